@@ -41,7 +41,11 @@ def refinement(units: int) -> Work:
     from kros.plants import HarmonicDrivePopulation
 
     linear = Lifting(problems.STATES)
-    population = HarmonicDrivePopulation(n_units=units, n_episodes=3, seconds=5.0, seed=0, conditions=("noload",)).simulate().population
+    population = (
+        HarmonicDrivePopulation(n_units=units, n_episodes=3, seconds=5.0, seed=0, conditions=("noload",))
+        .simulate()
+        .population
+    )
     keys = {unit: [key for key in population.episodes if key.unit == unit] for unit in population.unit_ids}
 
     def stack(factors: list[Factor]) -> Factor:
@@ -56,7 +60,10 @@ def refinement(units: int) -> Work:
 
 def runs(samples: int, episodes: int, lifted: int) -> Work:
     rng, lifting = np.random.default_rng(0), problems.wide(lifted)
-    A, B = (np.tile(M, (episodes, 1, 1)) for M in (0.5 * np.linalg.qr(rng.normal(size=(lifted, lifted)))[0], rng.normal(size=(lifted, 2))))
+    A, B = (
+        np.tile(M, (episodes, 1, 1))
+        for M in (0.5 * np.linalg.qr(rng.normal(size=(lifted, lifted)))[0], rng.normal(size=(lifted, 2)))
+    )
     x0, u = 0.1 * rng.normal(size=(episodes, 3)), 0.1 * rng.normal(size=(episodes, samples, 2))
     return lambda: free_run(A, B, lifting, {}, x0, u)
 
@@ -130,7 +137,8 @@ CURVES: dict[str, dict[str, tuple[Callable[[int], Work], tuple[int, ...]]]] = {
 
 @pytest.mark.benchmark(timer=time.process_time)
 @pytest.mark.parametrize(
-    ("against", "name", "size"), [(x, name, n) for x, rows in CURVES.items() for name, (_, sizes) in rows.items() for n in sizes]
+    ("against", "name", "size"),
+    [(x, name, n) for x, rows in CURVES.items() for name, (_, sizes) in rows.items() for n in sizes],
 )
 def test_growth(benchmark: Any, against: str, name: str, size: int) -> None:
     work = CURVES[against][name][0](size)

@@ -40,7 +40,9 @@ CURRENT = Runtime(upper=np.array([np.inf, np.inf, 0.5, *[np.inf] * 12]), relift=
 def observer(functions: tuple[str, ...], internal: int, order: int, **parts: Any) -> Observer:
     """An observer of drives: with internal states as a predictor has them, or with a correction filter of an order."""
     rng = np.random.default_rng(0)
-    lifting = Lifting((*STATES, *(f"memory_{i + 1}" for i in range(internal))), functions, ("phase",) if functions else ())
+    lifting = Lifting(
+        (*STATES, *(f"memory_{i + 1}" for i in range(internal))), functions, ("phase",) if functions else ()
+    )
     n, nl = lifting.n_states, lifting.n_lifted
     A = np.zeros((nl, nl))
     A[:n] = 0.3 * rng.normal(size=(n, nl)) / np.sqrt(nl)
@@ -50,7 +52,18 @@ def observer(functions: tuple[str, ...], internal: int, order: int, **parts: Any
         K = StateSpace(0.5 * np.eye(order), np.ones((order, 1)), 0.01 * rng.normal(size=(nl, order)), K.D, DT)
     B = 0.1 * rng.normal(size=(nl, 2))
     found = Observer(
-        "o", lifting, A, B, (0,), INPUTS, K, Injection.STATE, DT, {"phase": 1.0} if functions else {}, internal=internal, seen=SEEN
+        "o",
+        lifting,
+        A,
+        B,
+        (0,),
+        INPUTS,
+        K,
+        Injection.STATE,
+        DT,
+        {"phase": 1.0} if functions else {},
+        internal=internal,
+        seen=SEEN,
     )
     return replace(found, **parts)
 

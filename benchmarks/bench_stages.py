@@ -85,7 +85,11 @@ def reading() -> Stage:
         return [pd.read_csv(file).to_numpy() for file in files]
 
     note = "pandas parses numbers alone; kros also cuts the rest, removes the offset, aligns the targets and checks every sample"
-    return Stage("8 files of 20 000 rows", {"kros": lambda: Entry(ours), "pandas": lambda: Entry(pandas, within=np.nan, note=note)}, len)
+    return Stage(
+        "8 files of 20 000 rows",
+        {"kros": lambda: Entry(ours), "pandas": lambda: Entry(pandas, within=np.nan, note=note)},
+        len,
+    )
 
 
 def models() -> Stage:
@@ -99,7 +103,9 @@ def models() -> Stage:
         from pykoop import Edmd, KoopmanPipeline, PolynomialLiftingFn, SplitPipeline
 
         def fit() -> Any:
-            pipeline = KoopmanPipeline([("p", SplitPipeline([("p", PolynomialLiftingFn(order=2))], None))], Edmd(alpha=1.0))
+            pipeline = KoopmanPipeline(
+                [("p", SplitPipeline([("p", PolynomialLiftingFn(order=2))], None))], Edmd(alpha=1.0)
+            )
             return pipeline.fit(np.hstack([x, u]), n_inputs=2, episode_feature=False).regressor_.coef_.T
 
         return Entry(fit)
@@ -123,8 +129,12 @@ def predictions() -> Stage:
     found = edmd(reduce_episode(x, u, QUADRATIC).R, 9, 1e5)
     batch = [np.tile(M, (200, 1, 1)) for M in (found.A, found.B)]
     others = {
-        "pykoop": lambda: Entry(lambda: [pipeline().predict_trajectory(x0[:1], inputs[0], episode_feature=False)], share=1 / 200),
-        "plain": lambda: Entry(lambda: [plain.free_run(found.A, found.B, lift, x0[i], inputs[i]) for i in range(4)], share=4 / 200),
+        "pykoop": lambda: Entry(
+            lambda: [pipeline().predict_trajectory(x0[:1], inputs[0], episode_feature=False)], share=1 / 200
+        ),
+        "plain": lambda: Entry(
+            lambda: [plain.free_run(found.A, found.B, lift, x0[i], inputs[i]) for i in range(4)], share=4 / 200
+        ),
     }
     ours = Entry(lambda: free_run(*batch, QUADRATIC, {}, x0, inputs))
     return Stage("200 episodes of 500 samples, 9 lifted states", {"kros": lambda: ours, **others})
@@ -137,10 +147,17 @@ def frequency_responses() -> Stage:
         import control
 
         systems = [control.ss(units[i].A, units[i].B, units[i].C, units[i].D, DT) for i in range(38)]
-        return Entry(lambda: [np.moveaxis(control.frequency_response(s, 2 * np.pi * freqs).complex, -1, 0) for s in systems])
+        return Entry(
+            lambda: [np.moveaxis(control.frequency_response(s, 2 * np.pi * freqs).complex, -1, 0) for s in systems]
+        )
 
-    others = {"python-control": control, "plain": lambda: Entry(lambda: [plain.response(units[i], freqs) for i in range(4)], share=4 / 38)}
-    return Stage("38 units, 4 × 2, 1000 frequencies", {"kros": lambda: Entry(lambda: units.frequency_response(freqs)), **others})
+    others = {
+        "python-control": control,
+        "plain": lambda: Entry(lambda: [plain.response(units[i], freqs) for i in range(4)], share=4 / 38),
+    }
+    return Stage(
+        "38 units, 4 × 2, 1000 frequencies", {"kros": lambda: Entry(lambda: units.frequency_response(freqs)), **others}
+    )
 
 
 def nominals() -> Stage:
@@ -150,7 +167,9 @@ def nominals() -> Stage:
         import dkpy
 
         def largest(i: int) -> float:
-            E = dkpy.compute_uncertainty_residual_response(G[i], np.delete(G, i, axis=0), {"inverse_multiplicative_input"})
+            E = dkpy.compute_uncertainty_residual_response(
+                G[i], np.delete(G, i, axis=0), {"inverse_multiplicative_input"}
+            )
             return float(np.linalg.norm(E["inverse_multiplicative_input"], 2, axis=(-2, -1)).max())
 
         return Entry(lambda: min(map(largest, range(len(G)))))
@@ -194,22 +213,30 @@ def magnitudes() -> Stage:
 
     def ours() -> Any:
         axis = BilinearAxis.over(omega / (2 * np.pi))
-        system = axis.continuous(fit_magnitude(axis.discrete_hz(omega / (2 * np.pi)), magnitude, axis.period_s, order=2).system)
+        system = axis.continuous(
+            fit_magnitude(axis.discrete_hz(omega / (2 * np.pi)), magnitude, axis.period_s, order=2).system
+        )
         return np.abs(system.frequency_response(omega / (2 * np.pi))[:, 0, 0])
 
     def dkpy() -> Entry:
         import dkpy
 
         def fit() -> Any:
-            return np.abs(dkpy.fit_uncertainty_weight(magnitude[:, None, None], omega, [2], weight=np.ones((100, 1)))(s))
+            return np.abs(
+                dkpy.fit_uncertainty_weight(magnitude[:, None, None], omega, [2], weight=np.ones((100, 1)))(s)
+            )
 
         return Entry(fit, within=2e-3)
 
     note = "sequential quadratic programming from one start ends away from the optimum"
-    slsqp = Entry(lambda: np.abs(paper_slsqp.response(paper_slsqp.fit(omega, magnitude, 2), omega)), within=np.nan, note=note)
+    slsqp = Entry(
+        lambda: np.abs(paper_slsqp.response(paper_slsqp.fit(omega, magnitude, 2), omega)), within=np.nan, note=note
+    )
     # what it misses: the magnitude itself is a fit of this order
     return Stage(
-        "100 frequencies, order 2", {"kros": lambda: Entry(ours), "dkpy": dkpy, "plain": lambda: slsqp}, lambda f: np.squeeze(f) / magnitude
+        "100 frequencies, order 2",
+        {"kros": lambda: Entry(ours), "dkpy": dkpy, "plain": lambda: slsqp},
+        lambda f: np.squeeze(f) / magnitude,
     )
 
 
@@ -259,7 +286,11 @@ def norms_hinf() -> Stage:
         whole = of_control(plant)
         return Entry(lambda: control.linfnorm(whole)[0])
 
-    return Stage("30 states, discrete", {"kros": lambda: Entry(lambda: hinf_norm(system)), "python-control, slycot": control}, float)
+    return Stage(
+        "30 states, discrete",
+        {"kros": lambda: Entry(lambda: hinf_norm(system)), "python-control, slycot": control},
+        float,
+    )
 
 
 def norms_h2() -> Stage:
@@ -272,7 +303,9 @@ def norms_h2() -> Stage:
         whole = of_control(plant)
         return Entry(lambda: control.norm(whole, 2))
 
-    return Stage("30 states, discrete", {"kros": lambda: Entry(lambda: h2_norm(system)), "python-control": control}, float)
+    return Stage(
+        "30 states, discrete", {"kros": lambda: Entry(lambda: h2_norm(system)), "python-control": control}, float
+    )
 
 
 def mixed_norms() -> Stage:
@@ -291,7 +324,10 @@ def observers() -> Stage:
     y, u = 0.1 * rng.normal(size=(2000, 100, 1)), 0.1 * rng.normal(size=(2000, 100, 2))
     one_by_one = Entry(lambda: [plain.observe(o, lift, y[:, i], u[:, i]) for i in range(2)], share=2 / 100)
     ours = Entry(lambda: np.moveaxis(run_observer(o, y, u), 1, 0))
-    return Stage("100 episodes of 2000 samples, 9 lifted states, filter of order 4", {"kros": lambda: ours, "plain": lambda: one_by_one})
+    return Stage(
+        "100 episodes of 2000 samples, 9 lifted states, filter of order 4",
+        {"kros": lambda: ours, "plain": lambda: one_by_one},
+    )
 
 
 STAGES: dict[str, tuple[Callable[[], Stage], tuple[str, ...]]] = {
@@ -334,11 +370,15 @@ def quiet() -> Iterator[None]:
 
 
 @pytest.mark.benchmark(timer=time.process_time)
-@pytest.mark.parametrize(("name", "by"), [(name, by) for name, (_, others) in STAGES.items() for by in ("kros", *others)])
+@pytest.mark.parametrize(
+    ("name", "by"), [(name, by) for name, (_, others) in STAGES.items() for by in ("kros", *others)]
+)
 def test_stage(benchmark: Any, name: str, by: str) -> None:
     for package in by.split(", "):
         if package not in ("kros", "plain"):
-            pytest.importorskip(MODULES.get(package, package), reason=f"{package} is not installed, see benchmarks/README.md")
+            pytest.importorskip(
+                MODULES.get(package, package), reason=f"{package} is not installed, see benchmarks/README.md"
+            )
     own = stage(name)
     entry = own.entries[by]()
     entry.run()  # imports and caches
@@ -352,5 +392,11 @@ def test_stage(benchmark: Any, name: str, by: str) -> None:
         assert deviation <= entry.within
     iterations = max(1, int(0.02 / max(seconds, 1e-6)))
     benchmark.group = name
-    benchmark.extra_info |= {"by": by, "share": entry.share, "size": own.size, "deviation": deviation, "note": entry.note}
+    benchmark.extra_info |= {
+        "by": by,
+        "share": entry.share,
+        "size": own.size,
+        "deviation": deviation,
+        "note": entry.note,
+    }
     benchmark.pedantic(entry.run, rounds=int(np.clip(0.5 / max(seconds, 0.02), 3, 9)), iterations=iterations)

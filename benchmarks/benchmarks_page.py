@@ -68,7 +68,13 @@ def render(measured: dict[str, Any], packages: dict[str, str]) -> str:
     table = "| | |\n|---|---|\n" + "\n".join(f"| {name} | {value} |" for name, value in facts.items())
     rows = [{**b["extra_info"], "median_s": b["stats"]["median"]} for b in measured["benchmarks"]]
     stages = [row | {"stage": b["group"]} for row, b in zip(rows, measured["benchmarks"], strict=True) if "by" in row]
-    return HEAD.format(facts=table) + _stages(stages) + GROWTH + _growth([row for row in rows if "curve" in row]) + _steps(rows)
+    return (
+        HEAD.format(facts=table)
+        + _stages(stages)
+        + GROWTH
+        + _growth([row for row in rows if "curve" in row])
+        + _steps(rows)
+    )
 
 
 def _stages(rows: list[dict[str, Any]]) -> str:
@@ -80,7 +86,13 @@ def _stages(rows: list[dict[str, Any]]) -> str:
             seconds = row["median_s"] / row["share"]
             first = (f"**{stage}**", row["size"]) if row is contestants[0] else ("", "")
             ratio = "" if row["by"] == "kros" else f"{seconds / own:.{0 if seconds > 10 * own else 2}f}"
-            differs = "" if row["by"] == "kros" else "not compared" if np.isnan(row["deviation"]) else f"{row['deviation']:.0e}"
+            differs = (
+                ""
+                if row["by"] == "kros"
+                else "not compared"
+                if np.isnan(row["deviation"])
+                else f"{row['deviation']:.0e}"
+            )
             share = f"given {row['share']:.2g} of the problem" if row["share"] < 1 else ""
             lines.append(f"| {' | '.join([*first, row['by'], _time(seconds), ratio, differs, row['note'] or share])} |")
     return "\n".join(lines) + "\n"
@@ -93,7 +105,9 @@ def _growth(rows: list[dict[str, Any]]) -> str:
         for curve, found in groupby(group, lambda row: row["curve"]):
             points = [(row["size"], row["median_s"]) for row in found]
             slope = np.polyfit(*np.log(np.array(points)).T, 1)[0]
-            text += f"| {curve} | {', '.join(f'{size}: {_time(seconds)}' for size, seconds in points)} | {slope:.2f} |\n"
+            text += (
+                f"| {curve} | {', '.join(f'{size}: {_time(seconds)}' for size, seconds in points)} | {slope:.2f} |\n"
+            )
     return text
 
 
@@ -105,7 +119,9 @@ def _steps(rows: list[dict[str, Any]]) -> str:
 
 def _time(seconds: float) -> str:
     return next(
-        f"{seconds * factor:.3g} {unit}" for limit, factor, unit in ((1.0, 1, "s"), (1e-3, 1e3, "ms"), (0.0, 1e6, "µs")) if seconds >= limit
+        f"{seconds * factor:.3g} {unit}"
+        for limit, factor, unit in ((1.0, 1, "s"), (1e-3, 1e3, "ms"), (0.0, 1e6, "µs"))
+        if seconds >= limit
     )
 
 

@@ -37,7 +37,9 @@ DENSER, MAXIMA, FINER = 20, 40, 200
 def main() -> None:
     """Print one row of a table for every weight."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--populations", nargs="+", default=["stiff:0:1", "stiff:1:3", "soft:2:1"], help="loop:seed:spread")
+    parser.add_argument(
+        "--populations", nargs="+", default=["stiff:0:1", "stiff:1:3", "soft:2:1"], help="loop:seed:spread"
+    )
     parser.add_argument("--models", nargs="+", default=["koopman", "linear", "koopman_edmd", "linear_edmd"])
     parser.add_argument("--forms", nargs="+", default=[form.value for form in Form])
     parser.add_argument("--max-order", type=int, default=4)
@@ -62,7 +64,9 @@ def models_of(place: Path, population: str, units: int) -> Path:
     loop, seed, spread = population.split(":")
     folder = place / f"pop_{loop}_{seed}_{spread}"
     if not (folder / "run" / "models").exists():
-        simulate_to(folder / "recordings", "harmonic-drive", units, 10, 20.0, int(seed), float(spread), loop, False, "parquet")
+        simulate_to(
+            folder / "recordings", "harmonic-drive", units, 10, 20.0, int(seed), float(spread), loop, False, "parquet"
+        )
         raw = {"data": {"source": str(folder / "recordings"), "reader": "parquet"}, "identify": {"refine": True}}
         run_study(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
     return folder / "run" / "models"
@@ -70,7 +74,10 @@ def models_of(place: Path, population: str, units: int) -> Path:
 
 def row(models: ModelSet, form: str, name: str, population: str, options: argparse.Namespace) -> str:
     """Quantify, verify, and return a row."""
-    grid, limits = log_grid(models.sample_period_s), {"max_order": options.max_order, "tolerance_db": options.tolerance_db}
+    grid, limits = (
+        log_grid(models.sample_period_s),
+        {"max_order": options.max_order, "tolerance_db": options.tolerance_db},
+    )
     start = time.process_time()
     found = quantify_systems(models, form, grid, **limits)
     seconds = time.process_time() - start
@@ -88,9 +95,16 @@ def independent_cover_max(found: UncertainModel, units: StateSpace) -> float:
     dt = found.nominal_system.dt
     inside = found.freqs_hz[found.freqs_hz > 0]
     dense = np.interp(np.arange((len(inside) - 1) * DENSER + 1) / DENSER, np.arange(len(inside)), np.log(inside))
-    systems = [found.nominal_system, found.weight.left, found.weight.right, *(units[k] for k in range(units.batch_shape[0]))]
+    systems = [
+        found.nominal_system,
+        found.weight.left,
+        found.weight.right,
+        *(units[k] for k in range(units.batch_shape[0])),
+    ]
     bends = np.concatenate([bends_hz(s) for s in systems])
-    freqs = np.unique(np.concatenate([np.exp(dense).clip(max=nyquist_hz(dt)), bends, [nyquist_hz(dt) * 1e-9, nyquist_hz(dt)]]))
+    freqs = np.unique(
+        np.concatenate([np.exp(dense).clip(max=nyquist_hz(dt)), bends, [nyquist_hz(dt) * 1e-9, nyquist_hz(dt)]])
+    )
     ratio = ratios(found, units, freqs)
     worst = float(ratio.max())
     for unit in range(len(ratio)):  # local maxima of every unit, asked again
@@ -139,7 +153,10 @@ def response(system: StateSpace, freqs: Array) -> Array:
     """Return the frequency response by solves, shape (frequency, p, m)."""
     z = np.exp(2j * np.pi * freqs * system.dt)[:, None, None]
     return np.asarray(
-        system.C @ np.linalg.solve(z * np.eye(system.n_states) - system.A, np.broadcast_to(system.B + 0j, (len(freqs), *system.B.shape)))
+        system.C
+        @ np.linalg.solve(
+            z * np.eye(system.n_states) - system.A, np.broadcast_to(system.B + 0j, (len(freqs), *system.B.shape))
+        )
         + system.D
     )
 

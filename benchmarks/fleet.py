@@ -46,7 +46,15 @@ def main() -> None:
         for units in options.units:
             place = folder / f"{units}x{options.seconds:g}"
             simulate(place / "recordings", units, options.seconds)
-            command = [sys.executable, __file__, "--one", str(units), "--folder", str(place), *(["--refine"] if options.refine else [])]
+            command = [
+                sys.executable,
+                __file__,
+                "--one",
+                str(units),
+                "--folder",
+                str(place),
+                *(["--refine"] if options.refine else []),
+            ]
             found[units] = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
             print(json.dumps({"units": units, **found[units]}), flush=True)
     print(table(found))
@@ -66,11 +74,17 @@ def simulate(folder: Path, units: int, seconds: float) -> None:
     names: tuple[Unit, ...] = ()
     for block in range(0, units, BLOCK):
         count = min(BLOCK, units - block)
-        made = HarmonicDrivePopulation(n_units=count, n_episodes=EPISODES, seconds=seconds, seed=1000 + block).simulate().population
+        made = (
+            HarmonicDrivePopulation(n_units=count, n_episodes=EPISODES, seconds=seconds, seed=1000 + block)
+            .simulate()
+            .population
+        )
         own = tuple(Unit(f"{block + k + 1:06d}", "population") for k in range(count))
         renamed = dict(zip(made.unit_ids, own, strict=True))
         keys = {EpisodeKey(renamed[k.unit].id, k.condition, k.episode): k for k in made.episodes}
-        whole: Population = replace(made, units=own, episodes=tuple(keys), source=lambda key, keys=keys, made=made: made.source(keys[key]))
+        whole: Population = replace(
+            made, units=own, episodes=tuple(keys), source=lambda key, keys=keys, made=made: made.source(keys[key])
+        )
         records += [write_group(whole, *group[:2], folder) for group in whole.groups()]
         names += own
     write_index(replace(whole, units=names), records, folder)
@@ -98,7 +112,11 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
         times[name] = time.process_time() - began
         times[f"{name} (wall)"] = time.perf_counter() - wall
         memory[name] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
-        print(f"{units} units, {name}: {1000 * times[name] / units:.2f} ms each, {memory[name]:.2f} GB", file=sys.stderr, flush=True)
+        print(
+            f"{units} units, {name}: {1000 * times[name] / units:.2f} ms each, {memory[name]:.2f} GB",
+            file=sys.stderr,
+            flush=True,
+        )
 
     settings = UncertaintySettings.of({"n_freqs": POINTS, "max_order": ORDER}, "fleet")
     with stage("open"):
@@ -134,7 +152,10 @@ def table(found: dict[int, dict[str, Any]]) -> str:
 
     sizes = sorted(found)
     stages = [name for name in found[sizes[0]]["times"] if not name.endswith("(wall)")]
-    lines = ["| stage | " + " | ".join(f"{n} units, ms each" for n in sizes) + " | exponent | GB |", "|---" * (len(sizes) + 3) + "|"]
+    lines = [
+        "| stage | " + " | ".join(f"{n} units, ms each" for n in sizes) + " | exponent | GB |",
+        "|---" * (len(sizes) + 3) + "|",
+    ]
     for name in stages:
         own = [found[n]["times"][name] for n in sizes]
         slope = np.log(own[-1] / own[0]) / np.log(sizes[-1] / sizes[0]) if len(sizes) > 1 else float("nan")

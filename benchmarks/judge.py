@@ -69,7 +69,16 @@ EVERYTHING = (  # what says most comes first
         "compliant:1:403:limit",
         "compliant:1:403:declared",
     ),
-    *("stiff:3:401", "soft:1:401", "stiff:1:402", "soft:3:402", "compliant:1:402", "dc:1:402", "stiff:3:402", "soft:1:402"),
+    *(
+        "stiff:3:401",
+        "soft:1:401",
+        "stiff:1:402",
+        "soft:3:402",
+        "compliant:1:402",
+        "dc:1:402",
+        "stiff:3:402",
+        "soft:1:402",
+    ),
 )
 SENSED = ("stiff:1:401", "compliant:1:401")  # populations and
 SENSED_FOLDS = (0,)  # folds that the sensor is made worse for
@@ -145,7 +154,9 @@ def cut(population: Population) -> Population:
         values = population.read(key)
         for p in range(0, len(values) // length, 1 if int(key.episode) == last else 2):
             pieces[EpisodeKey(key.unit, key.condition, f"{key.episode}-{p}")] = values[p * length : (p + 1) * length]
-    return from_arrays(pieces, population.channels, population.sample_period_s, units=population.units, metadata=population.metadata)
+    return from_arrays(
+        pieces, population.channels, population.sample_period_s, units=population.units, metadata=population.metadata
+    )
 
 
 def held_out(task: Task, population: Population) -> tuple[str, ...] | None:
@@ -166,7 +177,9 @@ class Fold:
         self.test = held_out(task, population)
         began = time.process_time()
         lifting = LIFTINGS.get(task.kind)
-        models = kros.identify(population.select([u for u in population.unit_ids if u not in self.held]), lifting, test=self.test)
+        models = kros.identify(
+            population.select([u for u in population.unit_ids if u not in self.held]), lifting, test=self.test
+        )
         self.seconds["identify"] = time.process_time() - began
         found = kros.quantify(models)
         self.seconds["quantify"] = time.process_time() - began - self.seconds["identify"]
@@ -189,7 +202,12 @@ class Fold:
         baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
         limits = {"current": Limit.of((-LIMIT, LIMIT), "Judge")} if self.task.variant == "declared" else {}
         found = synthesize_all(
-            self.uncertain, SynthesisSettings(methods=methods), baselines, PredictorSettings(), sensor=sensor, limits=limits
+            self.uncertain,
+            SynthesisSettings(methods=methods),
+            baselines,
+            PredictorSettings(),
+            sensor=sensor,
+            limits=limits,
         )
         self.seconds["synthesize"] = time.process_time() - began
         return found
@@ -208,16 +226,27 @@ class Fold:
             assert models.calibration is not None
             on = splits.get((unit, models.facts.identify_on)) or next(s for (u, _), s in splits.items() if u == unit)
             spec = models.calibration.spec
-            known[unit] = {spec.parameter: models.calibration.calibrate(segments_of((self.population, on.train, spec)), unit).phase_rad}
+            known[unit] = {
+                spec.parameter: models.calibration.calibrate(
+                    segments_of((self.population, on.train, spec)), unit
+                ).phase_rad
+            }
         keys = [k for split in splits.values() for k in split.test]
-        return as_shown(EpisodeBatch.read(self.population, keys, parameters=known, truths=True), sensor, self.population.states)
+        return as_shown(
+            EpisodeBatch.read(self.population, keys, parameters=known, truths=True), sensor, self.population.states
+        )
 
     def estimates(self, designs: Designs, batch: EpisodeBatch, learned: Any) -> Iterable[tuple[str, np.ndarray]]:
         """Run all observers and the learned estimator."""
         for name, design in designs.designs.items():
             observer = design.observer
             values = batch.parameters if observer.lifting.parameters else None
-            yield name, run_observer(observer, batch.measurements(observer.measured), batch.inputs, values)[..., : batch.states.shape[-1]]
+            yield (
+                name,
+                run_observer(observer, batch.measurements(observer.measured), batch.inputs, values)[
+                    ..., : batch.states.shape[-1]
+                ],
+            )
         yield LEARNED, learned.run(batch, batch.parameters)
 
     def rows(self, designs: Designs, batch: EpisodeBatch, learned: Any, **case: Any) -> list[dict[str, Any]]:
@@ -243,7 +272,9 @@ class Fold:
         return found
 
 
-def true_row(population: Population, estimate: np.ndarray, batch: EpisodeBatch, chosen: Sequence[int], state: int) -> dict[str, float]:
+def true_row(
+    population: Population, estimate: np.ndarray, batch: EpisodeBatch, chosen: Sequence[int], state: int
+) -> dict[str, float]:
     """Return error and lag against what a state really was."""
     if batch.truths is None or state not in population.true_states:
         return {}
@@ -264,7 +295,14 @@ def make(task: Task) -> dict[str, float]:
         content = {"accuracy": accuracy, "sensor": sensor}[part](fold)
         seconds[part] = time.process_time() - began
         write_json(
-            task.place(part), {"population": task.name, "fold": task.fold, "held": fold.held, **content, "seconds": fold.seconds | seconds}
+            task.place(part),
+            {
+                "population": task.name,
+                "fold": task.fold,
+                "held": fold.held,
+                **content,
+                "seconds": fold.seconds | seconds,
+            },
         )
     return fold.seconds | seconds
 
@@ -312,7 +350,9 @@ def main() -> None:
     parser.add_argument("--populations", nargs="+", default=list(EVERYTHING))
     parser.add_argument("--folds", type=int, nargs="+", default=list(range(FOLDS)))
     parser.add_argument("--parts", nargs="+", choices=("accuracy", "sensor"), default=["accuracy", "sensor"])
-    parser.add_argument("--sensed", nargs="+", default=list(SENSED), help="populations that the sensor is made worse for")
+    parser.add_argument(
+        "--sensed", nargs="+", default=list(SENSED), help="populations that the sensor is made worse for"
+    )
     parser.add_argument("--sensed-folds", type=int, nargs="+", default=list(SENSED_FOLDS))
     parser.add_argument("--units", type=int, default=UNITS)
     parser.add_argument("--seconds", type=float, default=SECONDS)

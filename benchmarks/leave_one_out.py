@@ -38,7 +38,14 @@ from kros.study.engine.progress import Lines
 HOME, HIDDEN, LEARNED, ENTRYWISE = "noload", ("velocity", "current"), "learned", "koopman_edmd/paper"
 SHOWN = (
     *("koopman/open_loop", "koopman/kalman_tuned", "koopman/ekf", "filtered_difference", LEARNED),
-    *(PAPER, ENTRYWISE, "linear_edmd/paper", "koopman/worst_case_h2", "koopman/residual_h2", "koopman_edmd/residual_h2"),
+    *(
+        PAPER,
+        ENTRYWISE,
+        "linear_edmd/paper",
+        "koopman/worst_case_h2",
+        "koopman/residual_h2",
+        "koopman_edmd/residual_h2",
+    ),
     *("linear/residual_h2", "koopman/memory", "linear/memory"),
 )
 Facts = Mapping[str, Mapping[str, Any]]
@@ -57,16 +64,22 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=available_cores())
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[])
     parser.add_argument("--out", type=Path)
-    parser.add_argument("--markdown", action="store_true", help="print tables as in docs/observers.md, of the observers named there")
+    parser.add_argument(
+        "--markdown", action="store_true", help="print tables as in docs/observers.md, of the observers named there"
+    )
     options = parser.parse_args()
     verdicts = []
     with tempfile.TemporaryDirectory() as scratch:
         for loop, spread in product(options.loop, options.spread):
-            title = f"{loop} loop, spread {spread:g}, seed {options.seed}, {options.units} units in {options.folds} folds"
+            title = (
+                f"{loop} loop, spread {spread:g}, seed {options.seed}, {options.units} units in {options.folds} folds"
+            )
             say(f"\n{title} ...")
             began = time.perf_counter()
             try:
-                left_out = studied((options.out or Path(scratch)) / f"{loop}-{spread:g}-{options.seed}", loop, spread, options)
+                left_out = studied(
+                    (options.out or Path(scratch)) / f"{loop}-{spread:g}-{options.seed}", loop, spread, options
+                )
             except Exception as error:  # whatever it is: the populations that follow are run all the same
                 say(traceback.format_exc())
                 verdicts.append((title, [f"failed: {error}"]))
@@ -90,7 +103,16 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     if not (recordings / "truth.json").exists():  # written last
         shutil.rmtree(recordings, ignore_errors=True)
         simulate_to(
-            recordings, "harmonic-drive", options.units, options.episodes, options.seconds, options.seed, spread, loop, False, "parquet"
+            recordings,
+            "harmonic-drive",
+            options.units,
+            options.episodes,
+            options.seconds,
+            options.seed,
+            spread,
+            loop,
+            False,
+            "parquet",
         )
     study = folder / "study.toml"
     methods = json.dumps(["paper", *SynthesisSettings().methods])
@@ -111,7 +133,10 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
 def show(table: ErrorTable, facts: Facts, folds: int) -> None:
     """Print one condition."""
     channels = [c for c in HIDDEN if c in table.channels]
-    say(f"\n{table.condition:31s} {'':>5s} {'certified':>11s} " + " ".join(f"{f'{c}, % of the largest value':>45s}" for c in channels))
+    say(
+        f"\n{table.condition:31s} {'':>5s} {'certified':>11s} "
+        + " ".join(f"{f'{c}, % of the largest value':>45s}" for c in channels)
+    )
     columns = f"{'mean':>8s} {'(95 %)':>18s} {'worst':>8s} {'band dB':>8s}"
     say(f"{'observer':31s} {'order':>5s} {'runs':>5s} {'set':>5s} " + " ".join([columns] * len(channels)))
     for name, cells in table.cells.items():
@@ -119,7 +144,10 @@ def show(table: ErrorTable, facts: Facts, folds: int) -> None:
         orders = "/".join(map(str, own["orders"])) or "-"
         proofs = [f"{own[key]}/{folds}" if own[key] is not None else "-" for key in ("relift_certified", "robust")]
         made = name if own["made"] == folds else f"{name} ({own['made']}/{folds})"
-        say(f"{made:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} " + " ".join(numbers(cells.get(c)) for c in channels))
+        say(
+            f"{made:31s} {orders:>5s} {proofs[0]:>5s} {proofs[1]:>5s} "
+            + " ".join(numbers(cells.get(c)) for c in channels)
+        )
 
 
 def rounded(cell: ErrorCell | None) -> str:
@@ -143,7 +171,10 @@ def markdown(tables: list[ErrorTable], facts: Facts, folds: int) -> list[str]:
     """Return the rows of a table for people: velocity and current at home, velocity elsewhere, powers around the gearbox frequency at home."""
     places = [(tables[0], "velocity"), (tables[0], "current"), *((table, "velocity") for table in tables[1:])]
     head = [f"{channel}, {table.condition} | worst" for table, channel in places]
-    lines = [" | ".join(["| observer | states | runs | set", *head, "band, velocity | current |"]), "|---" * (2 * len(places) + 6) + "|"]
+    lines = [
+        " | ".join(["| observer | states | runs | set", *head, "band, velocity | current |"]),
+        "|---" * (2 * len(places) + 6) + "|",
+    ]
     for name in (n for n in SHOWN if n in tables[0].cells):
         own, cells = facts[name], tables[0].cells[name]
         made = "" if own["made"] == folds else f" ({own['made']}/{folds})"
@@ -192,7 +223,9 @@ def both(table: ErrorTable, name: str) -> float:
     return sqrt(worst(table, name, "velocity") * worst(table, name, "current"))
 
 
-def best_of_certified(table: ErrorTable, certified: list[str], chosen: str | None, facts: Facts, what: str) -> list[str]:
+def best_of_certified(
+    table: ErrorTable, certified: list[str], chosen: str | None, facts: Facts, what: str
+) -> list[str]:
     """How far kros's best certified observer is from the best certified one of all, and which uncertified ones beat it."""
     if chosen is None:
         return [f"{what}: none of kros's own {met(False)}"]
@@ -204,7 +237,10 @@ def best_of_certified(table: ErrorTable, certified: list[str], chosen: str | Non
         lines.append(f"(a) {channel} of the worst unit: {reached:.4f}, {beside} {met(ratio <= 1)}")
         for name in table.cells:
             if name not in certified and worst(table, name, channel) < reached:
-                reasons = "; ".join(facts[name]["reasons"]) or "it is no constant correction of a model, and certificates are about these"
+                reasons = (
+                    "; ".join(facts[name]["reasons"])
+                    or "it is no constant correction of a model, and certificates are about these"
+                )
                 lines.append(f"    better without: {name} {worst(table, name, channel):.4f} ({reasons[:200]})")
     return lines
 
@@ -217,7 +253,9 @@ def against_paper(tables: Mapping[str, ErrorTable], name: str) -> list[str]:
         shared = [unit for unit in ours if ours[unit] is not None and theirs.get(unit) is not None]
         ratio = sum(theirs[unit] or 0.0 for unit in shared) / sum(ours[unit] or inf for unit in shared)
         where = "" if len(shared) == len(ours) else f" on the {len(shared)} units that it could be made for"
-        lines.append(f"(b) {channel} of {paper}{where} over that of {name}: {ratio:.2f}, asked {times:g} {met(ratio >= times)}")
+        lines.append(
+            f"(b) {channel} of {paper}{where} over that of {name}: {ratio:.2f}, asked {times:g} {met(ratio >= times)}"
+        )
     for condition, table in tables.items():
         for channel in HIDDEN:
             found = table.cells[name][channel].band_db

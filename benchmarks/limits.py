@@ -46,9 +46,13 @@ def fold(population, parameters, test: list[str], conditions: tuple[str, ...]) -
 
     lifting = Lifting(population.states, ("sin(100*position + phase)", "cos(100*position + phase)"), ("phase",))
     sizes = dict(zip(population.states + population.inputs, [*scale, *inputs], strict=True))
-    before = identify_predictor("before", lifting.in_sizes(sizes), (0,), population.inputs, normal(learn), iterations=4, episodes=1)
+    before = identify_predictor(
+        "before", lifting.in_sizes(sizes), (0,), population.inputs, normal(learn), iterations=4, episodes=1
+    )
     inf = np.array([np.inf, np.inf])
-    lower, upper = (np.append(side * inf, side * np.inf if v is None else v) for side, v in ((-1, limit.lower), (1, limit.upper)))
+    lower, upper = (
+        np.append(side * inf, side * np.inf if v is None else v) for side, v in ((-1, limit.lower), (1, limit.upper))
+    )
     loaded = EpisodeBatch.read(population, [k for k in keys if k.condition == "load"], 6000, parameters)
     met = np.mean(np.abs(loaded.states[..., 2]) > 0.99, axis=0)
     at = normal(loaded.take([int(i) for i in np.argsort(-met)[:12] if met[i] > 0]))
@@ -57,14 +61,18 @@ def fold(population, parameters, test: list[str], conditions: tuple[str, ...]) -
     features = Features.of(lifting, (0,), learn.states[..., :1], learn.inputs)
     moments = Moments.of(features, [learn], 0.1 * scale)
     learned = moments.estimator((), moments.choose())
-    held = EpisodeBatch.read(population, [k for k in population.episodes if k.unit in test and k.episode == HELD], None, parameters)
+    held = EpisodeBatch.read(
+        population, [k for k in population.episodes if k.unit in test and k.episode == HELD], None, parameters
+    )
     y, found = held.states[..., :1], {}
     found["learned"] = learned.run(y, held.inputs, held.parameters)
     found["told"] = np.clip(found["learned"], lower, upper)
     for name, observer in (("before", before), ("now", now)):
         found[name] = run_observer(observer, y / scale[0], held.inputs / inputs, held.parameters)[..., :3] * scale
     errors = {name: percent(estimate, held) for name, estimate in found.items()}
-    print("certified" if relift_certificate(now, mismatch=False).certified else "not certified, a study halves the gain")
+    print(
+        "certified" if relift_certificate(now, mismatch=False).certified else "not certified, a study halves the gain"
+    )
     for row, key in enumerate(held.keys):
         share = 100 * np.mean(np.abs(held.states[:, row, 2]) > 0.99)
         same = np.allclose(errors["before"][row], errors["now"][row], rtol=1e-6)

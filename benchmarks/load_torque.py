@@ -55,7 +55,9 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--known", type=int, default=2, help="units with a known load")
     parser.add_argument("--memories", type=int, nargs="+", default=[8])
-    parser.add_argument("--level", type=float, nargs="+", default=[10.0], help="seconds after which a constant load is forgotten")
+    parser.add_argument(
+        "--level", type=float, nargs="+", default=[10.0], help="seconds after which a constant load is forgotten"
+    )
     parser.add_argument("--iterations", type=int, default=10, help="steps of tuning")
     parser.add_argument("--settle", type=float, default=2.0, help="seconds at the start that do not count")
     parser.add_argument("--unlimited", action="store_true", help="as if the current had no limit")
@@ -97,7 +99,10 @@ def checks(rows: list[dict[str, Any]]) -> list[str]:
         own = [r for r in rows if (r["loop"], r["spread"], r["seed"]) == key]
         found, twin = (next(r for r in own if r["estimator"].startswith(f"{kind}, known load")) for kind in FUNCTIONS)
         paper = next(r for r in own if r["estimator"].startswith("linear, from"))
-        gains = [f"{other['band'] - found['band']:.1f} (moving {other['moving'] - found['moving']:.1f})" for other in (paper, twin)]
+        gains = [
+            f"{other['band'] - found['band']:.1f} (moving {other['moving'] - found['moving']:.1f})"
+            for other in (paper, twin)
+        ]
         lines.append(
             f"{key}: error to floor {found.get('ratio')} {'holds' if found.get('ratio', 9) <= MOST_RATIO else 'FAILS'} {MOST_RATIO}; "
             f"ripple, dB less than the linear observer's current error {gains[0]}, than the linear observer with a known load {gains[1]}"
@@ -109,19 +114,27 @@ class Drives:
     """One population, with what is known of it."""
 
     def __init__(self, loop: str, spread: float, seed: int, options: argparse.Namespace) -> None:
-        simulated = HarmonicDrivePopulation(options.units, options.episodes, options.seconds, seed, spread, loop).simulate()
+        simulated = HarmonicDrivePopulation(
+            options.units, options.episodes, options.seconds, seed, spread, loop
+        ).simulate()
         self.population, self.truth, self.options = simulated.population, simulated.truth, options
         self.dt = self.population.sample_period_s
         last = {str(e) for e in range(options.episodes - 2, options.episodes)}
         units = self.population.unit_ids
         peak = {
             u: max(
-                np.abs(self.population.read(k)[:, CURRENT]).max() for k in self.population.episodes if k.unit == u and k.condition == "load"
+                np.abs(self.population.read(k)[:, CURRENT]).max()
+                for k in self.population.episodes
+                if k.unit == u and k.condition == "load"
             )
             for u in units
         }
         self.known = sorted(units, key=lambda u: (round(peak[u], 2), u))[: options.known]
-        train = [k for k in self.population.episodes if k.episode not in last and (k.condition == "noload" or k.unit in self.known)]
+        train = [
+            k
+            for k in self.population.episodes
+            if k.episode not in last and (k.condition == "noload" or k.unit in self.known)
+        ]
         test = [k for k in self.population.episodes if k.episode in last and k.unit not in self.known]
         self.phase = self.phases([k for k in train if k.condition == "noload"])
         phases = {unit: {"phase": value} for unit, value in self.phase.items()}
@@ -175,7 +188,9 @@ class Drives:
             REAL_HZ,
             LIMIT,
         )
-        observer = load_observer(f"{kind}/load", calibration, self.population.inputs, memories, iterations=self.options.iterations)
+        observer = load_observer(
+            f"{kind}/load", calibration, self.population.inputs, memories, iterations=self.options.iterations
+        )
         estimate = run_observer(observer, self.test.states[..., :1], self.test.inputs, self.parameters(kind, self.test))
         seen = estimate[..., 3]
         limit = np.inf if self.options.unlimited else 1.0
@@ -201,7 +216,10 @@ class Drives:
             iterations=self.options.iterations,
         )
         estimate = run_observer(observer, self.test.states[..., :1], self.test.inputs, self.parameters(kind, self.test))
-        return {"estimator": f"{kind}, memory that knows no load", "current": self.current_percent(estimate[..., CURRENT])}
+        return {
+            "estimator": f"{kind}, memory that knows no load",
+            "current": self.current_percent(estimate[..., CURRENT]),
+        }
 
     def unloaded_model(self, kind: str) -> tuple[Observer, Array]:
         """One-step model of all units without load and the covariance of what it misses."""
@@ -211,7 +229,9 @@ class Drives:
         A, B = one_step_rows(lifting, batch)
         functions = len(lifting.functions)
         A, B = (np.vstack([M, np.zeros((functions, M.shape[1]))]) for M in (A, B))
-        residual = one_step_residual(lifting, A, B, batch.states, batch.inputs, batch.parameters).reshape(-1, len(A) - functions)
+        residual = one_step_residual(lifting, A, B, batch.states, batch.inputs, batch.parameters).reshape(
+            -1, len(A) - functions
+        )
         return Observer.open_loop(kind, lifting, A, B, (0,), self.population.inputs, self.dt), np.cov(residual.T)
 
     def modelled(self, kind: str) -> dict[str, Any]:
@@ -220,7 +240,9 @@ class Drives:
         loaded = [i for i, k in enumerate(self.train.keys) if k.condition == "load"]
         own = self.parameters(kind, self.train)
         values = None if own is None else {"phase": own["phase"][loaded]}
-        residual = one_step_residual(model.lifting, model.A, model.B, self.train.states[:, loaded], self.train.inputs[:, loaded], values)
+        residual = one_step_residual(
+            model.lifting, model.A, model.B, self.train.states[:, loaded], self.train.inputs[:, loaded], values
+        )
         known = low_passed(self.loads[0][:, loaded], REAL_HZ, self.dt)
         E = load_direction(residual, known[:-1])
         noise = [COUNT_RAD / np.sqrt(12)]
@@ -257,7 +279,10 @@ class Drives:
         scale = calibrate_torque(errors[0][:, loaded], self.loads[0][:, loaded], self.dt)
         load = load_from_current(errors[1], 0.0, scale)
         row = self.judged(f"{kind}, from the recorded current", load, load, None)
-        return [row | {"torque constant": round(scale.torque_constant, 3), "residual_percent": round(scale.residual_percent, 1)}]
+        return [
+            row
+            | {"torque constant": round(scale.torque_constant, 3), "residual_percent": round(scale.residual_percent, 1)}
+        ]
 
     def judged(self, name: str, estimate: Array, seen: Array, level_s: float | None) -> dict[str, Any]:
         """Errors and ripple of an estimate; `seen` is what lacks its level, and is judged against the seen part of the truth."""
@@ -273,7 +298,9 @@ class Drives:
                 "ratio": round(accuracy.ratio, 2),
             }
             if level_s is not None:
-                part = load_accuracy(seen[:, fit], without_level(truth[:, fit], level_s, self.dt), self.dt, SLOW_HZ, skip)
+                part = load_accuracy(
+                    seen[:, fit], without_level(truth[:, fit], level_s, self.dt), self.dt, SLOW_HZ, skip
+                )
                 row |= {
                     "seen floor": round(100 * part.floor_rms / part.load_rms, 1),
                     "seen error": round(part.percent, 1),
@@ -281,7 +308,11 @@ class Drives:
                 }
         others = ~self.loaded | (self.limited & self.loaded)
         if (self.limited & self.loaded).any():
-            row |= {"at limit": round(load_accuracy(estimate[:, others], truth[:, others], self.dt, SLOW_HZ, skip).percent, 1)}
+            row |= {
+                "at limit": round(
+                    load_accuracy(estimate[:, others], truth[:, others], self.dt, SLOW_HZ, skip).percent, 1
+                )
+            }
         row["episodes at limit"] = f"{int((self.limited & self.loaded).sum())} of {int(self.loaded.sum())}"
         known = truth if level_s is None else without_level(truth, level_s, self.dt)
         error = seen - low_passed(known, REAL_HZ, self.dt)
@@ -301,7 +332,9 @@ class Drives:
         skip = round(self.options.settle / self.dt)
         truth = self.test.states[skip:, :, CURRENT]
         percent = 100 * np.sqrt(np.mean((estimate[skip:] - truth) ** 2, axis=0)) / np.abs(truth).max(axis=0)
-        return [round(float(percent[some].mean()), 1) for some in (~self.loaded, self.loaded & ~self.limited) if some.any()]
+        return [
+            round(float(percent[some].mean()), 1) for some in (~self.loaded, self.loaded & ~self.limited) if some.any()
+        ]
 
 
 if __name__ == "__main__":

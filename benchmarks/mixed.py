@@ -71,7 +71,9 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
         label = f"{loop}-{seed}" + ("-refined" if options.refine else "")
         out, recordings = root / label, root / label / "recordings"
         if not (out / "run" / "metrics.json").exists():
-            simulate_to(recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, 1.0, loop, True, "parquet")
+            simulate_to(
+                recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, 1.0, loop, True, "parquet"
+            )
             config = validate_config(
                 {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": options.refine}}, root
             )
@@ -85,7 +87,9 @@ def tasks(folder: Path) -> list[DesignTask]:
     with open_executor(1) as executor:
         context = Context(config, Store(folder), Work(executor))
         found = context.uncertain
-        first = [tasks_of(found, kind, ("open_loop",), config.synthesis, config.predictor)[0] for kind in found.models.kinds]
+        first = [
+            tasks_of(found, kind, ("open_loop",), config.synthesis, config.predictor)[0] for kind in found.models.kinds
+        ]
         return [replace(task, name=f"{task.models.name}/mixed", method="mixed") for task in first]
 
 
@@ -98,11 +102,16 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     try:
         result = design_mixed(task)
     except KrosError as error:
-        return f"{n_states:2d} states FAILED after {time.perf_counter() - wall:.2f} s: {error}", time.process_time() - start, True
+        return (
+            f"{n_states:2d} states FAILED after {time.perf_counter() - wall:.2f} s: {error}",
+            time.process_time() - start,
+            True,
+        )
     wall, used = time.perf_counter() - wall, time.process_time() - start
     judge, found = task.training.read(), result.synthesis
     nothing, _ = certify(
-        result.problem, gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s)
+        result.problem,
+        gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s),
     )
     error, free = judge.percent(result.observer), judge.percent(task.open_loop())
     return (

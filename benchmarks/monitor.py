@@ -68,7 +68,11 @@ def designed(loop: str, method: str, work: Path) -> tuple[Observer, TrainingSet]
     """Return the observer of a loop and the episodes that it was designed on; made once."""
     folder = work / f"{loop}-{method.replace('/', '-')}"
     if not (folder / "observer.json").exists():
-        population = HarmonicDrivePopulation(n_units=UNITS, n_episodes=6, seconds=12.0, seed=DESIGN_SEED, loop=loop).simulate().population
+        population = (
+            HarmonicDrivePopulation(n_units=UNITS, n_episodes=6, seconds=12.0, seed=DESIGN_SEED, loop=loop)
+            .simulate()
+            .population
+        )
         models = kros.identify(population, lifting=["sin(100*position + phase)"])
         models.save(folder / "models")
         kros.synthesize(kros.quantify(models), method).observer.save(folder / "observer.json")
@@ -78,7 +82,9 @@ def designed(loop: str, method: str, work: Path) -> tuple[Observer, TrainingSet]
 
 def record(drives: DriveParameters, seed: int, loop: str, episodes: int, seconds: float = SECONDS) -> TrainingSet:
     """Simulate and return all episodes."""
-    simulated = Given(n_units=len(drives), n_episodes=episodes, seconds=seconds, seed=seed, loop=loop, drives=drives).simulate()
+    simulated = Given(
+        n_units=len(drives), n_episodes=episodes, seconds=seconds, seed=seed, loop=loop, drives=drives
+    ).simulate()
     population, truth = simulated.population, simulated.truth
     phases = {unit: {"phase": float(phase)} for unit, phase in zip(truth.unit_ids, truth.phase_rad, strict=True)}
     return TrainingSet(population, population.episodes, phases)
@@ -133,7 +139,9 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=5000)
     parser.add_argument("--rate", type=float, default=RATE)
     parser.add_argument("--units", type=int, default=UNITS)
-    parser.add_argument("--own", type=int, default=0, help="further good drives against the monitor of the observer's own drives")
+    parser.add_argument(
+        "--own", type=int, default=0, help="further good drives against the monitor of the observer's own drives"
+    )
     parser.add_argument("--work", type=Path, required=True)
     args = parser.parse_args()
     logging.disable(logging.INFO)
@@ -156,16 +164,21 @@ def main() -> None:
         good = draw_parameters(seed, args.units + UNITS, 1.0)
         kinds = [(kind, s) for kind, severities in FAULTS.items() for s in severities]
         watched = replace(
-            observer, monitor=fit_monitor(observer, record(good.take(slice(args.units)), seed, args.loop, EPISODES), args.rate)
+            observer,
+            monitor=fit_monitor(observer, record(good.take(slice(args.units)), seed, args.loop, EPISODES), args.rate),
         )
         bounds = dict(watched.monitor.bounds)
-        rows = levels(watched, record(good.take(slice(args.units, None)), ELSEWHERE + seed, args.loop, NEW_EPISODES, NEW_SECONDS))
+        rows = levels(
+            watched, record(good.take(slice(args.units, None)), ELSEWHERE + seed, args.loop, NEW_EPISODES, NEW_SECONDS)
+        )
         counts["any"].add(rows, {})
         counts["told"].add(rows, bounds)
         drives = faulty(seed, *kinds[0])
         for kind in kinds[1:]:
             drives = concatenate(drives, faulty(seed, *kind))
-        for unit, condition, level, motion in levels(watched, record(drives, ELSEWHERE + seed, args.loop, 1, NEW_SECONDS)):
+        for unit, condition, level, motion in levels(
+            watched, record(drives, ELSEWHERE + seed, args.loop, 1, NEW_SECONDS)
+        ):
             within = level[motion <= WITHIN_S].max()
             kind = kinds[int(unit)]
             found.setdefault((*kind, condition, "any"), []).append(within > 0)
@@ -177,7 +190,9 @@ def main() -> None:
 def show(args: argparse.Namespace, done: int, counts: dict[str, Count], found: dict[tuple, list[bool]]) -> None:
     """Print what was found so far."""
     for name, count in counts.items():
-        print(f"{args.loop} {args.method} {args.units} drives, rate {args.rate}, good drives, condition {name}: {count}")
+        print(
+            f"{args.loop} {args.method} {args.units} drives, rate {args.rate}, good drives, condition {name}: {count}"
+        )
     print(f"found within {WITHIN_S:g} s of motion, of {done}: condition told / not told")
     for kind, severities in FAULTS.items():
         for s in severities:

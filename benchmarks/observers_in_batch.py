@@ -21,7 +21,15 @@ from kros.core.lti import StateSpace, gain
 from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import summarise_all
 from kros.lifting import Lifting
-from kros.observer import ExtendedKalman, FilteredDifference, Observer, Runtime, run_observer, run_observers, track_parameter
+from kros.observer import (
+    ExtendedKalman,
+    FilteredDifference,
+    Observer,
+    Runtime,
+    run_observer,
+    run_observers,
+    track_parameter,
+)
 from kros.observer.baselines.learned import Features
 from kros.observer.baselines.learned_moments import Moments
 from kros.synthesis import Injection
@@ -42,7 +50,10 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=19_000)
     options = parser.parse_args()
     rng = np.random.default_rng(0)
-    blocks = [Block.of(rng, options.samples, min(EPISODES, options.episodes - i)) for i in range(0, options.episodes, EPISODES)]
+    blocks = [
+        Block.of(rng, options.samples, min(EPISODES, options.episodes - i))
+        for i in range(0, options.episodes, EPISODES)
+    ]
     found: dict[str, float] = {}
 
     def timed(name: str, work: Callable[[], Any], count: float = 1) -> Any:
@@ -63,13 +74,22 @@ def main() -> None:
         for order, count in zip(ORDERS, COUNTS, strict=True):
             work = partial(every, partial(side_by_side, [observer(lifting, order)] * TOGETHER))
             timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)
-        timed(f"1 {name} subspace-identified predictor of {MEMORIES} states", partial(every, partial(side_by_side, [memory])))
+        timed(
+            f"1 {name} subspace-identified predictor of {MEMORIES} states",
+            partial(every, partial(side_by_side, [memory])),
+        )
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
     timed("extended Kalman filter", lambda: every(lambda block: extended.run(block.y, block.u, block.phase)))
-    timed("filtered difference", lambda: every(lambda block: FilteredDifference(3, ((0, 1),), 100.0, DT).run(block.y, block.u)))
+    timed(
+        "filtered difference",
+        lambda: every(lambda block: FilteredDifference(3, ((0, 1),), 100.0, DT).run(block.y, block.u)),
+    )
     features = Features.of(KOOPMAN, (0,), blocks[0].y, blocks[0].u)
-    moments = timed("learned estimator, moments", lambda: Moments.of(features, (part for block in blocks for part in block.one_by_one())))
+    moments = timed(
+        "learned estimator, moments",
+        lambda: Moments.of(features, (part for block in blocks for part in block.one_by_one())),
+    )
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * (sum(COUNTS) + 1) + 3
     made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
@@ -83,9 +103,12 @@ def main() -> None:
     )
     late = observer(KOOPMAN, 9, Runtime(delay=3, upper=np.array([9.0, 9.0, 9.0])))
     timed(
-        "an observer with a delay of 3 samples and limits", lambda: every(lambda block: run_observer(late, block.y, block.u, block.phase))
+        "an observer with a delay of 3 samples and limits",
+        lambda: every(lambda block: run_observer(late, block.y, block.u, block.phase)),
     )
-    timed("phase-locked loop, 32 episodes", lambda: track_parameter(observer(KOOPMAN, 9), block.y, block.u, block.phase))
+    timed(
+        "phase-locked loop, 32 episodes", lambda: track_parameter(observer(KOOPMAN, 9), block.y, block.u, block.phase)
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,13 +126,21 @@ class Block:
         """Draw signals."""
         states, u = (0.1 * rng.normal(size=(samples, width, episodes)).swapaxes(1, 2) for width in (3, 2))
         return cls(
-            states, np.ascontiguousarray(states[..., :1]), u, {"phase": rng.uniform(-3, 3, size=episodes)}, np.full(episodes, samples)
+            states,
+            np.ascontiguousarray(states[..., :1]),
+            u,
+            {"phase": rng.uniform(-3, 3, size=episodes)},
+            np.full(episodes, samples),
         )
 
     def first(self, samples: int) -> Block:
         """The first samples."""
         return replace(
-            self, states=self.states[:samples], y=self.y[:samples], u=self.u[:samples], lengths=np.minimum(self.lengths, samples)
+            self,
+            states=self.states[:samples],
+            y=self.y[:samples],
+            u=self.u[:samples],
+            lengths=np.minimum(self.lengths, samples),
         )
 
     def of_lifting(self, lifting: Lifting) -> dict[str, np.ndarray] | None:

@@ -22,7 +22,17 @@ import numpy.typing as npt
 from kros.core.frequency import log_grid
 from kros.core.lti import StateSpace
 from kros.data.population import Population
-from kros.identify import Factor, PhaseSpec, combine, edmd, find_segments, lifted_factor, reduce_episode, resolve_branches, unit_phase
+from kros.identify import (
+    Factor,
+    PhaseSpec,
+    combine,
+    edmd,
+    find_segments,
+    lifted_factor,
+    reduce_episode,
+    resolve_branches,
+    unit_phase,
+)
 from kros.identify.edmd import smallest_stabilising_alpha
 from kros.lifting import Lifting
 from kros.plants import HarmonicDrivePopulation
@@ -58,7 +68,9 @@ def main() -> None:
             for form in options.forms:
                 for rate in options.rate:
                     print(
-                        f"| {kind} | {form} | {condition} | {100 * rate:g} % | " + " | ".join(count(populations, form, rate)) + " |",
+                        f"| {kind} | {form} | {condition} | {100 * rate:g} % | "
+                        + " | ".join(count(populations, form, rate))
+                        + " |",
                         flush=True,
                     )
 
@@ -108,7 +120,9 @@ def responses(factors: dict[str, Any], condition: str, kind: str) -> dict[float,
     for k, severity in enumerate((0.0, *SEVERITIES)):
         rows = [*range(N_UNITS)] if severity == 0 else [*range(N_UNITS), N_UNITS + k - 1]
         phase = {"phase": phases(factors, rows)}
-        raw = Factor(factors[f"R_{condition}"][rows], factors[f"peak_{condition}"][rows], factors[f"n_{condition}"][rows])
+        raw = Factor(
+            factors[f"R_{condition}"][rows], factors[f"peak_{condition}"][rows], factors[f"n_{condition}"][rows]
+        )
         both = {model: lifted_factor(raw, KOOPMAN, phase, model) for model in (KOOPMAN, Lifting(STATES))}
         alpha = ALPHA_FACTOR * smallest_stabilising_alpha([(f.R, model.n_lifted) for model, f in both.items()])
         factor, n = both[lifting], lifting.n_lifted
@@ -146,11 +160,17 @@ def simulate(seed: int, episodes: int, seconds: float) -> dict[str, Array]:
 
     def of(n_units: int, severity: float | None) -> Population:
         settings = {} if severity is None else {"outlier": True, "outlier_severity": severity}
-        return HarmonicDrivePopulation(n_units=n_units, n_episodes=episodes, seconds=seconds, seed=seed, **settings).simulate().population
+        return (
+            HarmonicDrivePopulation(n_units=n_units, n_episodes=episodes, seconds=seconds, seed=seed, **settings)
+            .simulate()
+            .population
+        )
 
     whole = of(N_UNITS, None)
     work = [(whole, u) for u in whole.unit_ids] + [(of(1, s), "000000") for s in SEVERITIES]
-    found: dict[str, list[Any]] = {"phases": []} | {f"{name}_{c}": [] for name in ("R", "peak", "n") for c in CONDITIONS}
+    found: dict[str, list[Any]] = {"phases": []} | {
+        f"{name}_{c}": [] for name in ("R", "peak", "n") for c in CONDITIONS
+    }
     for population, unit in work:
         spec = PhaseSpec()
         for condition in CONDITIONS:
@@ -159,7 +179,9 @@ def simulate(seed: int, episodes: int, seconds: float) -> dict[str, Array]:
             for name, value in (("R", factor.R), ("peak", factor.peak), ("n", factor.n_samples)):
                 found[f"{name}_{condition}"].append(value)
             if condition == "noload":
-                segments = [s for v in data for s in find_segments(v[:, 0], v[:, 4], v[:, 1], population.sample_period_s, spec)]
+                segments = [
+                    s for v in data for s in find_segments(v[:, 0], v[:, 4], v[:, 1], population.sample_period_s, spec)
+                ]
                 p = unit_phase(segments, unit)
                 found["phases"].append((p.phase_rad, p.lag_rad, p.concentration, p.n_segments))
     return {name: np.array(value) for name, value in found.items()}

@@ -23,8 +23,14 @@ from typing import Any
 KROS = [sys.executable, "-c", "from kros.cli import app; app()"]
 STUDIES = {
     "drives": ("harmonic-drive", '[data]\nsource = "drives"\nreader = "parquet"\n'),
-    "pendulums": ("pendulum", '[data]\nsource = "pendulums"\nreader = "parquet"\n[lifting]\nfunctions = ["sin(position)"]\n'),
-    "motors": ("dc-motor", '[data]\nsource = "motors-csv"\nreader = "csv"\n[lifting]\nfunctions = ["tanh(velocity)"]\n'),
+    "pendulums": (
+        "pendulum",
+        '[data]\nsource = "pendulums"\nreader = "parquet"\n[lifting]\nfunctions = ["sin(position)"]\n',
+    ),
+    "motors": (
+        "dc-motor",
+        '[data]\nsource = "motors-csv"\nreader = "csv"\n[lifting]\nfunctions = ["tanh(velocity)"]\n',
+    ),
 }
 MAPPING = """[data.csv]
 files = '(?P<unit>[^/]+)/(?P<episode>[^/]+)\\.csv'
@@ -62,7 +68,9 @@ def main() -> None:
     what.add_argument("--save", type=Path)
     what.add_argument("--against", type=Path)
     parser.add_argument("--rtol", type=float, default=1e-9)
-    parser.add_argument("--only", choices=list(STUDIES), nargs="+", default=list(STUDIES), help="compare with these alone")
+    parser.add_argument(
+        "--only", choices=list(STUDIES), nargs="+", default=list(STUDIES), help="compare with these alone"
+    )
     options = parser.parse_args()
     folder = options.save or options.against
     if options.save:
@@ -72,7 +80,9 @@ def main() -> None:
     if options.save:
         (folder / "results.json").write_text(json.dumps(results, indent=1))
         return
-    before = {name: found for name, found in json.loads((folder / "results.json").read_text()).items() if name in options.only}
+    before = {
+        name: found for name, found in json.loads((folder / "results.json").read_text()).items() if name in options.only
+    }
     changes = sorted(differences(before, results, options.rtol), key=lambda c: -c[0])
     for size, text in changes[:60]:
         print(f"{size:.2g}  {text}")
@@ -84,7 +94,21 @@ def record(folder: Path) -> None:
     """Simulate the recordings and write the studies."""
     folder.mkdir(parents=True)
     for name, (plant, text) in STUDIES.items():
-        run("simulate", folder / name, "--plant", plant, "--units", "5", "--episodes", "5", "--seconds", "6", "--seed", "11", "--outlier")
+        run(
+            "simulate",
+            folder / name,
+            "--plant",
+            plant,
+            "--units",
+            "5",
+            "--episodes",
+            "5",
+            "--seconds",
+            "6",
+            "--seed",
+            "11",
+            "--outlier",
+        )
         (folder / f"{name}.toml").write_text(text + (MAPPING if name == "motors" else ""))
     write_csv(folder / "motors", folder / "motors-csv")
 

@@ -33,7 +33,10 @@ def main() -> None:
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
             print(
-                json.dumps({"seed": seed, "loop": options.loop, "hidden": options.hide, **study(Path(folder), seed, options)}), flush=True
+                json.dumps(
+                    {"seed": seed, "loop": options.loop, "hidden": options.hide, **study(Path(folder), seed, options)}
+                ),
+                flush=True,
             )
 
 
@@ -70,7 +73,9 @@ def facts(metrics: dict[str, Any]) -> dict[str, Any]:
                 c: [r["error_percent"] for r in rows if (r["observer"], r["channel"]) == (name, c)]
                 for c in ("position", "velocity", "current")
             }
-            found[name] = {c: round(sum(v) / len(v), 6) for c, v in errors.items() if v} or metrics["observers"][name].get("reason")
+            found[name] = {c: round(sum(v) / len(v), 6) for c, v in errors.items() if v} or metrics["observers"][
+                name
+            ].get("reason")
         weight = metrics["uncertainty"][model]["weight"]
         found[f"{model}/weight"] = {k: weight[k] for k in ("structure", "cover_max", "overbound_db_max", "orders")}
     loaded = sorted((r for r in metrics["outliers"] if r["condition"] == "load"), key=lambda r: -r["score"])

@@ -18,7 +18,9 @@ from kros.synthesis import GeneralizedPlant, Injection
 Array = npt.NDArray[np.float64]
 DT = 1e-3
 STATES = ("position", "velocity", "current")
-QUADRATIC = Lifting(STATES, tuple(f"{a}*{b}" for i, a in enumerate(STATES) for b in STATES[i:]))  # as pykoop orders them
+QUADRATIC = Lifting(
+    STATES, tuple(f"{a}*{b}" for i, a in enumerate(STATES) for b in STATES[i:])
+)  # as pykoop orders them
 GEAR = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
 
 
@@ -49,7 +51,9 @@ def raw_drives(n_episodes: int, seconds: float = 19.0) -> Population:
     raw = HarmonicDrivePopulation(n_units=1, n_episodes=2, seconds=seconds, conditions=("noload",)).simulate().raw
     keys = tuple(EpisodeKey("000000", "noload", str(e)) for e in range(n_episodes))
     units = (Unit("000000", "population"),)
-    return Population(raw.channels, raw.sample_period_s, units, keys, Repeated(tuple(map(raw.read, raw.episodes))), raw.metadata)
+    return Population(
+        raw.channels, raw.sample_period_s, units, keys, Repeated(tuple(map(raw.read, raw.episodes))), raw.metadata
+    )
 
 
 def lags(n_units: int, seed: int = 0) -> StateSpace:
@@ -81,9 +85,14 @@ def plant(n: int, dt: float = 0.0, seed: int = 0) -> GeneralizedPlant:
     A = rng.normal(size=(n, n)) / np.sqrt(n)
     A = A - 0.5 * np.eye(n) if dt == 0 else 0.95 * A / np.abs(np.linalg.eigvals(A)).max()
     zero, one = np.zeros((2, 2)), np.eye(2)
-    B1, C1 = np.hstack([rng.normal(size=(n, 2)), np.zeros((n, 2))]), np.vstack([rng.normal(size=(2, n)), np.zeros((2, n))])
+    B1, C1 = (
+        np.hstack([rng.normal(size=(n, 2)), np.zeros((n, 2))]),
+        np.vstack([rng.normal(size=(2, n)), np.zeros((2, n))]),
+    )
     D12, D21 = np.vstack([zero, one]), np.hstack([zero, one])
-    return GeneralizedPlant(A, B1, rng.normal(size=(n, 2)), C1, rng.normal(size=(2, n)), np.zeros((4, 4)), D12, D21, zero, dt)
+    return GeneralizedPlant(
+        A, B1, rng.normal(size=(n, 2)), C1, rng.normal(size=(2, n)), np.zeros((4, 4)), D12, D21, zero, dt
+    )
 
 
 def two_channels() -> GeneralizedPlant:

@@ -51,7 +51,9 @@ def main() -> None:
 def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate one population, identify and quantify it, return the facts."""
     recordings, out = folder / "recordings", folder / "run"
-    simulate_to(recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, spread, loop, False, "parquet")
+    simulate_to(
+        recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, spread, loop, False, "parquet"
+    )
     raw = {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": True}}
     config = validate_config(raw, folder)
     metrics = run_study(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
@@ -97,9 +99,15 @@ def percent(context: Context, models: ModelSet, pooled: KoopmanMatrices | None =
     out = np.zeros((len(models.unit_ids), models.lifting.n_states))
     for row, unit in enumerate(models.unit_ids):
         A, B = (models.A[row], models.B[row]) if pooled is None else (pooled.A, pooled.B)
-        parts = [context.population.read_parts(key) for key in context.facts.keys("test", unit, context.facts.identify_on)]
+        parts = [
+            context.population.read_parts(key) for key in context.facts.keys("test", unit, context.facts.identify_on)
+        ]
         x, u = np.stack([p[0] for p in parts]), np.stack([p[1] for p in parts])
-        own = {} if not models.lifting.parameters or calibration is None else {"phase": np.full(len(x), calibration.units[unit].phase_rad)}
+        own = (
+            {}
+            if not models.lifting.parameters or calibration is None
+            else {"phase": np.full(len(x), calibration.units[unit].phase_rad)}
+        )
         run = free_run(A, B, models.lifting, own, x[:, 0], u)
         out[row] = np.mean(100 * np.sqrt(np.mean((run - x) ** 2, axis=1)) / np.abs(x).max(axis=1), axis=0)
     return out

@@ -70,7 +70,12 @@ def main() -> None:
             continue
         start = time.perf_counter()
         run = study(folder, seed, loop, spread, options)
-        told: dict[str, Any] = {"loop": loop, "spread": spread, "seed": seed, "study_s": round(time.perf_counter() - start, 1)}
+        told: dict[str, Any] = {
+            "loop": loop,
+            "spread": spread,
+            "seed": seed,
+            "study_s": round(time.perf_counter() - start, 1),
+        }
         if not options.only_studies:
             found = certified(folder, run, options)
             rows.append(found)
@@ -85,13 +90,28 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     recordings, run = folder / "recordings", folder / "run"
     if not (run / "observers" / "made.json").exists():
         shutil.rmtree(folder, ignore_errors=True)
-        simulate_to(recordings, "harmonic-drive", options.units, options.episodes, options.seconds, seed, spread, loop, False, "parquet")
+        simulate_to(
+            recordings,
+            "harmonic-drive",
+            options.units,
+            options.episodes,
+            options.seconds,
+            seed,
+            spread,
+            loop,
+            False,
+            "parquet",
+        )
         config = validate_config({**STUDY, "data": {"source": str(recordings.absolute()), "reader": "parquet"}}, folder)
         run_study(config, run, until=Stage.QUANTIFY, workers=options.workers)
         with open_executor(options.workers) as executor:
             context = Context(config, Store(run), Work(executor))
             wanted = {*config.observer.baselines, *config.synthesis.methods}
-            tasks = [task for kind in KINDS for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.predictor)]
+            tasks = [
+                task
+                for kind in KINDS
+                for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.predictor)
+            ]
             made = []
             for task, product in zip(tasks, context.work.map("synthesize", design, tasks), strict=True):
                 if product.observer is not None:
@@ -103,12 +123,22 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
 
 def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str, Any]:
     """Certify and attack every observer of one population."""
-    config = validate_config({**STUDY, "data": {"source": str((folder / "recordings").absolute()), "reader": "parquet"}}, folder)
+    config = validate_config(
+        {**STUDY, "data": {"source": str((folder / "recordings").absolute()), "reader": "parquet"}}, folder
+    )
     with open_executor(1) as executor:
         context = Context(config, Store(run), Work(executor))
-        facts, calibration, population = context.facts, context.identified.calibration, read_parquet(folder / "recordings")
+        facts, calibration, population = (
+            context.facts,
+            context.identified.calibration,
+            read_parquet(folder / "recordings"),
+        )
         keys = [facts.keys("train", unit, facts.identify_on)[0] for unit in facts.pooled]
-        units = {} if calibration is None else {unit: {"phase": phase.phase_rad} for unit, phase in calibration.units.items()}
+        units = (
+            {}
+            if calibration is None
+            else {unit: {"phase": phase.phase_rad} for unit, phase in calibration.units.items()}
+        )
         batch = EpisodeBatch.read(population, keys, parameters=units)
     noise = np.array([facts.resolution["position"] / np.sqrt(12)])
     found = {}
@@ -122,7 +152,9 @@ def certified(folder: Path, run: Path, options: argparse.Namespace) -> dict[str,
     return found
 
 
-def judged(observer: Observer, batch: EpisodeBatch, values: Any, noise: np.ndarray, options: argparse.Namespace) -> dict[str, Any]:
+def judged(
+    observer: Observer, batch: EpisodeBatch, values: Any, noise: np.ndarray, options: argparse.Namespace
+) -> dict[str, Any]:
     """Return what is certified about one observer, how close its errors come, and how close the adversary does."""
     residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
     scales = ReliftScales.typical(np.abs(batch.states).max(axis=(0, 1)), residual, noise)
@@ -144,7 +176,10 @@ def judged(observer: Observer, batch: EpisodeBatch, values: Any, noise: np.ndarr
         "lower_bound": certificate.lower_bound,
         "mismatch_gain": certificate.mismatch_gain,
     }
-    told |= {"error_of_bound": [r.error / r.bound for r in rows], "error_of_gain_bound": [r.error / r.gain_bound for r in rows]}
+    told |= {
+        "error_of_bound": [r.error / r.bound for r in rows],
+        "error_of_gain_bound": [r.error / r.gain_bound for r in rows],
+    }
     told |= {
         "attack": worst.share,
         "attack_running": share,
@@ -167,8 +202,12 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
                 "gain_over_lower_bound_max": rounded(max(m["gain"] / m["lower_bound"] for m in made)),
                 "attack_share": [rounded(f([m["attack"] for m in made])) for f in (min, max)],
                 "attack_running_share": [rounded(f([m["attack_running"] for m in made])) for f in (min, max)],
-                "error_of_bound": [rounded(f([v for m in made for v in m["error_of_bound"]])) for f in (min, np.median, max)],
-                "error_of_gain_bound": [rounded(f([v for m in made for v in m["error_of_gain_bound"]])) for f in (min, np.median, max)],
+                "error_of_bound": [
+                    rounded(f([v for m in made for v in m["error_of_bound"]])) for f in (min, np.median, max)
+                ],
+                "error_of_gain_bound": [
+                    rounded(f([v for m in made for v in m["error_of_gain_bound"]])) for f in (min, np.median, max)
+                ],
                 "states_max": max(m["states"] for m in made),
                 "cpu_s_max": max(m["cpu_s"] for m in made),
                 "steps_min": min(m["steps"] for m in made),

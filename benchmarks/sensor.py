@@ -62,7 +62,10 @@ def held_out(uncertain: UncertainModels, population: Any, units: list[str]) -> E
     calibration = uncertain.models.calibration
     assert calibration is not None
     keys = {u: [k for k in population.episodes if (k.unit, k.condition) == (u, "noload")] for u in units}
-    found = {u: calibration.calibrate(segments_of((population.select([u]), tuple(own), calibration.spec)), u) for u, own in keys.items()}
+    found = {
+        u: calibration.calibrate(segments_of((population.select([u]), tuple(own), calibration.spec)), u)
+        for u, own in keys.items()
+    }
     phases = {u: {calibration.spec.parameter: phase.phase_rad} for u, phase in found.items()}
     return EpisodeBatch.read(population, [k for own in keys.values() for k in own[-2:]], parameters=phases)
 
@@ -90,16 +93,29 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=2)
     args = parser.parse_args()
     uncertain, population, units = prepared(args.folder, args.loop, args.seed)
-    batch, predictor = held_out(uncertain, population, units), PredictorSettings(steps=args.steps, episodes=args.episodes)
+    batch, predictor = (
+        held_out(uncertain, population, units),
+        PredictorSettings(steps=args.steps, episodes=args.episodes),
+    )
     size, step = uncertain.models.sizes["position"], uncertain.models.facts.resolution["position"]
     untold: dict[str, Run] = {}
-    print("| sensor | predictor, told | untold | learned, told | untold | tuned Kalman, told | open loop |\n|" + "---|" * 7)
+    print(
+        "| sensor | predictor, told | untold | learned, told | untold | tuned Kalman, told | open loop |\n|"
+        + "---|" * 7
+    )
     for name, declared in sensors(size, step).items():
         sensor = {"position": Sensor(**declared)} if declared else {}  # type: ignore[arg-type]
         told = designs(uncertain, sensor, predictor)
         untold = untold or told
         shown = as_shown(batch, sensor, population.states)
-        columns = (told["memory"], untold["memory"], told["learned"], untold["learned"], told["kalman_tuned"], told["open_loop"])
+        columns = (
+            told["memory"],
+            untold["memory"],
+            told["learned"],
+            untold["learned"],
+            told["kalman_tuned"],
+            told["open_loop"],
+        )
         cells = []
         for run in columns:
             errors = error_percent(run(shown)[..., : len(population.states)], shown.states, shown.lengths)[:, HIDDEN]

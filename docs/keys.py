@@ -25,7 +25,11 @@ def written(kind: object) -> str:
     if origin in (types.UnionType, typing.Union):
         return " or ".join(filter(None, map(written, inside)))
     if origin is tuple:
-        return "list of tables" if dataclasses.is_dataclass(inside[0]) or "table" in written(inside[0]) else f"list: {written(inside[0])}"
+        return (
+            "list of tables"
+            if dataclasses.is_dataclass(inside[0]) or "table" in written(inside[0])
+            else f"list: {written(inside[0])}"
+        )
     if isinstance(origin, type) and issubclass(origin, Mapping):
         return "table"
     if isinstance(kind, type) and kind in WORDS:
@@ -40,7 +44,13 @@ def shown(value: object) -> str:
         return str(value).lower()
     if isinstance(value, str):
         return f'"{value}"'
-    return f"[{', '.join(map(shown, value))}]" if isinstance(value, tuple) else f"{value:g}" if isinstance(value, float) else str(value)
+    return (
+        f"[{', '.join(map(shown, value))}]"
+        if isinstance(value, tuple)
+        else f"{value:g}"
+        if isinstance(value, float)
+        else str(value)
+    )
 
 
 def default(value: object) -> str:
@@ -71,7 +81,12 @@ def settings_rows(model: type[Settings]) -> list[tuple[str, str, str, str]]:
     for name, field in model.model_fields.items():
         if name in inner:
             continue
-        bounds = [f"{word} {getattr(limit, key):g}" for limit in field.metadata for key, word in LIMITS.items() if hasattr(limit, key)]
+        bounds = [
+            f"{word} {getattr(limit, key):g}"
+            for limit in field.metadata
+            for key, word in LIMITS.items()
+            if hasattr(limit, key)
+        ]
         value = ", ".join([written(field.annotation), *bounds])
         said = "required" if field.is_required() else default(None if field.default_factory else field.default)
         rows.append((f"`{name}`", value, said, field.description or ""))
@@ -105,7 +120,9 @@ def summary(kind: type) -> str:
 def study_keys() -> str:
     """Return a section for every table of a study."""
     parts = [f"### Keys outside of tables\n\n{table(settings_rows(StudyConfig))}"]
-    parts += [f"### `[{name}]`\n\n{summary(kind)}\n\n{table(settings_rows(kind))}" for name, kind in sections(StudyConfig)]
+    parts += [
+        f"### `[{name}]`\n\n{summary(kind)}\n\n{table(settings_rows(kind))}" for name, kind in sections(StudyConfig)
+    ]
     return "\n".join(parts)
 
 

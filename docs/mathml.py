@@ -39,7 +39,9 @@ def visit_block(self: HTML5Translator, node: nodes.math_block) -> None:
     """Write a formula of its own, and the number that a tag gives it."""
     formula = node.astext()
     number = "".join(f'<span class="eqno">({text})</span>' for text in TAG.findall(formula))
-    self.body.append(f"{self.starttag(node, 'div', CLASS='math')}{number}{mathml(node, TAG.sub('', formula), block=True)}</div>\n")
+    self.body.append(
+        f"{self.starttag(node, 'div', CLASS='math')}{number}{mathml(node, TAG.sub('', formula), block=True)}</div>\n"
+    )
     raise nodes.SkipNode
 
 

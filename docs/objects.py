@@ -24,13 +24,19 @@ COMMENT = "<!-- objects -->"
 @cache
 def packages() -> tuple[ModuleType, ...]:
     """Return the packages of kros that list names, in alphabetical order."""
-    public = (m.name for m in pkgutil.walk_packages(kros.__path__, "kros.") if m.ispkg and m.name.split(".")[1] in kros.__all__)
+    public = (
+        m.name
+        for m in pkgutil.walk_packages(kros.__path__, "kros.")
+        if m.ispkg and m.name.split(".")[1] in kros.__all__
+    )
     return tuple(package for package in map(importlib.import_module, sorted(public)) if hasattr(package, "__all__"))
 
 
 def members(package: ModuleType) -> list[str]:
     """Return the full names of a package's public objects, without the packages in it."""
-    return [f"{package.__name__}.{name}" for name in package.__all__ if not isinstance(getattr(package, name), ModuleType)]
+    return [
+        f"{package.__name__}.{name}" for name in package.__all__ if not isinstance(getattr(package, name), ModuleType)
+    ]
 
 
 @cache

@@ -22,7 +22,13 @@ os.environ["PYTHONWARNINGS"] = "error::RuntimeWarning"
 
 # Files that need the demo's study, which is made once for all of them, and what takes longest and begins first, that processes end together.
 DEMO = {f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "robustness")}
-LONGEST = ["demo", *(f"tests/e2e/test_{name}.py" for name in ("examples", "short_way", "units_of_measure", "run_folder", "demo_command"))]
+LONGEST = [
+    "demo",
+    *(
+        f"tests/e2e/test_{name}.py"
+        for name in ("examples", "short_way", "units_of_measure", "run_folder", "demo_command")
+    ),
+]
 
 
 def group_of(nodeid: str) -> str:
@@ -34,8 +40,14 @@ def group_of(nodeid: str) -> str:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the longest first; refuse a file that would make the demo's study once more."""
     groups = {item.nodeid: group_of(item.nodeid) for item in items}
-    if unknown := {item.path.name for item in items if "demo" in getattr(item, "fixturenames", ()) and groups[item.nodeid] != "demo"}:
-        raise pytest.UsageError(f"tests/conftest.py, DEMO: should name {', '.join(sorted(unknown))}, which needs the demo's study.")
+    if unknown := {
+        item.path.name
+        for item in items
+        if "demo" in getattr(item, "fixturenames", ()) and groups[item.nodeid] != "demo"
+    }:
+        raise pytest.UsageError(
+            f"tests/conftest.py, DEMO: should name {', '.join(sorted(unknown))}, which needs the demo's study."
+        )
     items.sort(key=lambda item: LONGEST.index(groups[item.nodeid]) if groups[item.nodeid] in LONGEST else len(LONGEST))
 
 

@@ -47,7 +47,9 @@ def main() -> None:
     for part in given.parts:
         print(f"== {part}", flush=True)
         for name, (observer, track) in kinds.items():
-            for line in {"python": against_python, "turns": turned, "day": day, "clock": clock}[part](observer, track, data, given):
+            for line in {"python": against_python, "turns": turned, "day": day, "clock": clock}[part](
+                observer, track, data, given
+            ):
                 print(f"{name:<28}{line}", flush=True)
 
 
@@ -55,7 +57,9 @@ def read(run: Path) -> tuple[dict[str, tuple[Observer, str | None]], HeldOut]:
     """Return the observers of a run with variants of the deployed one, and its held-out recordings."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         paths = sorted(p for p in store.path("observers").glob("*/*.json"))
-        kinds: dict[str, tuple[Observer, str | None]] = {f"{p.parent.name}/{p.stem}": (Observer.load(p), None) for p in paths}
+        kinds: dict[str, tuple[Observer, str | None]] = {
+            f"{p.parent.name}/{p.stem}": (Observer.load(p), None) for p in paths
+        }
         deployed = Observer.load(store.path("observers", "deployed.json"))
         data = exporting.held_out(config, store, deployed)
     assert data is not None, "the run's recordings are gone"
@@ -97,11 +101,15 @@ def faulty(data: HeldOut, seed: int, share: float = 2e-3) -> tuple[np.ndarray, n
 
 def in_python(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str | None) -> np.ndarray:
     """Return estimates of the recorded states."""
-    found = run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
+    found = (
+        run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
+    )
     return found[..., : len(observer.recorded)]
 
 
-def in_c(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str | None, precision: str) -> tuple[np.ndarray, np.ndarray]:
+def in_c(
+    observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str | None, precision: str
+) -> tuple[np.ndarray, np.ndarray]:
     """Return estimates, the first not a number, and status."""
     compiled = build(observer, track, precision)
     found, status = np.full((*y.shape[:2], len(observer.recorded)), np.nan), np.empty(y.shape[:2], dtype=np.uint32)
@@ -113,7 +121,9 @@ def in_c(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str
 
 def build(observer: Observer, track: str | None, precision: str) -> CompiledObserver:
     """Export and compile."""
-    return CompiledObserver.build(export_c(observer, Path(tempfile.mkdtemp()) / "c", "observer", precision, track=track))
+    return CompiledObserver.build(
+        export_c(observer, Path(tempfile.mkdtemp()) / "c", "observer", precision, track=track)
+    )
 
 
 def rms(values: np.ndarray) -> np.ndarray:
@@ -189,7 +199,10 @@ def turned(observer: Observer, track: str | None, data: HeldOut, given: argparse
 
 def in_steps(observer: Observer, track: str | None, y: np.ndarray, u: np.ndarray, own: dict) -> np.ndarray:
     """Return estimates of the first machine, from the observer that runs in Python sample by sample."""
-    running, found = observer.start(y[0, 0], {p: float(v[0]) for p, v in own.items()}), np.empty((*y.shape[:2], len(observer.recorded)))
+    running, found = (
+        observer.start(y[0, 0], {p: float(v[0]) for p, v in own.items()}),
+        np.empty((*y.shape[:2], len(observer.recorded))),
+    )
     if track is not None:
         running.track(track)
     for k in range(len(y)):
@@ -213,8 +226,14 @@ def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.
     """Return the estimates in extended precision, written out."""
     lifting, K, real = observer.lifting, observer.controller, np.longdouble
     n, first = lifting.n_states, run_observer(observer, y[:2], u[:2], own)[0]
-    A, B, into, *linear = (np.asarray(M, dtype=real) for M in (observer.A[:n], observer.B[:n], observer.into[:n], K.A, K.B, K.C, K.D))
-    x, x_c, found = first.astype(real), np.zeros((y.shape[1], K.n_states), dtype=real), np.empty((*y.shape[:2], n), dtype=real)
+    A, B, into, *linear = (
+        np.asarray(M, dtype=real) for M in (observer.A[:n], observer.B[:n], observer.into[:n], K.A, K.B, K.C, K.D)
+    )
+    x, x_c, found = (
+        first.astype(real),
+        np.zeros((y.shape[1], K.n_states), dtype=real),
+        np.empty((*y.shape[:2], n), dtype=real),
+    )
     values = {p: np.asarray(own.get(p, observer.parameters.get(p)), dtype=real) for p in lifting.parameters}
     for k in range(len(y)):
         found[k] = x
@@ -258,7 +277,11 @@ def day(observer: Observer, track: str | None, data: HeldOut, given: argparse.Na
         yield (
             f"{precision}, {'with' if share else 'without'} faults: {steps / hour:.2f} h at {1 / observer.sample_period_s:g} Hz, "
             f"{'finite' if finite else 'NOT FINITE'}, largest estimates {times} times the largest recorded; bits 1, 2, 4, 8 in {bits.tolist()} samples"
-            + ("" if share else f"; outside the certificate for a share of these of {data.y.shape[1]} episodes: {outside}")
+            + (
+                ""
+                if share
+                else f"; outside the certificate for a share of these of {data.y.shape[1]} episodes: {outside}"
+            )
         )
 
 
@@ -294,10 +317,17 @@ def clock(observer: Observer, track: str | None, data: HeldOut, given: argparse.
     """Yield one line: time of a step, the best of several runs."""
     from kros.export.c99.write import c_files
 
-    compiled, y, u = build(observer, track, "double"), np.ascontiguousarray(data.y[:, 0]), np.ascontiguousarray(data.u[:, 0])
+    compiled, y, u = (
+        build(observer, track, "double"),
+        np.ascontiguousarray(data.y[:, 0]),
+        np.ascontiguousarray(data.u[:, 0]),
+    )
     readme = c_files(observer, "observer", "double", track)["README.md"]
     operations = int(next(row for row in readme.splitlines() if row.startswith("| multiplications")).split("|")[2])
-    context, rows = Source.of(observer, "observer", "double").context(), observer.lifting.n_states + observer.controller.n_states
+    context, rows = (
+        Source.of(observer, "observer", "double").context(),
+        observer.lifting.n_states + observer.controller.n_states,
+    )
     lifted = len(context["sigma"])
     functions = "".join(f"z[{i}] = {'sin' if i % 2 else 'cos'}(100.0 * y[k] + 0.3); " for i in range(lifted))
     text = HAND.format(rows=rows, columns=max(-(-operations // rows), lifted, 2), m=u.shape[1], functions=functions)
@@ -306,7 +336,9 @@ def clock(observer: Observer, track: str | None, data: HeldOut, given: argparse.
     import subprocess
 
     subprocess.run(
-        ["cc", "-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "hand.c", "-o", "hand.so", "-lm"], cwd=folder, check=True
+        ["cc", "-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "hand.c", "-o", "hand.so", "-lm"],
+        cwd=folder,
+        check=True,
     )
     hand = ctypes.CDLL(str(folder / "hand.so")).by_hand
     hand.restype = ctypes.c_double

@@ -88,7 +88,10 @@ def draw(seed: int, n_units: int, spread: float) -> dict[str, Array]:
     rows = []
     for unit in range(n_units):
         rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(71, unit)))
-        row = {name: value * np.exp(spread * deviation * rng.standard_normal()) for name, (value, deviation) in NOMINAL.items()}
+        row = {
+            name: value * np.exp(spread * deviation * rng.standard_normal())
+            for name, (value, deviation) in NOMINAL.items()
+        }
         rows.append(row | {name: rng.uniform(0.0, 2 * np.pi) for name in ANGLES})
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
@@ -230,7 +233,9 @@ def simulate(
     keys = [EpisodeKey(u, c, str(e)) for u in units for c in sorted(conditions) for e in range(n_episodes)]
     rows = np.repeat(np.arange(n_units), len(conditions) * n_episodes)
     parameters = draw(seed, n_units, spread)
-    references = [SPEED * np.stack(episode_reference(seed, e, n_samples, REST_SAMPLES, PERIOD_S)) for e in range(n_episodes)]
+    references = [
+        SPEED * np.stack(episode_reference(seed, e, n_samples, REST_SAMPLES, PERIOD_S)) for e in range(n_episodes)
+    ]
     targets = np.stack([references[int(k.episode)] for k in keys], axis=1)
     loaded = np.array([float(k.condition == "load") for k in keys])
     signals = run({name: value[rows] for name, value in parameters.items()}, loaded, targets, limit)[..., REST_SAMPLES:]
@@ -238,8 +243,13 @@ def simulate(
     signals[2] += CURRENT_NOISE * rng.standard_normal(signals[2].shape)
     parts = {key: (signals[:3, i], targets[:, i, REST_SAMPLES:], signals[3:, i]) for i, key in enumerate(keys)}
     metadata = {"plant": "compliant-drive", "gear_ratio": GEAR_RATIO}
-    population = Population(CHANNELS, PERIOD_S, tuple(Unit(u) for u in units), tuple(keys), SimulatedEpisodes(parts), metadata, TRUTHS)
-    return population, {"limit": limit, "units": {u: {n: float(v[i]) for n, v in parameters.items()} for i, u in enumerate(units)}}
+    population = Population(
+        CHANNELS, PERIOD_S, tuple(Unit(u) for u in units), tuple(keys), SimulatedEpisodes(parts), metadata, TRUTHS
+    )
+    return population, {
+        "limit": limit,
+        "units": {u: {n: float(v[i]) for n, v in parameters.items()} for i, u in enumerate(units)},
+    }
 
 
 def main() -> None:

@@ -26,7 +26,12 @@ def read_parts(out: Path, name: str, part: str) -> list[dict[str, Any]]:
 
 
 def errors(
-    parts: Sequence[Mapping[str, Any]], observer: str, condition: str, channel: str, what: str = "error_percent", **case: Any
+    parts: Sequence[Mapping[str, Any]],
+    observer: str,
+    condition: str,
+    channel: str,
+    what: str = "error_percent",
+    **case: Any,
 ) -> dict[str, float]:
     """Return an observer's error of every unit; `deployed` is every fold's own. Infinite where it diverged, absent where it was not made."""
     found = {}
@@ -35,7 +40,9 @@ def errors(
         if isinstance(wanted, Mapping):
             wanted = wanted[case["case"] if case["told"] else ""]
         for r in part["rows"]:
-            if (r["observer"], r["condition"], r["channel"]) == (wanted, condition, channel) and all(r[k] == v for k, v in case.items()):
+            if (r["observer"], r["condition"], r["channel"]) == (wanted, condition, channel) and all(
+                r[k] == v for k, v in case.items()
+            ):
                 found[f"{part['fold']}/{r['unit']}"] = np.inf if r[what] is None else float(r[what])
     return found
 
@@ -63,7 +70,9 @@ def table(out: Path, names: Sequence[str]) -> None:
     """Print everything that is there."""
     for name in names:
         if parts := read_parts(out, name, "accuracy"):
-            say(f"\n== {name}: {len(parts)} of {FOLDS} folds, {sum(p['seconds'].get('accuracy', 0) for p in parts):.0f} s")
+            say(
+                f"\n== {name}: {len(parts)} of {FOLDS} folds, {sum(p['seconds'].get('accuracy', 0) for p in parts):.0f} s"
+            )
             show_accuracy(parts)
     say("\n== In short (deployed over learned, units left out)")
     for name in names:
@@ -77,7 +86,9 @@ def show_accuracy(parts: Sequence[Mapping[str, Any]]) -> None:
     """Print one population."""
     for part in parts:
         facts = part["facts"][part["deployed"]]
-        known = [f"{k} {_short(v)}" for k, v in facts.items() if re.search(PROOFS, k) and not isinstance(v, (Mapping, list))]
+        known = [
+            f"{k} {_short(v)}" for k, v in facts.items() if re.search(PROOFS, k) and not isinstance(v, (Mapping, list))
+        ]
         say(f"fold {part['fold']}: deployed {part['deployed']}, {', '.join(known)}")
     conditions, hidden = conditions_of(parts), hidden_of(parts)
     say(f"{'deployed over learned':58s} {'mean':>7s} {'95 %':>7s} {'worst':>7s}")
@@ -86,7 +97,10 @@ def show_accuracy(parts: Sequence[Mapping[str, Any]]) -> None:
             own, other = (errors(parts, o, condition, channel, what) for o in ("deployed", LEARNED))
             text = f"  {condition}, {channel}{'' if what == 'error_percent' else ', ' + what.split('_')[0]}"
             say(ratio(own, other, text) + f"   {np.mean([*own.values()]):.4g} / {np.mean([*other.values()]):.4g} %")
-    say(f"{f'{conditions[0]}, mean over units (worst)':28s}" + "".join(f"{f'{c}: % / open loop / learned':>46s}" for c in hidden))
+    say(
+        f"{f'{conditions[0]}, mean over units (worst)':28s}"
+        + "".join(f"{f'{c}: % / open loop / learned':>46s}" for c in hidden)
+    )
     for observer in dict.fromkeys(r["observer"] for p in parts for r in p["rows"]):
         cells = []
         for channel in hidden:
@@ -111,7 +125,8 @@ def show_accuracy(parts: Sequence[Mapping[str, Any]]) -> None:
 def show_truth(parts: Sequence[Mapping[str, Any]], condition: str, observer: str, prefix: str, title: str) -> None:
     """Print error and lag against the true velocity."""
     error, lag = (
-        np.mean([*errors(parts, observer, condition, "velocity", f"{prefix}{what}").values()]) for what in ("error_percent", "lag_s")
+        np.mean([*errors(parts, observer, condition, "velocity", f"{prefix}{what}").values()])
+        for what in ("error_percent", "lag_s")
     )
     say(f"  true velocity, {title}: error {error:.4g} %, lag {1e3 * lag:.3f} ms")
 
@@ -143,7 +158,9 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
     deployed = [p["facts"][p["deployed"]] for p in parts]
     made = ", ".join(dict.fromkeys(p["deployed"] for p in parts))
     proofs = [sum(f.get(key) is True for f in deployed) for key in ("relift_certified", "set_certified")]
-    say(f"  {name:24s} deployed {made}; certified as it runs {proofs[0]}, for the set of signals {proofs[1]} of {len(parts)}")
+    say(
+        f"  {name:24s} deployed {made}; certified as it runs {proofs[0]}, for the set of signals {proofs[1]} of {len(parts)}"
+    )
     bounds(name, "deployed", deployed)
     for condition, channel in product(conditions, hidden):
         values = paired(*(errors(parts, o, condition, channel) for o in ("deployed", LEARNED)))
@@ -162,10 +179,18 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
             line(name, f"{what}: upper limit of the mean ratio", upper(values), 1.03, f"mean {values.mean():.3f}")
             line(name, f"{what}: worst unit", values.max(), 1.1)
         elif condition == conditions[0]:
-            line(name, f"{what}: mean ratio", values.mean(), 0.85, f"upper limit {upper(values):.3f}, worst {values.max():.3f}")
+            line(
+                name,
+                f"{what}: mean ratio",
+                values.mean(),
+                0.85,
+                f"upper limit {upper(values):.3f}, worst {values.max():.3f}",
+            )
     robust = [o for o in dict.fromkeys(r["observer"] for p in parts for r in p["rows"]) if "worst_case_h2" in o]
     for channel, most in (("velocity", 0.35), ("current", 0.85)) if not short and not limited else ():
-        found = {o: paired(*(errors(parts, x, conditions[0], channel) for x in (o, open_loop_of(o)))).mean() for o in robust}
+        found = {
+            o: paired(*(errors(parts, x, conditions[0], channel) for x in (o, open_loop_of(o)))).mean() for o in robust
+        }
         if found:
             best = min(found, key=lambda o: found[o])
             bounds(name, best, [p["facts"][best] for p in parts if best in p["facts"]])
@@ -175,10 +200,17 @@ def verdict(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
 def bounds(name: str, observer: str, facts: Sequence[Mapping[str, Any]]) -> None:
     """Print the certified bound of the units in the set over their error, least and largest, where there is one."""
     least, most = (
-        [f[f"set_bound_to_error_{end}"] for f in facts if f.get(f"set_bound_to_error_{end}") is not None] for end in ("min", "max")
+        [f[f"set_bound_to_error_{end}"] for f in facts if f.get(f"set_bound_to_error_{end}") is not None]
+        for end in ("min", "max")
     )
     if least:
-        line(name, f"{observer}: bound over error, largest", max(most), 3.0, f"{len(most)} of {len(facts)} folds, least {min(least):.3f}")
+        line(
+            name,
+            f"{observer}: bound over error, largest",
+            max(most),
+            3.0,
+            f"{len(most)} of {len(facts)} folds, least {min(least):.3f}",
+        )
 
 
 def show_sensor(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
@@ -186,7 +218,10 @@ def show_sensor(name: str, parts: Sequence[Mapping[str, Any]]) -> None:
     asked = {"noise": (0.5, 0.8), "late": (0.5, 0.8), "dropout": (1.0, 1.05), "coarse": (1.0, 1.05)}
     condition = conditions_of(parts)[0]
     rivals = dict.fromkeys(
-        r["observer"] for p in parts for r in p["rows"] if r["observer"].endswith(("open_loop", "kalman_tuned", LEARNED))
+        r["observer"]
+        for p in parts
+        for r in p["rows"]
+        if r["observer"].endswith(("open_loop", "kalman_tuned", LEARNED))
     )
     for case, channel in product(dict.fromkeys(r["case"] for p in parts for r in p["rows"]), hidden_of(parts)):
         told, untold = (mean_error(parts, "deployed", condition, channel, case=case, told=t) for t in (True, False))
@@ -203,7 +238,9 @@ def mean_error(parts: Sequence[Mapping[str, Any]], observer: str, condition: str
 
 def line(name: str, what: str, found: float, most: float, note: str = "") -> None:
     """Print what is asked, what was found, and whether it is met."""
-    say(f"  {name:24s} {what:56s} {found:8.3f}   asked {most:g} [{'met' if found <= most * (1 + 1e-9) else 'MISSED'}] {note}")
+    say(
+        f"  {name:24s} {what:56s} {found:8.3f}   asked {most:g} [{'met' if found <= most * (1 + 1e-9) else 'MISSED'}] {note}"
+    )
 
 
 def _has_truth(parts: Sequence[Mapping[str, Any]]) -> bool:

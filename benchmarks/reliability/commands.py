@@ -113,14 +113,23 @@ def constant(content: bytes, rng: random.Random) -> bytes:
     """One column is the same everywhere: zero, a step, time that stands."""
     where, value = rng.randrange(4), rng.choice((b"0", b"1", b"-1e9", b"nan", b""))
     head, *rest = content.split(b"\n")
-    return b"\n".join([head, *(b",".join(value if i == where else c for i, c in enumerate(row.split(b","))) for row in rest if row)])
+    return b"\n".join(
+        [head, *(b",".join(value if i == where else c for i, c in enumerate(row.split(b","))) for row in rest if row)]
+    )
 
 
 def encoded(content: bytes, rng: random.Random) -> bytes:
     """Text in another encoding, or none."""
     text = content.decode("latin-1")
     return rng.choice(
-        (text.encode("utf-16"), text.encode("utf-32"), text.encode("utf-7"), b"\xff\xfe" + content, content[::-1], b"\x1f\x8b" + content)
+        (
+            text.encode("utf-16"),
+            text.encode("utf-32"),
+            text.encode("utf-7"),
+            b"\xff\xfe" + content,
+            content[::-1],
+            b"\x1f\x8b" + content,
+        )
     )
 
 
@@ -372,7 +381,8 @@ def verdict(code: int | None, printed: str, written: bool) -> tuple[str, bool]:
     if "Traceback" in printed or "Internal error" in printed or code in (98, 99):
         return "traceback: " + printed.strip().splitlines()[-1][:200], True
     if heard := re.search(
-        r".*(RuntimeWarning|warning: (divide by zero|overflow|underflow|invalid value|Mean of empty|Degrees of freedom)).*", printed
+        r".*(RuntimeWarning|warning: (divide by zero|overflow|underflow|invalid value|Mean of empty|Degrees of freedom)).*",
+        printed,
     ):
         return f"NumPy warning: {heard[0][:200]}", True
     if code not in (0, 1, 2, 3, 4):
@@ -381,7 +391,13 @@ def verdict(code: int | None, printed: str, written: bool) -> tuple[str, bool]:
         return "no reason", True
     if code in (1, 2) and written:
         return "half written", True
-    return {0: "done", 1: "failed with a reason", 2: "refused with a reason", 3: "done, flagged", 4: "done, cannot tell"}[code], False
+    return {
+        0: "done",
+        1: "failed with a reason",
+        2: "refused with a reason",
+        3: "done, flagged",
+        4: "done, cannot tell",
+    }[code], False
 
 
 def linked(good: Path, copy: Path) -> None:
@@ -419,12 +435,27 @@ def run(count: int, seed: int) -> list[Tally]:
         root = Path(name)
         recordings(root)
         options = [word for text in QUICK for word in ("--set", text)]
-        code, printed = command(["run", str(root / "toml" / "study.toml"), "--out", str(root / "run"), "--workers", "1", *options], root)
+        code, printed = command(
+            ["run", str(root / "toml" / "study.toml"), "--out", str(root / "run"), "--workers", "1", *options], root
+        )
         assert code == 0, printed
         until = ["--workers", "1", "--out", WRITTEN]
-        run_csv = ["run", str(root / "toml" / "study.toml"), "--set", "data.source={place}/case", "--until", "identify", *until]
+        run_csv = [
+            "run",
+            str(root / "toml" / "study.toml"),
+            "--set",
+            "data.source={place}/case",
+            "--until",
+            "identify",
+            *until,
+        ]
         groups: list[tuple[str, Path, dict[str, Damage], list[list[str]]]] = [
-            ("CSV", root / "csv", TABLES, [["init", "case", "--out", WRITTEN, "--measured", "angle", "--input", "torque"], run_csv]),
+            (
+                "CSV",
+                root / "csv",
+                TABLES,
+                [["init", "case", "--out", WRITTEN, "--measured", "angle", "--input", "torque"], run_csv],
+            ),
             (
                 "CSV in the field",
                 root / "csv",
@@ -454,7 +485,17 @@ def run(count: int, seed: int) -> list[Tally]:
                     ["estimate", "case", "field.toml", f"{WRITTEN}.parquet"],
                     ["check", "case", "field.toml", "--workers", "1"],
                     ["report", "case"],
-                    ["run", str(root / "toml" / "study.toml"), "--out", "case", "--until", "identify", "--workers", "1", *options],
+                    [
+                        "run",
+                        str(root / "toml" / "study.toml"),
+                        "--out",
+                        "case",
+                        "--until",
+                        "identify",
+                        "--workers",
+                        "1",
+                        *options,
+                    ],
                 ],
             ),
         ]
@@ -481,7 +522,11 @@ def run(count: int, seed: int) -> list[Tally]:
                         own = [p for p in place.iterdir() if p.name.lstrip(".").startswith(WRITTEN)]
                         outcome, failed = verdict(code, printed, bool(own))
                         assert kind != WHOLE or code in (0, 3, 4), f"{chosen} fails on whole inputs: {printed}"
-                        tally.add(outcome if not failed else f"{' '.join(chosen[:2])}: {outcome}", time.perf_counter() - began, failed)
+                        tally.add(
+                            outcome if not failed else f"{' '.join(chosen[:2])}: {outcome}",
+                            time.perf_counter() - began,
+                            failed,
+                        )
                 tallies.append(tally)
                 if tally.failures:
                     print(tally.cases, dict(tally.failures), flush=True)

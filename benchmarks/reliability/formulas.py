@@ -42,7 +42,18 @@ HOSTILE = (
     "((10**60*x)**8)**8",
     "(((99999999/99999998)**64)**64)**64*x",
 )
-ALPHABET = (*"0123456789+-*/().,[] e_xyp\0\n'\"é\ud800λ^%@:=<>!~&|{}#;", *FUNCTIONS, "**", "x", "y", "p", "1e308", "64", "pi", "x[-1]")
+ALPHABET = (
+    *"0123456789+-*/().,[] e_xyp\0\n'\"é\ud800λ^%@:=<>!~&|{}#;",
+    *FUNCTIONS,
+    "**",
+    "x",
+    "y",
+    "p",
+    "1e308",
+    "64",
+    "pi",
+    "x[-1]",
+)
 
 
 class HangError(Exception):
@@ -69,7 +80,15 @@ def random_text(rng: np.random.Generator, depth: int) -> str:
     if depth == 0 or rng.random() < 0.1:
         return str(
             rng.choice(
-                [*NAMES[:2], *NAMES[:2], "p", "pi", str(rng.integers(0, 12)), f"{rng.normal():.4g}", f"{10 ** rng.uniform(-6, 6):.3e}"]
+                [
+                    *NAMES[:2],
+                    *NAMES[:2],
+                    "p",
+                    "pi",
+                    str(rng.integers(0, 12)),
+                    f"{rng.normal():.4g}",
+                    f"{10 ** rng.uniform(-6, 6):.3e}",
+                ]
             )
         )
     kind = rng.random()
@@ -102,7 +121,9 @@ def mutated(rng: np.random.Generator, text: str) -> str:
         elif kind == 5:
             text = f"({text})**{rng.choice(['64', '-64', '9**9', '1e3', '0.1', '(1/7)'])}"
         else:
-            text = text.replace(str(rng.choice(list("0123456789"))), str(rng.choice(["1e300", "9" * 40, "0", "1e-320", "64**64"])))
+            text = text.replace(
+                str(rng.choice(list("0123456789"))), str(rng.choice(["1e300", "9" * 40, "0", "1e-320", "64**64"]))
+            )
     return text[:3000]
 
 
@@ -115,11 +136,15 @@ def truth_of(text: str) -> Callable[..., Any]:
 
     tree = ast.fix_missing_locations(Constants().visit(ast.parse(text.strip(), mode="eval")))
     code = compile(tree, "formula", "eval")
-    known = {name: within(getattr(mpmath, name), 1e4 if name == "exp" else 1e290) for name in FUNCTIONS if name != "abs"}
+    known = {
+        name: within(getattr(mpmath, name), 1e4 if name == "exp" else 1e290) for name in FUNCTIONS if name != "abs"
+    }
     known |= {"abs": abs, "pi": mpmath.pi, "Abs": abs}
 
     def evaluate(x: Any, y: Any, p: Any, change: Callable[[Any], Any] = lambda v: v) -> Any:
-        found = eval(code, {"__builtins__": {}}, known | {"x": x, "y": y, "p": p, "number": lambda v: change(mpmath.mpf(v))})
+        found = eval(
+            code, {"__builtins__": {}}, known | {"x": x, "y": y, "p": p, "number": lambda v: change(mpmath.mpf(v))}
+        )
         return found if isinstance(found, mpmath.mpf) and mpmath.isfinite(found) else None
 
     return evaluate
@@ -163,8 +188,13 @@ def judge(text: str, lifting: Lifting, rng: np.random.Generator) -> str:
                 continue
             parameters = {"p": place[2]}
             with np.errstate(all="ignore"):
-                found = float(lifting.lift(place[:2], parameters)[2]), float(lifting.slopes(place[:2], parameters)[0, 0])
-            for what, value, wanted, others in zip(("value", "derivative"), found, exact, zip(*moved, strict=True), strict=True):
+                found = (
+                    float(lifting.lift(place[:2], parameters)[2]),
+                    float(lifting.slopes(place[:2], parameters)[0, 0]),
+                )
+            for what, value, wanted, others in zip(
+                ("value", "derivative"), found, exact, zip(*moved, strict=True), strict=True
+            ):
                 spread = max(abs(other - wanted) for other in others)
                 allowed = mpmath.mpf("1e-9") * (1 + abs(wanted)) + 100 * spread
                 if np.isfinite(value) and abs(wanted) < 1e290 and abs(mpmath.mpf(value) - wanted) > allowed:
@@ -182,7 +212,9 @@ def judge_slopes(lifting: Lifting, rng: np.random.Generator) -> str:
     with np.errstate(all="ignore"):
         f, g = (lifting.lift(np.stack([v, y], axis=-1), {"p": p})[:, 2] for v in (x, z))
         quotient = (f - g) / (x - z)
-    rounding = 1e-9 * (1 + np.maximum(np.abs(f), np.abs(g))) / np.abs(x - z) + 1e-9 * max(abs(lower[0, 0]), abs(upper[0, 0]))
+    rounding = 1e-9 * (1 + np.maximum(np.abs(f), np.abs(g))) / np.abs(x - z) + 1e-9 * max(
+        abs(lower[0, 0]), abs(upper[0, 0])
+    )
     outside = (quotient < lower[0, 0] - rounding) | (quotient > upper[0, 0] + rounding)
     return "false slope bound" if np.any(outside & np.isfinite(quotient)) else ""
 
@@ -276,7 +308,9 @@ def run(count: int, seed: int) -> list[Tally]:
     """Run the campaign."""
     rng = np.random.default_rng(seed)
     truth = "mpmath with 60 digits; difference quotients for bounds of slopes"
-    grammar, changed, hostile = (Tally(cases, truth) for cases in ("random formulas", "mutated formulas", "hostile formulas, mutated"))
+    grammar, changed, hostile = (
+        Tally(cases, truth) for cases in ("random formulas", "mutated formulas", "hostile formulas, mutated")
+    )
     for _ in range(count):
         text = random_text(rng, int(rng.integers(1, 6)))
         one(text, grammar, rng)

@@ -33,8 +33,12 @@ def random_dynamics(rng: np.random.Generator, n: int, dt: float, damping: float 
         A = rng.standard_normal((n, n))
         stable = rng.random() < 0.75
         if dt > 0:
-            return A * ((rng.uniform(0.5, 0.99) if stable else rng.uniform(1.01, 1.6)) / np.abs(np.linalg.eigvals(A)).max())
-        return A - (np.linalg.eigvals(A).real.max() + (rng.uniform(0.02, 1) if stable else -rng.uniform(0.02, 1))) * np.eye(n)
+            return A * (
+                (rng.uniform(0.5, 0.99) if stable else rng.uniform(1.01, 1.6)) / np.abs(np.linalg.eigvals(A)).max()
+            )
+        return A - (
+            np.linalg.eigvals(A).real.max() + (rng.uniform(0.02, 1) if stable else -rng.uniform(0.02, 1))
+        ) * np.eye(n)
     blocks = np.zeros((n, n))
     for k in range(0, n - 1, 2):
         w = 10 ** rng.uniform(-1, 1) if dt == 0 else rng.uniform(0.05, 3.0)
@@ -53,7 +57,10 @@ def random_plant(rng: np.random.Generator, dt: float, family: str) -> Generalize
     damping = 10 ** rng.uniform(-6, -1) if family == "lightly damped" else None
     A = random_dynamics(rng, n, dt, damping)
     noise, penalty = 10 ** rng.uniform(-6, 0.5, 2) if family in ("small", "scaled") else 10 ** rng.uniform(-2, 0.5, 2)
-    B1, C1 = np.hstack([rng.standard_normal((n, d)), np.zeros((n, q))]), np.vstack([rng.standard_normal((e, n)), np.zeros((m, n))])
+    B1, C1 = (
+        np.hstack([rng.standard_normal((n, d)), np.zeros((n, q))]),
+        np.vstack([rng.standard_normal((e, n)), np.zeros((m, n))]),
+    )
     D12, D21 = np.vstack([np.zeros((e, m)), penalty * np.eye(m)]), np.hstack([np.zeros((q, d)), noise * np.eye(q)])
     D11 = np.zeros((e + m, d + q))
     if family == "full":
@@ -81,7 +88,11 @@ def norm(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, dt: float, 
         return float("inf")
     poles = np.linalg.eigvals(A)
     # A pole within rounding of the boundary is not called stable.
-    if (np.abs(poles).max(initial=0) >= 1 - 1e-10) if dt > 0 else (poles.real.max(initial=-1) >= -1e-10 * np.abs(poles).max(initial=1)):
+    if (
+        (np.abs(poles).max(initial=0) >= 1 - 1e-10)
+        if dt > 0
+        else (poles.real.max(initial=-1) >= -1e-10 * np.abs(poles).max(initial=1))
+    ):
         return float("inf")
     if SLYCOT and len(A):
         import slycot
@@ -162,7 +173,9 @@ def judge(tally: Tally, tried: Callable[[], tuple[str, bool]]) -> None:
     try:
         outcome, failed = tried()
     except KrosError as error:
-        outcome, failed = ("internal error", True) if "internal error" in str(error) else ("refused with a reason", False)
+        outcome, failed = (
+            ("internal error", True) if "internal error" in str(error) else ("refused with a reason", False)
+        )
     except Exception as error:
         outcome, failed = f"traceback ({type(error).__name__})", True
     tally.add(outcome, time.perf_counter() - began, failed)
@@ -182,7 +195,10 @@ def optimum(rng: np.random.Generator, dt: float, family: str) -> Callable[[], tu
             return "norm not confirmed", not np.isfinite(mine) or mine > (found.hinf_norm or 0) * (1 + 1e-3)
         if found.status.value == "optimal":
             return ("optimal", False) if best >= mine * (1 - 1e-3) or mine < 1e-7 else ("not the optimum", True)
-        return f"bounded within {'1 %' if mine <= 1.01 * lower else '10 %' if mine <= 1.1 * lower else 'more than 10 %'}", False
+        return (
+            f"bounded within {'1 %' if mine <= 1.01 * lower else '10 %' if mine <= 1.1 * lower else 'more than 10 %'}",
+            False,
+        )
 
     return tried
 
@@ -205,7 +221,9 @@ def constrained(rng: np.random.Generator) -> Callable[[], tuple[str, bool]]:
     C1[0, :n], C1[2, n] = rng.standard_normal(n), share * gain
     B2, C2 = np.append(rng.standard_normal(n), 1.0)[:, None], np.append(rng.standard_normal(n), 0.0)[None]
     noise = np.array([[0.0, 0.3, rng.integers(0, 2) * 1.0]])
-    plant = GeneralizedPlant(A, B1, B2, C1, C2, np.diag([0, 0, c]), [[0.0], [0.3], [share * direct]], noise, [[0.0]], 1.0, 2, 2)
+    plant = GeneralizedPlant(
+        A, B1, B2, C1, C2, np.diag([0, 0, c]), [[0.0], [0.3], [share * direct]], noise, [[0.0]], 1.0, 2, 2
+    )
 
     def tried() -> tuple[str, bool]:
         try:
@@ -214,7 +232,9 @@ def constrained(rng: np.random.Generator) -> Callable[[], tuple[str, bool]]:
             shown = "is infeasible, no controller has" in str(error)
             if feasible:
                 return ("false claim of infeasibility", True) if shown else ("feasible, nothing found", False)
-            return ("infeasible: refused with the least within reach", False) if shown else ("infeasible: not shown", True)
+            return (
+                ("infeasible: refused with the least within reach", False) if shown else ("infeasible: not shown", True)
+            )
         closed = closed_loop(plant, found.controller)
         value = norm(closed[0], closed[1][:, 2:], closed[2][2:], closed[3][2:, 2:], 1.0)
         return ("feasible: solved", False) if value < gamma * (1 + FALSE) else ("constraint violated", True)
@@ -229,19 +249,27 @@ def run(count: int, seed: int) -> list[Tally]:
         if SLYCOT
         else "other levels, a dense grid"
     )
-    kind = {"small": "small penalties and noises", "scaled": "the same in units of many sizes", "full": "every feedthrough"}
+    kind = {
+        "small": "small penalties and noises",
+        "scaled": "the same in units of many sizes",
+        "full": "every feedthrough",
+    }
     tallies = []
     for family, dt in itertools.product(("small", "scaled", "lightly damped", "full"), (0.0, 1.0)):
         name = f"H-infinity optimum, {kind.get(family, family)}, {'discrete' if dt else 'continuous'}"
         make = partial(optimum, family=family)
         tallies.append(_tried(Tally(name, truth), make, dt, count // 8, np.random.default_rng([seed, len(tallies)])))
     rng = np.random.default_rng([seed, len(tallies)])
-    least = Tally("Mixed synthesis, constraint within reach or not, discrete", "the least norm by interpolation at a zero")
+    least = Tally(
+        "Mixed synthesis, constraint within reach or not, discrete", "the least norm by interpolation at a zero"
+    )
     tallies.append(_tried(least, lambda rng, dt: constrained(rng), 1.0, count // 10, rng))
     return tallies
 
 
-def _tried(tally: Tally, make: Callable[..., Callable[[], tuple[str, bool]]], dt: float, count: int, rng: np.random.Generator) -> Tally:
+def _tried(
+    tally: Tally, make: Callable[..., Callable[[], tuple[str, bool]]], dt: float, count: int, rng: np.random.Generator
+) -> Tally:
     for _ in range(max(count, 1)):
         judge(tally, make(rng, dt))
     return tally

@@ -64,7 +64,25 @@ ODD: tuple[Any, ...] = (
     float("nan"),
     float("inf"),
 )
-FLAWED = ("nan", "inf", "-inf", "1e999", "", "x", "1;2", '"', '"1', "0x10", "1e308", "--1", "\t", "\0", "ä", "1,1", "9" * 200)
+FLAWED = (
+    "nan",
+    "inf",
+    "-inf",
+    "1e999",
+    "",
+    "x",
+    "1;2",
+    '"',
+    '"1',
+    "0x10",
+    "1e308",
+    "--1",
+    "\t",
+    "\0",
+    "ä",
+    "1,1",
+    "9" * 200,
+)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------ mutations
@@ -126,7 +144,23 @@ def mutate_text(content: bytes, rng: random.Random) -> bytes:
         return mutate_bytes(content, rng)
     lines = content.split(b"\n")
     row = rng.randrange(len(lines))
-    kind = rng.choice(("cell", "cell", "drop", "double", "cr", "crlf", "header", "column", "bom", "utf16", "long", "empty line", "shuffle"))
+    kind = rng.choice(
+        (
+            "cell",
+            "cell",
+            "drop",
+            "double",
+            "cr",
+            "crlf",
+            "header",
+            "column",
+            "bom",
+            "utf16",
+            "long",
+            "empty line",
+            "shuffle",
+        )
+    )
     cells = lines[row].split(b",")
     if kind == "cell":
         cells[rng.randrange(len(cells))] = rng.choice(FLAWED).encode()
@@ -210,7 +244,11 @@ class Folder:
 
 
 def folder_target(
-    cases: str, good: Path, read: Callable[[Path], Any], mutate: Callable[[str, bytes, random.Random], bytes], checked: bool
+    cases: str,
+    good: Path,
+    read: Callable[[Path], Any],
+    mutate: Callable[[str, bytes, random.Random], bytes],
+    checked: bool,
 ) -> Target:
     """A target whose input is a folder of files."""
     names = sorted(str(p.relative_to(good)) for p in good.rglob("*") if p.is_file())
@@ -254,7 +292,13 @@ MAPPING: dict[str, Any] = {
 }
 STUDY: dict[str, Any] = {
     "name": "s",
-    "data": {"source": "csv", "reader": "csv", "csv": MAPPING, "prepare": [{"step": "trim", "start": 1}], "exclude": ["a"]},
+    "data": {
+        "source": "csv",
+        "reader": "csv",
+        "csv": MAPPING,
+        "prepare": [{"step": "trim", "start": 1}],
+        "exclude": ["a"],
+    },
     "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}]},
     "identify": {"alpha": 90.0, "refine": False},
     "uncertainty": {"form": "additive", "max_order": 3},
@@ -327,7 +371,9 @@ def recordings_targets(root: Path) -> list[Target]:
             False,
         ),
         folder_target("reader parquet", root / "parquet", lambda p: recorded(read(p, "parquet")), mutate_file, True),
-        toml_target("CSV mapping", root / "mapping.toml", MAPPING, lambda p: recorded(read(root / "csv", "csv", mapping=p))),
+        toml_target(
+            "CSV mapping", root / "mapping.toml", MAPPING, lambda p: recorded(read(root / "csv", "csv", mapping=p))
+        ),
     ]
 
 
@@ -349,7 +395,9 @@ def memory_targets() -> list[Target]:
         frame = pd.DataFrame(rows).astype(object)
         kind = rng.choice(("cell", "cell", "column", "drop", "double", "type", "rows"))
         if kind == "cell":
-            frame.iat[rng.randrange(len(frame)), rng.randrange(6)] = rng.choice([v for v in ODD if not isinstance(v, (list, dict))])
+            frame.iat[rng.randrange(len(frame)), rng.randrange(6)] = rng.choice(
+                [v for v in ODD if not isinstance(v, (list, dict))]
+            )
         elif kind == "drop":
             frame = frame.drop(columns=rng.choice(list(frame.columns)))
         elif kind == "double":
@@ -375,7 +423,13 @@ def memory_targets() -> list[Target]:
     good, other = {"data": table, "period": 0.01}, {"data": pykoop, "period": 0.01, "inputs": 1}
     return [
         Target("reader arrays", lambda r: mutate_tree(good, r), arrays, arrays(good), False),
-        Target("reader frame", damaged_frame, lambda f: recorded(from_frame(f, named, sample_period_s=0.01)), frame_good, False),
+        Target(
+            "reader frame",
+            damaged_frame,
+            lambda f: recorded(from_frame(f, named, sample_period_s=0.01)),
+            frame_good,
+            False,
+        ),
         Target("reader pykoop", lambda r: mutate_tree(other, r), koop, koop(other), False),
     ]
 
@@ -387,7 +441,9 @@ def population_models() -> ModelSet:
     B = np.array([[0.0], [0.1]]) + 0.002 * rng.normal(size=(4, 2, 1))
     lifting = Lifting(("position", "velocity"))
     unit = np.broadcast_to(np.eye(2), (4, 2, 2))
-    return ModelSet("linear", "c", lifting, CHANNELS, 0.01, tuple("abcd"), A, B, {}, unit, np.ones(2), np.ones(1), 1.0, ("ok",) * 4)
+    return ModelSet(
+        "linear", "c", lifting, CHANNELS, 0.01, tuple("abcd"), A, B, {}, unit, np.ones(2), np.ones(1), 1.0, ("ok",) * 4
+    )
 
 
 def artifact_targets(root: Path) -> list[Target]:
@@ -416,7 +472,11 @@ def artifact_targets(root: Path) -> list[Target]:
     )
     (root / "observer").mkdir()
     observer.save(root / "observer" / "deployed.json")
-    save_artifact(root / "metrics", "metrics", {"study": {"units": 3}, "rows": [{"unit": "a", "value": 1.5}, {"unit": "b", "value": None}]})
+    save_artifact(
+        root / "metrics",
+        "metrics",
+        {"study": {"units": 3}, "rows": [{"unit": "a", "value": 1.5}, {"unit": "b", "value": None}]},
+    )
 
     def target(cases: str, name: str, read: Callable[[Path], Any]) -> Target:
         return folder_target(cases, root / name, lambda p: matrices(read(p)), mutate_file, True)
@@ -479,7 +539,9 @@ def judge(target: Target, tally: Tally, rng: random.Random) -> None:
 
 def carries_checksum(folder: Path) -> bool:
     """Whether every JSON file of a folder still has its checksum; without one it counts as edited on purpose."""
-    return all(isinstance(found := json.loads(p.read_bytes()), dict) and CHECKSUM in found for p in folder.rglob("*.json"))
+    return all(
+        isinstance(found := json.loads(p.read_bytes()), dict) and CHECKSUM in found for p in folder.rglob("*.json")
+    )
 
 
 def run(count: int, seed: int) -> list[Tally]:
@@ -493,7 +555,9 @@ def run(count: int, seed: int) -> list[Tally]:
         root = Path(folder)
         for target in (*recordings_targets(root), *memory_targets(), *artifact_targets(root), *study_targets(root)):
             rng = random.Random(f"{target.cases} {seed}")
-            tally = Tally(target.cases, "what was read before the damage" + (", under a checksum" if target.checked else ""))
+            tally = Tally(
+                target.cases, "what was read before the damage" + (", under a checksum" if target.checked else "")
+            )
             for _ in range(count):
                 judge(target, tally, rng)
             tallies.append(tally)

@@ -45,8 +45,13 @@ robustness = false
 """
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 STAGES = ("simulate", "read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report")
-IN_A_ROW, PATIENCE = 4, 10  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
-_TIMED_TABLE = re.compile(r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL)
+IN_A_ROW, PATIENCE = (
+    4,
+    10,
+)  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
+_TIMED_TABLE = re.compile(
+    r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL
+)
 _LAST_CELL = re.compile(r"<td[^>]*>[^<]*</td>(?=\s*</tr>)")
 
 
@@ -109,7 +114,11 @@ class Campaign:
             return lambda: time.perf_counter() > end
         missing = [name for name in self.files if not (self.folder / name).exists()] or self.files
         name = self.draw.choice(missing)
-        places = [self.folder / name] if self.draw.random() < 0.5 else [self.folder / name, self.folder / ".kros.partial" / "draft" / name]
+        places = (
+            [self.folder / name]
+            if self.draw.random() < 0.5
+            else [self.folder / name, self.folder / ".kros.partial" / "draft" / name]
+        )
         end = time.perf_counter() + PATIENCE * self.seconds
         return lambda: any(place.exists() for place in places) or time.perf_counter() > end
 
@@ -121,7 +130,9 @@ class Campaign:
     def finish(self) -> str:
         """Let the run finish; return what is wrong with it, if anything."""
         try:
-            ended = subprocess.run(self.command, capture_output=True, text=True, timeout=PATIENCE * self.seconds, check=False)
+            ended = subprocess.run(
+                self.command, capture_output=True, text=True, timeout=PATIENCE * self.seconds, check=False
+            )
         except subprocess.TimeoutExpired:
             return "hang"
         if "Traceback" in ended.stderr:
@@ -140,7 +151,8 @@ class Campaign:
 def results(folder: Path) -> dict[str, Any]:
     """Return all files of a run with what does not depend on the time that something took; of records the names that they list."""
     return {
-        name: content(folder / name, name) for name in sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+        name: content(folder / name, name)
+        for name in sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
     }
 
 
@@ -165,7 +177,11 @@ def timeless(found: Any) -> Any:
 def descendants(pid: int) -> list[int]:
     """Return the processes that a process started, and theirs."""
     try:
-        own = [int(child) for task in Path(f"/proc/{pid}/task").iterdir() for child in (task / "children").read_text().split()]
+        own = [
+            int(child)
+            for task in Path(f"/proc/{pid}/task").iterdir()
+            for child in (task / "children").read_text().split()
+        ]
     except FileNotFoundError:
         return []
     return own + [further for child in own for further in descendants(child)]
@@ -181,11 +197,25 @@ def lives(pid: int) -> bool:
 
 def campaigns(folder: Path, seed: int) -> Iterator[tuple[str, Campaign]]:
     """Yield the four-drive study and the demo."""
-    recordings = ("simulate", str(folder / "recordings"), "--units", "4", "--episodes", "2", "--seconds", "5", "--seed", str(seed))
+    recordings = (
+        "simulate",
+        str(folder / "recordings"),
+        "--units",
+        "4",
+        "--episodes",
+        "2",
+        "--seconds",
+        "5",
+        "--seed",
+        str(seed),
+    )
     subprocess.run((*KROS, *recordings), check=True, capture_output=True)
     (folder / "study.toml").write_text(STUDY)
     run = ("run", str(folder / "study.toml"), "--out", str(folder / "run"), "--workers", "2")
-    yield "a study of four drives, killed (kill -9) and resumed", Campaign((*KROS, *run), folder / "run", random.Random(seed))
+    yield (
+        "a study of four drives, killed (kill -9) and resumed",
+        Campaign((*KROS, *run), folder / "run", random.Random(seed)),
+    )
     demo = ("demo", "--out", str(folder / "demo"), "--seed", str(seed), "--workers", "2")
     yield "the demo, killed (kill -9) and resumed", Campaign((*KROS, *demo), folder / "demo", random.Random(seed))
 
@@ -199,7 +229,9 @@ def run(count: int, seed: int, demo_count: int) -> list[Tally]:
             if wanted:
                 campaign.measure()
                 campaign.kills(wanted, tally)
-                tally.note = f"Without a kill it takes {campaign.seconds:.1f} s; {len(campaign.expected)} files are compared."
+                tally.note = (
+                    f"Without a kill it takes {campaign.seconds:.1f} s; {len(campaign.expected)} files are compared."
+                )
                 tallies.append(tally)
     return tallies
 
@@ -208,4 +240,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(add_help=False)
     parser.add_argument("--demo-count", type=int, default=5)
     options, sys.argv[1:] = parser.parse_known_args()
-    main("kill_points", "Runs that are killed and resumed", lambda count, seed: run(count, seed, options.demo_count), 100)
+    main(
+        "kill_points", "Runs that are killed and resumed", lambda count, seed: run(count, seed, options.demo_count), 100
+    )

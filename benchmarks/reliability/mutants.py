@@ -57,12 +57,17 @@ def run(count: int, seed: int) -> list[Tally]:
     with tempfile.TemporaryDirectory() as folder:
         found = [mutant for place in PLACES for mutant in _mutants(Path(folder), place)]
         chosen = random.Random(seed).sample(found, min(count, len(found)))
-        known = {line["name"]: line for line in map(json.loads, KNOWN.read_text().splitlines())} if KNOWN.exists() else {}
+        known = (
+            {line["name"]: line for line in map(json.loads, KNOWN.read_text().splitlines())} if KNOWN.exists() else {}
+        )
         if any(_name(m) not in known for m in chosen):
             seconds, lines = _covered(Path(folder))
             for mutant in chosen:
                 if _name(mutant) not in known:
-                    known[_name(mutant)] = {"name": _name(mutant), **_tried(mutant, _selected(mutant, seconds, lines), seconds)}
+                    known[_name(mutant)] = {
+                        "name": _name(mutant),
+                        **_tried(mutant, _selected(mutant, seconds, lines), seconds),
+                    }
                     with KNOWN.open("a") as file:
                         file.write(json.dumps(known[_name(mutant)]) + "\n")
     tallies = {place: Tally(f"mutants of `{place}`", "fast tests that run the line") for place in PLACES}
@@ -87,7 +92,9 @@ def _mutants(folder: Path, place: str) -> list[Mutant]:
         rows = database.execute(query).fetchall()
     keys = ("path", "operator", "occurrence", "row", "column")
     found = [{"place": place, **dict(zip(keys, row, strict=True))} for row in rows]
-    return [m for m in found if not any(start <= (m["row"], m["column"]) < end for start, end in _annotations(m["path"]))]
+    return [
+        m for m in found if not any(start <= (m["row"], m["column"]) < end for start, end in _annotations(m["path"]))
+    ]
 
 
 def _name(mutant: Mutant) -> str:
@@ -102,18 +109,30 @@ def _tree(path: str) -> ast.Module:
 @cache
 def _annotations(path: str) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     nodes = ast.walk(_tree(path))
-    notes = [n for node in nodes for n in (getattr(node, "annotation", None), getattr(node, "returns", None)) if isinstance(n, ast.expr)]
+    notes = [
+        n
+        for node in nodes
+        for n in (getattr(node, "annotation", None), getattr(node, "returns", None))
+        if isinstance(n, ast.expr)
+    ]
     return [((n.lineno, n.col_offset), (n.end_lineno or n.lineno, n.end_col_offset or n.col_offset)) for n in notes]
 
 
 def _covered(folder: Path) -> tuple[Seconds, Lines]:
     """Run the fast tests once; return how long each that passes takes, and which of them run a line of a file."""
-    files = [str(f.relative_to(ROOT)) for name in TESTS.split() for f in sorted((ROOT / "tests").glob(f"*/test_{name}.py"))]
+    files = [
+        str(f.relative_to(ROOT)) for name in TESTS.split() for f in sorted((ROOT / "tests").glob(f"*/test_{name}.py"))
+    ]
     data = folder / "coverage"
     wide = [f"--cov={Path(place).parent if place.endswith('.py') else place}" for place in PLACES]
     options = [*wide, "--cov-context=test", "--cov-report=", "--durations=0", "--durations-min=0", "-vv", "-rN"]
     done = subprocess.run(
-        [*PYTEST, *options, *files], cwd=ROOT, capture_output=True, text=True, env=os.environ | {"COVERAGE_FILE": str(data)}, check=False
+        [*PYTEST, *options, *files],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"COVERAGE_FILE": str(data)},
+        check=False,
     )
     passed = set(re.findall(r"^(tests/\S+::.+?) PASSED", done.stdout, re.MULTILINE))
     seconds: Seconds = defaultdict(float)
@@ -126,7 +145,9 @@ def _covered(folder: Path) -> tuple[Seconds, Lines]:
     measured.read()
     for file in measured.measured_files():
         by_line = measured.contexts_by_lineno(file)
-        lines[str(Path(file).relative_to(ROOT))] = {row: {c.partition("|")[0] for c in found} - {""} for row, found in by_line.items()}
+        lines[str(Path(file).relative_to(ROOT))] = {
+            row: {c.partition("|")[0] for c in found} - {""} for row, found in by_line.items()
+        }
     return dict(seconds), lines
 
 
@@ -178,7 +199,11 @@ def _fails(tests: Sequence[str], limit_s: float) -> bool:
         names.write("\n".join(tests))
         names.flush()
         process = subprocess.Popen(
-            [*PYTEST, "-x", f"@{names.name}"], cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+            [*PYTEST, "-x", f"@{names.name}"],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
         )
         try:
             return process.wait(limit_s) != 0

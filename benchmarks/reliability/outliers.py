@@ -86,7 +86,9 @@ def scored(recorded: Recorded) -> OutlierModel:
     )
 
 
-def new_unit(rng: np.random.Generator, recorded: Recorded, model: OutlierModel, episodes: int, samples: int, severity: float) -> str:
+def new_unit(
+    rng: np.random.Generator, recorded: Recorded, model: OutlierModel, episodes: int, samples: int, severity: float
+) -> str:
     """Record, identify and score one new unit; return what is said about it."""
     evidence = Evidence.of(record(rng, plant(rng, severity), episodes, samples), recorded.models, {})
     score = model.score("new", recorded.response([evidence])[0])
@@ -116,7 +118,9 @@ def population(rng: np.random.Generator) -> Recorded:
         input_scale=peak[2:],
         alpha=10.0,
     )
-    return Recorded(models, {u: Evidence.of(f, models, {}) for u, f in zip(models.unit_ids, factors, strict=True)}, FREQS)
+    return Recorded(
+        models, {u: Evidence.of(f, models, {}) for u, f in zip(models.unit_ids, factors, strict=True)}, FREQS
+    )
 
 
 def plant(rng: np.random.Generator, severity: float) -> tuple[Array, Array]:

@@ -35,20 +35,30 @@ def render() -> str:
     failed = sum(sum(tally["failures"].values()) for result in results.values() for tally in result["tallies"])
     summary = f"**{tried} cases in {len(results)} campaigns, {failed} failures.**\n"
     waiting = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - results.keys() - {"campaign", "page"})
-    missing = f"\nWithout a result in this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
+    missing = (
+        f"\nWithout a result in this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
+    )
     return INTRODUCTION + summary + missing + "".join(_campaign(name, result) for name, result in results.items())
 
 
 def _campaign(name: str, result: dict[str, Any]) -> str:
     rows = "".join(_row(tally) for tally in result["tallies"])
-    notes = "".join(f"\n{tally['cases'].capitalize()}: {tally['note'].strip()}\n" for tally in result["tallies"] if tally["note"])
+    notes = "".join(
+        f"\n{tally['cases'].capitalize()}: {tally['note'].strip()}\n" for tally in result["tallies"] if tally["note"]
+    )
     command = f"`python benchmarks/reliability/{name}.py --seed {result['seed']}`, {result['seconds'] / 60:.1f} minutes on one core"
     head = "| cases | compared with | tried | outcomes | failures | slowest (s) |\n|---|---|---|---|---|---|\n"
     return f"\n## {result['title']}\n\n{command}\n\n{head}{rows}{notes}"
 
 
 def _row(tally: dict[str, Any]) -> str:
-    cells = [tally["cases"], tally["truth"], str(tally["tried"]), _counts(tally["outcomes"]), _counts(tally["failures"])]
+    cells = [
+        tally["cases"],
+        tally["truth"],
+        str(tally["tried"]),
+        _counts(tally["outcomes"]),
+        _counts(tally["failures"]),
+    ]
     return f"| {' | '.join(cells)} | {tally['slowest_s']:.2g} |\n"
 
 

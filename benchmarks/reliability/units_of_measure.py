@@ -30,7 +30,11 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "pendulum": {"n_units": 3, "n_episodes": 3, "seconds": 4.0},
     "dc-motor": {"n_units": 3, "n_episodes": 3, "seconds": 1.4},
 }
-FUNCTIONS = {"harmonic-drive": "sin(100*{position} + phase)", "pendulum": "sin({position})", "dc-motor": "tanh({velocity})"}
+FUNCTIONS = {
+    "harmonic-drive": "sin(100*{position} + phase)",
+    "pendulum": "sin({position})",
+    "dc-motor": "tanh({velocity})",
+}
 RATIO = 100.0
 Factors = Mapping[str, float]
 
@@ -64,13 +68,18 @@ def simulated(plant: str, seed: int) -> Population:
 
 def in_units(population: Population, factors: Factors) -> Population:
     """Return the recordings with channels multiplied."""
-    return replace(population, source=Multiplied(population.source, np.array([factors.get(c.name, 1.0) for c in population.channels])))
+    return replace(
+        population,
+        source=Multiplied(population.source, np.array([factors.get(c.name, 1.0) for c in population.channels])),
+    )
 
 
 def study(plant: str, population: Population, factors: Factors, folder: Path, *, refine: bool) -> Found:
     """Make a small study of recordings in other units, formulas and declared noise with them."""
     write_parquet(in_units(population, factors), folder / "recordings")
-    names = {c.name: f"({1 / factors[c.name]!r}*{c.name})" if c.name in factors else c.name for c in population.channels}
+    names = {
+        c.name: f"({1 / factors[c.name]!r}*{c.name})" if c.name in factors else c.name for c in population.channels
+    }
     raw: dict[str, Any] = {
         "data": {"source": str(folder / "recordings"), "reader": "parquet"},
         "lifting": {"functions": [FUNCTIONS[plant].format(**names)]},
@@ -88,14 +97,18 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
         raw["calibrate"] = {"ratio": RATIO / factors.get("position", 1.0)}
     metrics = run_study(validate_config(raw, folder), folder / "run", until=Stage.EVALUATE, workers=1).metrics
     deployed = Observer.load(folder / "run" / "observers" / "deployed.json")
-    return Found(numbers_of(metrics), metrics["study"]["deployed"], estimates(deployed, population, factors, folder / "run"))
+    return Found(
+        numbers_of(metrics), metrics["study"]["deployed"], estimates(deployed, population, factors, folder / "run")
+    )
 
 
 def numbers_of(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Return every error in percent and every score, by what it is of."""
     found = {}
     for row in metrics["evaluation"]:
-        found["/".join(("error", *(row[k] for k in ("observer", "unit", "condition", "channel"))))] = row["error_percent"]
+        found["/".join(("error", *(row[k] for k in ("observer", "unit", "condition", "channel"))))] = row[
+            "error_percent"
+        ]
     for name, model in metrics["models"].items():
         for channel, errors in model["freerun_error_percent"].items():
             found |= {f"free run/{name}/{channel}/{which}": value for which, value in errors.items()}
@@ -116,7 +129,9 @@ def estimates(observer: Observer, population: Population, factors: Factors, run:
     if observer.lifting.parameters:
         phases = PhaseCalibration.load(run / "calibration").units
         values = {"phase": np.array([phases[k.unit].phase_rad for k in keys])}
-    found = observer.run(batch.states[..., list(observer.measured)], batch.inputs, values)[..., : len(population.states)]
+    found = observer.run(batch.states[..., list(observer.measured)], batch.inputs, values)[
+        ..., : len(population.states)
+    ]
     return found / np.array([factors.get(name, 1.0) for name in population.states])
 
 
@@ -166,7 +181,9 @@ def run(count: int, seed: int) -> list[Tally]:
             ("refined models, mixed", [f for f in every if len(f) > 1]),
         ):
             refine = kind.startswith("refined")
-            tally = Tally(f"units of measure, {plant}, {kind}", "the same recordings in the units of the simulation, within 1 %")
+            tally = Tally(
+                f"units of measure, {plant}, {kind}", "the same recordings in the units of the simulation, within 1 %"
+            )
             largest, place, first = 0.0, "none", fresh(plant, population, {}, refine=refine)
             for factors in chosen[:count]:
                 far, where = deviation(first, fresh(plant, population, factors, refine=refine))

@@ -47,11 +47,21 @@ class Case:
 
 def make(rng: np.random.Generator) -> Case:
     """Draw a case."""
-    kind, (p, m), dt = KINDS[rng.integers(len(KINDS))], SHAPES[rng.integers(len(SHAPES))], float(rng.choice([1.0, 0.01]))
+    kind, (p, m), dt = (
+        KINDS[rng.integers(len(KINDS))],
+        SHAPES[rng.integers(len(SHAPES))],
+        float(rng.choice([1.0, 0.01])),
+    )
     continuous = kind != "delayed" and rng.random() < 0.15
     base, count = _modes(rng, kind), int(rng.integers(2, 9))
-    spread = {"identical": 0.0, "nearly identical": 10.0 ** rng.uniform(-10, -4)}.get(kind, 10.0 ** rng.uniform(-2.5, -0.3))
-    B, C, D = rng.standard_normal((len(base) * 2, m)), rng.standard_normal((p, len(base) * 2)), rng.standard_normal((p, m))
+    spread = {"identical": 0.0, "nearly identical": 10.0 ** rng.uniform(-10, -4)}.get(
+        kind, 10.0 ** rng.uniform(-2.5, -0.3)
+    )
+    B, C, D = (
+        rng.standard_normal((len(base) * 2, m)),
+        rng.standard_normal((p, len(base) * 2)),
+        rng.standard_normal((p, m)),
+    )
     D = D * rng.choice([1e-3, 0.1, 1.0])
     units = [_unit(rng, kind, base, B, C, D, spread, dt, continuous) for _ in range(count)]
     top = 0.4999 / dt
@@ -73,7 +83,15 @@ def _modes(rng: np.random.Generator, kind: str) -> list[tuple[float, float]]:
 
 
 def _unit(
-    rng: np.random.Generator, kind: str, base: list[tuple[float, float]], B: Array, C: Array, D: Array, spread: float, dt: float, s: bool
+    rng: np.random.Generator,
+    kind: str,
+    base: list[tuple[float, float]],
+    B: Array,
+    C: Array,
+    D: Array,
+    spread: float,
+    dt: float,
+    s: bool,
 ) -> StateSpace:
     n, m = 2 * len(base), B.shape[1]
     A, gains = np.zeros((n, n)), np.ones(n)
@@ -97,7 +115,9 @@ def _unit(
     if not s:
         return StateSpace(A, B, Ck, Dk, dt)
     inverse = np.linalg.inv(A + np.eye(n))
-    return StateSpace(2 / dt * inverse @ (A - np.eye(n)), 2 / dt * inverse @ B, 2 * Ck @ inverse / 1.0, Dk - Ck @ inverse @ B, 0.0)
+    return StateSpace(
+        2 / dt * inverse @ (A - np.eye(n)), 2 / dt * inverse @ B, 2 * Ck @ inverse / 1.0, Dk - Ck @ inverse @ B, 0.0
+    )
 
 
 def response(system: StateSpace, freqs_hz: Array) -> Array:
@@ -113,8 +133,12 @@ def truth(form: Form, G: Array, Gp: Array) -> tuple[Array, Array]:
     E, R, known = formulas(form, G, Gp)
     sizes = [np.linalg.norm(x, 2, axis=(-2, -1)) for x in (G, Gp)]
     condition = 1.0 if form is Form.ADDITIVE else np.maximum(np.linalg.cond(G), np.linalg.cond(Gp))
-    units = {"additive": sizes[1], "inverse_additive": 1 / np.maximum(sizes[0], 1e-300)}.get(form.value, np.ones_like(sizes[1]))
-    return tuple(np.where(known[:, None, None], _shrunk(x, EPS * condition * u), 0.0) for x, u in ((E, units), (R, sizes[1])))  # type: ignore[return-value]
+    units = {"additive": sizes[1], "inverse_additive": 1 / np.maximum(sizes[0], 1e-300)}.get(
+        form.value, np.ones_like(sizes[1])
+    )
+    return tuple(
+        np.where(known[:, None, None], _shrunk(x, EPS * condition * u), 0.0) for x, u in ((E, units), (R, sizes[1]))
+    )  # type: ignore[return-value]
 
 
 def _shrunk(x: Array, noise: Array) -> Array:
@@ -128,7 +152,9 @@ def formulas(form: Form, G: Array, Gp: Array) -> tuple[Array, Array, Array]:
     known = np.ones(G.shape[0], bool)
     if form is Form.ADDITIVE:
         return diff, np.zeros_like(diff), known
-    inverted = {"input_multiplicative": [G], "output_multiplicative": [G], "inverse_additive": [G, Gp]}.get(form.value, [Gp])
+    inverted = {"input_multiplicative": [G], "output_multiplicative": [G], "inverse_additive": [G, Gp]}.get(
+        form.value, [Gp]
+    )
     for plant in inverted:
         known &= np.linalg.cond(plant) < REGULAR
     if form is Form.INPUT_MULTIPLICATIVE:
@@ -227,7 +253,11 @@ def limited(seconds: float) -> Iterator[None]:
 
 def models(case: Case) -> tuple[str, bool]:
     """Judge `quantify_systems`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
-    options: dict[str, Any] = {"structure": case.structure, "max_order": case.max_order, "tolerance_db": case.tolerance_db}
+    options: dict[str, Any] = {
+        "structure": case.structure,
+        "max_order": case.max_order,
+        "tolerance_db": case.tolerance_db,
+    }
     found = quantify_systems(case.units, case.form, case.freqs_hz, **options)
     nominal, weight, remainder = found.scaled_nominal(), found.weight, found.remainder
     shown = [weight.left, weight.right] + ([remainder.left, remainder.right] if remainder else [])

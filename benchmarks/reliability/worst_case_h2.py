@@ -43,7 +43,10 @@ def weight(rng: np.random.Generator, order: int, rows: int, columns: int, size: 
     for block in blocks:
         A[at : at + len(block), at : at + len(block)] = block
         at += len(block)
-    B, C = rng.standard_normal((order, columns)), rng.standard_normal((rows, order)) * (1 - np.abs(np.linalg.eigvals(A)).max(initial=0))
+    B, C = (
+        rng.standard_normal((order, columns)),
+        rng.standard_normal((rows, order)) * (1 - np.abs(np.linalg.eigvals(A)).max(initial=0)),
+    )
     system = StateSpace(A, B, C, rng.standard_normal((rows, columns)), 1.0)
     return _times(system, size / max(hinf_norm(system, 1e-3), 1e-9))
 
@@ -72,7 +75,13 @@ def random_problem(rng: np.random.Generator) -> ObserverProblem:
     units = 10.0 ** rng.uniform(-3, 3, n) if rng.random() < 0.4 else np.ones(n)
     model = StateSpace(model.A * units[:, None] / units, model.B * units[:, None], np.eye(n), np.zeros((n, m)), 1.0)
     scale = units * np.sqrt(np.diag(_covariance(model.A / units[:, None] * units, model.B / units[:, None])) + 1e-6)
-    parts: dict[str, Any] = {"nominal": model, "C": np.eye(n)[:q], "input_scale": np.ones(m), "output_scale": scale, "form": form}
+    parts: dict[str, Any] = {
+        "nominal": model,
+        "C": np.eye(n)[:q],
+        "input_scale": np.ones(m),
+        "output_scale": scale,
+        "form": form,
+    }
     parts["noise"] = scale[:q] * 10.0 ** rng.uniform(-4, 0.5, q)
     parts["injection"] = Injection.STATE if rng.random() < 0.5 else Injection.INPUT
     at_input = form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
@@ -84,7 +93,10 @@ def random_problem(rng: np.random.Generator) -> ObserverProblem:
     if rng.random() < 0.3:
         parts["W_u"] = weight(rng, 1, m, m, 1.0)
     if rng.random() < 0.25:
-        parts["remainder_left"], parts["remainder_right"] = weight(rng, int(rng.integers(0, 3)), n, n, 0.05), gain(np.eye(m), 1.0)
+        parts["remainder_left"], parts["remainder_right"] = (
+            weight(rng, int(rng.integers(0, 3)), n, n, 0.05),
+            gain(np.eye(m), 1.0),
+        )
     if rng.random() < 0.25:
         parts["process_noise"] = scale * 10.0 ** rng.uniform(-4, -1, n)
     problem = ObserverProblem(**parts)
@@ -105,7 +117,9 @@ def response(system: StateSpace, theta: Array) -> Array:
     """Transfer matrices at angles, by inversion."""
     n = system.n_states
     zeta = np.expm1(1j * theta)
-    return np.asarray(system.C @ np.linalg.inv(zeta[:, None, None] * np.eye(n) - (system.A - np.eye(n))) @ system.B + system.D)
+    return np.asarray(
+        system.C @ np.linalg.inv(zeta[:, None, None] * np.eye(n) - (system.A - np.eye(n))) @ system.B + system.D
+    )
 
 
 def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.random.Generator) -> Array:
@@ -129,7 +143,9 @@ def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.rand
         "inverse_input_multiplicative": lambda: W_R @ W_L,
         "inverse_output_multiplicative": lambda: W_R @ W_L,
     }.get(name, lambda: np.zeros((len(theta), M.shape[-2], T.shape[-1])))()
-    noise = np.concatenate([W_p @ S @ R @ J @ gains * problem.noise, W_p @ S @ R * np.asarray(problem.process_noise)], axis=-1)
+    noise = np.concatenate(
+        [W_p @ S @ R @ J @ gains * problem.noise, W_p @ S @ R * np.asarray(problem.process_noise)], axis=-1
+    )
     rest = np.zeros((len(theta), T.shape[-2], m))
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left, right = response(problem.remainder_left, theta), response(problem.remainder_right, theta) @ W_u
@@ -139,7 +155,9 @@ def attained(problem: ObserverProblem, K: StateSpace, theta: Array, rng: np.rand
         rest = S_x @ left @ (U[..., :k] @ np.swapaxes(V[..., :k], -1, -2).conj()) @ right
     found = np.zeros(len(theta))
     for start in range(3):
-        X = rng.standard_normal((len(theta), T.shape[-1], M.shape[-2])) + 1j * rng.standard_normal((len(theta), T.shape[-1], M.shape[-2]))
+        X = rng.standard_normal((len(theta), T.shape[-1], M.shape[-2])) + 1j * rng.standard_normal(
+            (len(theta), T.shape[-1], M.shape[-2])
+        )
         delta = _contraction(np.swapaxes(T, -1, -2).conj() @ T @ X @ M @ np.swapaxes(M, -1, -2).conj() if start else X)
         for _ in range(CLIMB):
             inner = np.linalg.inv(np.eye(N.shape[-2]) - N @ delta)
@@ -161,7 +179,8 @@ def fine_grid(problem: ObserverProblem, K: StateSpace) -> Array:
     systems = [loop, problem.W_L, problem.W_R, problem.input_weight, problem.nominal]
     poles = np.log(np.concatenate([s.poles() for s in systems]).astype(complex) + 1e-12)
     around = (
-        np.abs(poles.imag)[:, None] + np.abs(poles.real)[:, None] * np.r_[-(2.0 ** np.arange(-3, 6)), 0, 2.0 ** np.arange(-3, 6)]
+        np.abs(poles.imag)[:, None]
+        + np.abs(poles.real)[:, None] * np.r_[-(2.0 ** np.arange(-3, 6)), 0, 2.0 ** np.arange(-3, 6)]
     ).ravel()
     return np.unique(np.concatenate([np.geomspace(1e-6, np.pi, POINTS), around[(around > 1e-6) & (around < np.pi)]]))
 
@@ -171,7 +190,9 @@ def least_mean(density: Array, theta: Array) -> float:
     return float(np.sqrt(np.sum(np.minimum(density[1:], density[:-1]) * np.diff(theta)) / np.pi))
 
 
-def other_observers(problem: ObserverProblem, found: Synthesis, rng: np.random.Generator) -> Iterator[tuple[ObserverProblem, StateSpace]]:
+def other_observers(
+    problem: ObserverProblem, found: Synthesis, rng: np.random.Generator
+) -> Iterator[tuple[ObserverProblem, StateSpace]]:
     """Observers of either injection that are not the one found."""
     n, m, q = problem.nominal.n_states, problem.nominal.n_inputs, len(problem.C)
     K = found.controller
@@ -180,13 +201,24 @@ def other_observers(problem: ObserverProblem, found: Synthesis, rng: np.random.G
         size = 10.0 ** rng.uniform(-3, 0)
         yield (
             problem,
-            StateSpace(K.A, K.B * (1 + size * rng.standard_normal(K.B.shape)), K.C, K.D * (1 + size * rng.standard_normal(K.D.shape)), 1.0),
+            StateSpace(
+                K.A,
+                K.B * (1 + size * rng.standard_normal(K.B.shape)),
+                K.C,
+                K.D * (1 + size * rng.standard_normal(K.D.shape)),
+                1.0,
+            ),
         )
-    for injection, rows, scale in ((Injection.STATE, n, problem.output_scale), (Injection.INPUT, m, problem.input_scale)):
+    for injection, rows, scale in (
+        (Injection.STATE, n, problem.output_scale),
+        (Injection.INPUT, m, problem.input_scale),
+    ):
         same = replace(problem, injection=injection)
         best, least = np.zeros((rows, q)), np.inf
         for _ in range(OTHERS):
-            tried = best + 10.0 ** rng.uniform(-2, 0) * scale[:, None] / problem.output_scale[:q] * rng.standard_normal((rows, q))
+            tried = best + 10.0 ** rng.uniform(-2, 0) * scale[:, None] / problem.output_scale[:q] * rng.standard_normal(
+                (rows, q)
+            )
             value = value_of(same, gain(tried, 1.0))
             if value < least:
                 best, least = tried, value
@@ -204,10 +236,12 @@ def value_of(problem: ObserverProblem, K: StateSpace) -> float:
 def run(count: int, seed: int) -> list[Tally]:
     """Try random problems."""
     upper = Tally(
-        "worst_case_h2, certified value", "perturbations that climb at every frequency of a fine grid, from the definition of the set"
+        "worst_case_h2, certified value",
+        "perturbations that climb at every frequency of a fine grid, from the definition of the set",
     )
     density = Tally(
-        "worst_case_h2, lower bound", "certified values of other observers: none, perturbed, searched gains, the other injection"
+        "worst_case_h2, lower bound",
+        "certified values of other observers: none, perturbed, searched gains, the other injection",
     )
     gaps = []
     for k in range(count):
@@ -215,7 +249,9 @@ def run(count: int, seed: int) -> list[Tally]:
         problem = random_problem(rng)
         start = time.perf_counter()
         try:
-            found = worst_case_h2(problem, max_order=ORDERS[k % len(ORDERS)], tolerance_db=3.0, refinements=0, causal=False)
+            found = worst_case_h2(
+                problem, max_order=ORDERS[k % len(ORDERS)], tolerance_db=3.0, refinements=0, causal=False
+            )
         except SynthesisError:
             upper.add("refused with a reason", time.perf_counter() - start)
             density.add("refused with a reason")
@@ -231,7 +267,9 @@ def run(count: int, seed: int) -> list[Tally]:
         upper.add(f"exceeded, problem {k}" if false else "holds", seconds, failed=false)
         if found.lower_bound is None:
             internal = any("Internal" in note for note in found.notes)
-            density.add(f"false bound dropped, problem {k}" if internal else "none proven, with a note", failed=internal)
+            density.add(
+                f"false bound dropped, problem {k}" if internal else "none proven, with a note", failed=internal
+            )
             continue
         gaps.append(found.gap_percent or 0.0)
         least = min(value_of(*other) for other in other_observers(problem, found, rng))

@@ -37,11 +37,17 @@ def main() -> None:
     options = parser.parse_args()
     if "KROS_DATA" not in os.environ:
         sys.exit("Set KROS_DATA to the folder that holds dfki_double_pendulum; study.toml says where it is published.")
-    data = load_config(HERE / "study.toml", [f"data.source={Path(os.environ['KROS_DATA']) / 'dfki_double_pendulum'}"]).data
+    data = load_config(
+        HERE / "study.toml", [f"data.source={Path(os.environ['KROS_DATA']) / 'dfki_double_pendulum'}"]
+    ).data
     population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
-    sys.stdout.write(f"{'':8s} {'inputs':22s} {'factor':>7s} " + " ".join(f"{g:>24s}" for g in GROUPS) + f" {'condition':>10s}\n")
+    sys.stdout.write(
+        f"{'':8s} {'inputs':22s} {'factor':>7s} " + " ".join(f"{g:>24s}" for g in GROUPS) + f" {'condition':>10s}\n"
+    )
     split = split_episodes(population)
-    episodes = {unit: [population.read_parts(key) for key in split[unit, "default"].train] for unit in population.unit_ids}
+    episodes = {
+        unit: [population.read_parts(key) for key in split[unit, "default"].train] for unit in population.unit_ids
+    }
     for name, functions in LIFTINGS.items():
         lifting = Lifting(population.states, functions)
         for inputs, count in INPUTS.items():
@@ -74,7 +80,9 @@ def scaled(factors: Factor, lifting: Lifting, times: float, dt: float) -> tuple[
 def peak(drives: Sequence[str], responses: np.ndarray, freqs: np.ndarray, part: str) -> tuple[float, float]:
     """Return the lowest peak over the nominal drives of a group in dB, and its frequency in Hz."""
     group = responses[[i for i, unit in enumerate(drives) if part in unit]]
-    largest = [sigma_max(residual(FORM, nominal, np.delete(group, i, axis=0))).max(axis=0) for i, nominal in enumerate(group)]
+    largest = [
+        sigma_max(residual(FORM, nominal, np.delete(group, i, axis=0))).max(axis=0) for i, nominal in enumerate(group)
+    ]
     best = min(largest, key=np.max)
     return float(20 * np.log10(best.max())), float(freqs[best.argmax()])
 

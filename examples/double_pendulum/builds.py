@@ -43,7 +43,9 @@ FRICTION = ("tanh(10*w1)", "tanh(10*w2)")
 INERTIAL = ("sin(q2)*w1**2", "sin(q2)*w2**2", "sin(q2)*w1*w2")
 COUPLED = tuple(f"cos(q2)*{f}" for f in (*GRAVITY, "held1", "held2"))
 LIFTING = Lifting(STATES, GRAVITY + FRICTION + INERTIAL + COUPLED)
-OPTIONS = RefineOptions(horizons=(5, 20, HORIZON), segments=150, pooled_segments=150, balance=0.5, strengths=(10.0,), bound=1e3)
+OPTIONS = RefineOptions(
+    horizons=(5, 20, HORIZON), segments=150, pooled_segments=150, balance=0.5, strengths=(10.0,), bound=1e3
+)
 
 Recordings = dict[str, dict[str, np.ndarray]]
 
@@ -101,7 +103,9 @@ def koopman_predictions(A: np.ndarray, B: np.ndarray, values: np.ndarray) -> np.
 
 def arx_outputs(values: np.ndarray) -> np.ndarray:
     """Return sin q1, sin(q1 + q2), q1, q2, w1, w2."""
-    return np.concatenate([np.sin(values[..., :1]), np.sin(values[..., :1] + values[..., 1:2]), values[..., :4]], axis=-1)
+    return np.concatenate(
+        [np.sin(values[..., :1]), np.sin(values[..., :1] + values[..., 1:2]), values[..., :4]], axis=-1
+    )
 
 
 def fit_arx(episodes: list[np.ndarray]) -> np.ndarray:
@@ -149,14 +153,23 @@ def compare(recordings: Recordings) -> dict[str, dict[str, dict[str, np.ndarray]
 def main() -> None:
     """Print R^2 of every joint."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--with-spikes", action="store_true", help="train on the two episodes of C.0 with velocity spikes, too")
+    parser.add_argument(
+        "--with-spikes", action="store_true", help="train on the two episodes of C.0 with velocity spikes, too"
+    )
     parser.add_argument("--json", action="store_true", help="print numbers for other programs")
     arguments = parser.parse_args()
     if "KROS_DATA" not in os.environ:
         sys.exit("Set KROS_DATA to the folder that holds dfki_double_pendulum; study.toml says where it is published.")
     found = compare(read(Path(os.environ["KROS_DATA"]) / "dfki_double_pendulum", arguments.with_spikes))
     if arguments.json:
-        print(json.dumps({t: {b: {n: v.tolist() for n, v in models.items()} for b, models in rows.items()} for t, rows in found.items()}))
+        print(
+            json.dumps(
+                {
+                    t: {b: {n: v.tolist() for n, v in models.items()} for b, models in rows.items()}
+                    for t, rows in found.items()
+                }
+            )
+        )
         return
     for title, rows in found.items():
         print(f"R^2 over {title}\nbuild  model    " + "".join(f"{s:>8}" for s in STATES[:4]))
@@ -164,7 +177,9 @@ def main() -> None:
             for name, values in models.items():
                 print(f"{build:6} {name:8} " + "".join(f"{v:8.3f}" for v in values))
         for name in ("refined", "EDMD", "ARX"):
-            print(f"velocity, mean over the six drives, {name}: {np.mean([models[name][2:] for models in rows.values()]):.3f}")
+            print(
+                f"velocity, mean over the six drives, {name}: {np.mean([models[name][2:] for models in rows.values()]):.3f}"
+            )
 
 
 if __name__ == "__main__":

@@ -51,9 +51,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/double_pendulum_left_out"))
     parser.add_argument("--drives", nargs="+", help="leave out these alone")
     parser.add_argument("--builds", action="store_true", help="leave out both drives of a build at once")
-    parser.add_argument("--alone", action="store_true", help="without the other joint's motion as inputs: the commanded torque alone")
-    parser.add_argument("--memories", type=int, nargs="*", default=[4, 12], help="internal states of the subspace-identified predictors")
-    parser.add_argument("--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="as for kros run")
+    parser.add_argument(
+        "--alone", action="store_true", help="without the other joint's motion as inputs: the commanded torque alone"
+    )
+    parser.add_argument(
+        "--memories", type=int, nargs="*", default=[4, 12], help="internal states of the subspace-identified predictors"
+    )
+    parser.add_argument(
+        "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="as for kros run"
+    )
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if "KROS_DATA" not in os.environ:
@@ -117,7 +123,9 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
     """Return the observers of a fold's study with what its records say."""
     record = load_artifact(folder / "observers", "observers")[0]
     # One drive alone turns all the way round: its position would be refused as implausible, being beyond 1.5 times what the other drives do.
-    loaded = {name: replace(Observer.load(folder / "observers" / f"{name}.json"), seen=None) for name in record["names"]}
+    loaded = {
+        name: replace(Observer.load(folder / "observers" / f"{name}.json"), seen=None) for name in record["names"]
+    }
     return [(name, observer, record["facts"][name]) for name, observer in loaded.items()]
 
 
@@ -129,7 +137,14 @@ def with_memory(training: TrainingSet, memories: Sequence[int]) -> list[tuple[st
         for steps, how in ((0, ""), (25, ", tuned")):
             name = f"all training episodes, predictor of {count} internal states{how}"
             observer = identify_predictor(
-                name, Lifting(population.states), (0,), population.inputs, batch, count, episodes=len(batch.keys), iterations=steps
+                name,
+                Lifting(population.states),
+                (0,),
+                population.inputs,
+                batch,
+                count,
+                episodes=len(batch.keys),
+                iterations=steps,
             )
             found.append((name, observer, {"relift_certified": relift_certificate(observer, mismatch=False).certified}))
     return found
@@ -158,11 +173,24 @@ def summary(table: Mapping[str, Sequence[Row]]) -> dict[str, dict[str, Any]]:
         low, high = unit_interval(percent) if len(rows) > 1 else (percent[0], percent[0])
         states = sorted({row.states for row in rows if row.states is not None})
         errors = {
-            channel: {"mean": float(percent[:, i].mean()), "interval": [float(low[i]), float(high[i])], "worst": float(percent[:, i].max())}
+            channel: {
+                "mean": float(percent[:, i].mean()),
+                "interval": [float(low[i]), float(high[i])],
+                "worst": float(percent[:, i].max()),
+            }
             for i, channel in enumerate(SHOWN)
         }
-        proofs = {key: None if getattr(rows[0], key) is None else sum(getattr(r, key) for r in rows) for key in ("running", "robust")}
-        found[name] = {"drives": len(rows), "states": states, **proofs, **errors, "to_learned": to_learned(rows, table["learned"])}
+        proofs = {
+            key: None if getattr(rows[0], key) is None else sum(getattr(r, key) for r in rows)
+            for key in ("running", "robust")
+        }
+        found[name] = {
+            "drives": len(rows),
+            "states": states,
+            **proofs,
+            **errors,
+            "to_learned": to_learned(rows, table["learned"]),
+        }
     return found
 
 
@@ -181,10 +209,15 @@ def text(found: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     for name, row in found.items():
         proofs = ["-" if row[key] is None else f"{row[key]}/{row['drives']}" for key in ("running", "robust")]
-        cells = [f"{e['mean']:8.3g} {'({:.3g}, {:.3g})'.format(*e['interval']):>13s} {e['worst']:7.3g}" for e in (row[c] for c in SHOWN)]
+        cells = [
+            f"{e['mean']:8.3g} {'({:.3g}, {:.3g})'.format(*e['interval']):>13s} {e['worst']:7.3g}"
+            for e in (row[c] for c in SHOWN)
+        ]
         ratio = "{:.3g} ({:.3g}, {:.3g})".format(*row["to_learned"])
         states = "-" if not row["states"] else "/".join(map(str, row["states"]))
-        lines.append(f"{name:44s} {states:>7s} {proofs[0]:>10s} {proofs[1]:>10s} {cells[0]:>30s} {ratio:>20s} {cells[1]:>30s}")
+        lines.append(
+            f"{name:44s} {states:>7s} {proofs[0]:>10s} {proofs[1]:>10s} {cells[0]:>30s} {ratio:>20s} {cells[1]:>30s}"
+        )
     return "\n".join(lines) + "\n"
 
 

@@ -30,7 +30,9 @@ def value(metrics: Metrics, observer: str, key: str, channel: str, condition: st
 
 def ripple_db(metrics: Metrics, method: str, channel: str, condition: str, role: str) -> float:
     """Return the power of the Koopman observer's error around the gearbox frequency over that of its linear twin, dB."""
-    koopman, linear = (value(metrics, f"{kind}/{method}", "gearbox_band_power", channel, condition, role) for kind in KINDS.values())
+    koopman, linear = (
+        value(metrics, f"{kind}/{method}", "gearbox_band_power", channel, condition, role) for kind in KINDS.values()
+    )
     return float(10 * np.log10(koopman / linear))
 
 
@@ -44,7 +46,10 @@ def errors(metrics: Metrics, method: str, role: str, condition: str) -> str:
     """Return the errors of velocity and current of both observers, percent of the largest value."""
 
     def say(kind: str) -> str:
-        found = [value(metrics, f"{kind}/{method}", "error_percent", channel, condition, role) for channel in ("velocity", "current")]
+        found = [
+            value(metrics, f"{kind}/{method}", "error_percent", channel, condition, role)
+            for channel in ("velocity", "current")
+        ]
         return f"{found[0]:.2f}, {found[1]:.1f} %"
 
     return both(say)
@@ -78,7 +83,11 @@ def claims(metrics: Metrics, method: str = "mixed") -> Iterator[tuple[str, str, 
         f"{study['units']} drives, {', '.join(study['conditions'])}, {1 / study['sample_period_s']:g} Hz",
     )
     radius = both(lambda kind: f"{metrics['models'][kind]['spectral_radius_max']:.3f}")
-    yield "IV-B.2", "alpha = 90 stabilises all models, linear and Koopman", f"alpha = {study['alpha']:g}, largest spectral radius: {radius}"
+    yield (
+        "IV-B.2",
+        "alpha = 90 stabilises all models, linear and Koopman",
+        f"alpha = {study['alpha']:g}, largest spectral radius: {radius}",
+    )
 
     def free_run(kind: str) -> str:
         found = metrics["models"][kind]["freerun_error_percent"]
@@ -90,25 +99,53 @@ def claims(metrics: Metrics, method: str = "mixed") -> Iterator[tuple[str, str, 
     yield "IV-C, Fig. 7", text, f"peaks: {both(lambda kind: forms(metrics, kind))}"
     nominals = both(lambda kind: str(metrics["uncertainty"][kind]["nominal"]))
     yield "IV-C", "The unit with the lowest peak is the nominal one, the same for both", nominals
-    orders = both(lambda kind: f"{metrics['uncertainty'][kind]['weight']['structure']} {metrics['uncertainty'][kind]['weight']['orders']}")
-    yield "IV-C, Fig. 8", "Weights of order 1 to 2 (linear), 3 and once 1 (Koopman), an entry each", f"orders of W_L and W_R: {orders}"
+    orders = both(
+        lambda kind: (
+            f"{metrics['uncertainty'][kind]['weight']['structure']} {metrics['uncertainty'][kind]['weight']['orders']}"
+        )
+    )
+    yield (
+        "IV-C, Fig. 8",
+        "Weights of order 1 to 2 (linear), 3 and once 1 (Koopman), an entry each",
+        f"orders of W_L and W_R: {orders}",
+    )
     made = both(
-        lambda kind: f"{metrics['observers'][f'{kind}/{method}'].get('status')}, order {metrics['observers'][f'{kind}/{method}']['order']}"
+        lambda kind: (
+            f"{metrics['observers'][f'{kind}/{method}'].get('status')}, order {metrics['observers'][f'{kind}/{method}']['order']}"
+        )
     )
     yield "IV-D", "A mixed H2 and H-infinity observer exists for both", made
     for role, words in (("nominal", "nominal"), ("off_nominal", "off-nominal, mean over all")):
-        said = ", ".join(f"{channel} {ripple_db(metrics, method, channel, on, role):+.1f} dB" for channel in ("velocity", "current"))
-        yield "IV-E.1, Fig. 12", f"The Koopman observer reduces errors at the gearbox frequency, {words}", f"Koopman against linear: {said}"
+        said = ", ".join(
+            f"{channel} {ripple_db(metrics, method, channel, on, role):+.1f} dB" for channel in ("velocity", "current")
+        )
+        yield (
+            "IV-E.1, Fig. 12",
+            f"The Koopman observer reduces errors at the gearbox frequency, {words}",
+            f"Koopman against linear: {said}",
+        )
         yield "IV-E.1, Fig. 11", f"Errors of velocity and current, {words}", errors(metrics, method, role, on)
     if f"{KINDS['linear']}/open_loop" in metrics["observers"]:
         said = errors(metrics, "open_loop", "off_nominal", on)
-        yield "IV-D.2, Fig. 10", "The correction acts where uncertainty is high", f"the models alone, off-nominal: {said}"
+        yield (
+            "IV-D.2, Fig. 10",
+            "The correction acts where uncertainty is high",
+            f"the models alone, off-nominal: {said}",
+        )
     if loaded is not None:
         said = f"Koopman against linear, current: {ripple_db(metrics, method, 'current', loaded, 'nominal'):+.1f} dB"
         yield "IV-E.2, Fig. 14", "The load torque estimate holds less of the gearbox's disturbance", said
-        yield "Appendix A, Fig. 15", "A badly installed drive exceeds the bounds; under all nominals but one", outliers(metrics, loaded)
+        yield (
+            "Appendix A, Fig. 15",
+            "A badly installed drive exceeds the bounds; under all nominals but one",
+            outliers(metrics, loaded),
+        )
     phases = [unit["concentration"] for unit in metrics["units"] if unit.get("concentration") is not None]
-    yield "Appendix B", "Segments of constant velocity agree on a phase", f"least concentration (1: all alike) {min(phases):.6f}"
+    yield (
+        "Appendix B",
+        "Segments of constant velocity agree on a phase",
+        f"least concentration (1: all alike) {min(phases):.6f}",
+    )
 
 
 def table(metrics: Metrics, method: str = "mixed") -> str:

@@ -37,7 +37,10 @@ def main() -> None:
     simulated = PendulumPopulation(options.units, 10, 20.0, 1, 1.0).simulate()
     uncertain = quantify_systems(identify(simulated.population), "additive", np.geomspace(1e-3, 50.0, 300))
     plant = generalized_plant(uncertain)
-    controllers = {"nominal H2": h2(plant.channel(slice(1, None), slice(1, None))).controller, "H-infinity": hinf(plant).controller}
+    controllers = {
+        "nominal H2": h2(plant.channel(slice(1, None), slice(1, None))).controller,
+        "H-infinity": hinf(plant).controller,
+    }
     facts = {"units": options.units, "cover_max": round(uncertain.cover_max, 4)}
     try:
         controllers["D-K iteration"], facts["mu"] = dk_iteration(plant)
@@ -66,7 +69,12 @@ def identify(population):
 def generalized_plant(uncertain):
     """``u -> G``, with ``W_L Delta W_R`` beside it; W_S weighs position minus reference, W_U the torque; the controller sees the noisy error."""
     one, size = np.eye(1), float(REFERENCE_RAD / uncertain.output_scale[0])
-    weights = {"W_L": uncertain.weight.left, "W_R": uncertain.weight.right, "W_S": lag(*SENSITIVITY), "W_U": lag(*TORQUE)}
+    weights = {
+        "W_L": uncertain.weight.left,
+        "W_R": uncertain.weight.right,
+        "W_S": lag(*SENSITIVITY),
+        "W_U": lag(*TORQUE),
+    }
     error = {"G": one, "W_L": one, "reference": -size * one}
     scaled = {name: matrix / size for name, matrix in error.items()}
     wires = {"G": {"u": one}, "W_L": {"w": one}, "W_R": {"u": one}, "W_S": scaled, "W_U": {"u": one}}
@@ -121,7 +129,9 @@ def judged(positions, torques):
     error = (positions - np.where(times < 4.0, REFERENCE_RAD, -REFERENCE_RAD)[:, None]) / REFERENCE_RAD
     settled = np.sqrt(np.mean(error[times % 4.0 >= 1.5] ** 2, axis=0))
     numbers = {"settled_error_percent": 100 * settled.max(), "overshoot_percent": 100 * error[times < 4.0].max()}
-    return {name: round(float(value), 1) for name, value in numbers.items()} | {"largest_torque": round(float(np.abs(torques).max()), 2)}
+    return {name: round(float(value), 1) for name, value in numbers.items()} | {
+        "largest_torque": round(float(np.abs(torques).max()), 2)
+    }
 
 
 if __name__ == "__main__":

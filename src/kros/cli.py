@@ -55,8 +55,12 @@ def _version(asked: bool) -> None:
 @app.callback()
 def main(
     verbose: Annotated[bool, typer.Option("--verbose", "-v", help="Log what happens to standard error.")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show the traceback of an error in place of a message.")] = False,
-    version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and nothing else.")] = False,
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show the traceback of an error in place of a message.")
+    ] = False,
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Say the version and nothing else.")
+    ] = False,
 ) -> None:
     """Set up logging and memory."""
     log_to_stderr(verbose)
@@ -67,12 +71,19 @@ def main(
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV or Parquet files.")],
     measured: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="State that is available at run time; may be given several times.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="State that is available at run time; may be given several times."),
     ] = None,
-    input_: Annotated[list[str] | None, typer.Option("--input", metavar="NAME", help="Input; may be given several times.")] = None,
+    input_: Annotated[
+        list[str] | None, typer.Option("--input", metavar="NAME", help="Input; may be given several times.")
+    ] = None,
     out: Annotated[Path, typer.Option(help="New study file.")] = Path("study.toml"),
-    files: Annotated[str | None, typer.Option(metavar="REGEX", help="What a file is, in place of what its name seems to say.")] = None,
-    period: Annotated[float | None, typer.Option(metavar="SECONDS", help="Sampling period, where no column holds time.")] = None,
+    files: Annotated[
+        str | None, typer.Option(metavar="REGEX", help="What a file is, in place of what its name seems to say.")
+    ] = None,
+    period: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Sampling period, where no column holds time.")
+    ] = None,
 ) -> None:
     """Look at a folder of recordings and write a study for it."""
     from .data.discovery.discover import Wanted
@@ -136,7 +147,9 @@ def simulate(
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,
     seed: Seed = 0,
-    spread: Annotated[float, typer.Option(min=0, help="Manufacturing spread; 1 means 5 to 15 % on every physical parameter.")] = 1.0,
+    spread: Annotated[
+        float, typer.Option(min=0, help="Manufacturing spread; 1 means 5 to 15 % on every physical parameter.")
+    ] = 1.0,
     loop: Annotated[str, typer.Option(help="Velocity loop: stiff or soft.")] = "stiff",
     outlier: Annotated[bool, typer.Option("--outlier", help="Add one badly assembled unit.")] = False,
     format_: Annotated[str, typer.Option("--format", help="parquet or raw, the paper's layout.")] = "parquet",
@@ -170,7 +183,8 @@ def run(
     study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
     out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<study> beside the study file.")] = None,
     until: Annotated[
-        str, typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate, left_out or report.")
+        str,
+        typer.Option(help="Last stage: read, calibrate, identify, quantify, synthesize, evaluate, left_out or report."),
     ] = "report",
     set_: Overrides = None,
     workers: Workers = None,
@@ -207,12 +221,17 @@ def _finish(result: Any, quiet: bool) -> None:
 @app.command()
 def check(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
-    data: Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")],
+    data: Annotated[
+        Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")
+    ],
     workers: Workers = None,
     quiet: Annotated[bool, typer.Option("--json", help="Print scores as JSON and nothing else.")] = False,
     junit: Annotated[Path | None, typer.Option(metavar="FILE", help="Write verdicts as JUnit XML.")] = None,
     same_unit: Annotated[
-        bool, typer.Option("--same-unit", help="A unit named as one of the study is that machine: compare it with the others alone.")
+        bool,
+        typer.Option(
+            "--same-unit", help="A unit named as one of the study is that machine: compare it with the others alone."
+        ),
     ] = False,
 ) -> None:
     """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 0 all pass, 3 a unit fails, 4 a unit is undecided."""
@@ -239,13 +258,17 @@ def estimate(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
     data: Annotated[
         Path,
-        typer.Argument(metavar="DATA", help="Folder in the run's reader, or a TOML with [data]; no hidden channels needed."),
+        typer.Argument(
+            metavar="DATA", help="Folder in the run's reader, or a TOML with [data]; no hidden channels needed."
+        ),
     ],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New file, .parquet or .csv")],
     parameter: Annotated[
         list[str] | None, typer.Option(metavar="UNIT.NAME=VALUE", help="A unit's lifting parameter, such as its phase.")
     ] = None,
-    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
+    track: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")
+    ] = None,
 ) -> None:
     """Write the deployed observer's estimates on recordings."""
     from .study.commands.estimate import estimate_recordings
@@ -264,10 +287,14 @@ app.add_typer(export, name="export")
 def export_c(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New folder for the source.")],
-    name: Annotated[str | None, typer.Option(help="Prefix of all names, a C identifier; default: the study's name.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Prefix of all names, a C identifier; default: the study's name.")
+    ] = None,
     precision: Annotated[str, typer.Option(help="double or float")] = "double",
     observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
-    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
+    track: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")
+    ] = None,
 ) -> None:
     """Write an observer as C99 source with a self-test."""
     from .study.commands.export import export_run, numerical_error
@@ -282,10 +309,14 @@ def export_fmu(
     run_folder: Annotated[Path, typer.Argument(metavar="RUN")],
     out: Annotated[Path, typer.Argument(metavar="OUT.fmu", help="New file.")],
     fmi: Annotated[int, typer.Option(help="Version of the standard, 2 or 3")] = 2,
-    name: Annotated[str | None, typer.Option(help="Name of the model, a C identifier; default: the study's name.")] = None,
+    name: Annotated[
+        str | None, typer.Option(help="Name of the model, a C identifier; default: the study's name.")
+    ] = None,
     precision: Annotated[str, typer.Option(help="double or float")] = "double",
     observer: Annotated[str, typer.Option(help="Observer of the run; default: the one that is deployed.")] = "deployed",
-    track: Annotated[str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")] = None,
+    track: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Parameter that a phase-locked loop follows.")
+    ] = None,
 ) -> None:
     """Write an observer as a functional mock-up unit for co-simulation."""
     from .study.commands.export import export_run

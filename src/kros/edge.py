@@ -21,7 +21,9 @@ from typer.core import TyperGroup
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
-_USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # typer may carry its own click
+_USAGE = [
+    kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"
+]  # typer may carry its own click
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
 _BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
 
@@ -64,7 +66,11 @@ def edge(ctx: Any = None) -> Iterator[None]:
 
 def _afterwards(ctx: Any) -> str:
     resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
-    return "the same command goes on where this one ended." if resumes else "nothing half done is left; run the same command again."
+    return (
+        "the same command goes on where this one ended."
+        if resumes
+        else "nothing half done is left; run the same command again."
+    )
 
 
 class OnceHandler(logging.StreamHandler[TextIO]):
@@ -107,11 +113,11 @@ def message(error: Exception) -> str:
         return f"Memory: there is not enough of it ({str(error) or 'no details'}); use fewer --workers, shorter episodes or fewer units."
     if isinstance(error, OSError):
         place = " -> ".join(
-            repr(os.fspath(name)) for name in (error.filename, error.filename2) if name is not None and not isinstance(name, int)
+            repr(os.fspath(name))
+            for name in (error.filename, error.filename2)
+            if name is not None and not isinstance(name, int)
         )
-        return (
-            f"Files: {error.strerror or error}{f': {place}' if place else ''}; check the path, its permissions and the space that is left."
-        )
+        return f"Files: {error.strerror or error}{f': {place}' if place else ''}; check the path, its permissions and the space that is left."
     kind = type(error).__name__
     return f"Internal error, a defect of kros: {kind}: {error}; run the command again as kros --debug ... for its traceback, and report it."
 

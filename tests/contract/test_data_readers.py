@@ -54,7 +54,13 @@ def episode(key: EpisodeKey) -> np.ndarray:
     target = np.concatenate([np.zeros(1000), np.linspace(0, 0.05, 101)])
     noise = 1e-4 * rng.standard_normal((1101, 3))
     return np.column_stack(
-        [target - 0.02 + noise[:, 0], np.gradient(target, PERIOD) + noise[:, 1], 0.1 + noise[:, 2], target, np.gradient(target, PERIOD)]
+        [
+            target - 0.02 + noise[:, 0],
+            np.gradient(target, PERIOD) + noise[:, 1],
+            0.1 + noise[:, 2],
+            target,
+            np.gradient(target, PERIOD),
+        ]
     )
 
 
@@ -74,7 +80,10 @@ def by_parquet(folder: Path) -> Population:
 
 def by_csv(folder: Path) -> Population:
     for key, values in ALIGNED.items():
-        columns = [f"time [ms],{','.join(NAMES)}", *(f"{k},{','.join(repr(float(1e3 * v)) for v in row)}" for k, row in enumerate(values))]
+        columns = [
+            f"time [ms],{','.join(NAMES)}",
+            *(f"{k},{','.join(repr(float(1e3 * v)) for v in row)}" for k, row in enumerate(values)),
+        ]
         (folder / f"{key.unit}-{key.condition}-{key.episode}.csv").write_text("\n".join(columns))
     return read(folder, "csv", mapping=MAPPING, prepare=PREPARATION)
 
@@ -85,7 +94,10 @@ def by_arrays(folder: Path) -> Population:
 
 def by_frame(folder: Path) -> Population:
     pd = pytest.importorskip("pandas")
-    parts = [pd.DataFrame(v, columns=NAMES).assign(unit=k.unit, condition=k.condition, episode=int(k.episode)) for k, v in ALIGNED.items()]
+    parts = [
+        pd.DataFrame(v, columns=NAMES).assign(unit=k.unit, condition=k.condition, episode=int(k.episode))
+        for k, v in ALIGNED.items()
+    ]
     return prepare(from_frame(pd.concat(parts), CHANNELS, sample_period_s=PERIOD), PREPARATION)
 
 
@@ -100,7 +112,14 @@ def by_pykoop(folder: Path) -> Population:
     return prepare(from_arrays(episodes, CHANNELS, PERIOD), PREPARATION)
 
 
-READERS = {"raw": by_raw, "parquet": by_parquet, "csv": by_csv, "arrays": by_arrays, "frame": by_frame, "pykoop": by_pykoop}
+READERS = {
+    "raw": by_raw,
+    "parquet": by_parquet,
+    "csv": by_csv,
+    "arrays": by_arrays,
+    "frame": by_frame,
+    "pykoop": by_pykoop,
+}
 
 
 @pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
@@ -120,7 +139,9 @@ def test_same_population(opened: Callable[[Path], Population], tmp_path: Path) -
         assert values.dtype == np.float64
         # The raw layout rounds to 1e-6 deg, 1e-5 deg/s (motor side) and 1e-4 %.
         np.testing.assert_allclose(values, expected, rtol=1e-12, atol=1e-6 if opened is by_raw else 1e-15)
-        np.testing.assert_allclose(values[:, [0, 1, 3, 4]], expected[:, [0, 1, 3, 4]], rtol=1e-12, atol=2e-9 if opened is by_raw else 1e-15)
+        np.testing.assert_allclose(
+            values[:, [0, 1, 3, 4]], expected[:, [0, 1, 3, 4]], rtol=1e-12, atol=2e-9 if opened is by_raw else 1e-15
+        )
 
 
 @pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
@@ -148,7 +169,11 @@ def test_conversion_to_parquet_is_exact(opened: Callable[[Path], Population], tm
     population = opened(tmp_path)
     write_parquet(population, tmp_path / "converted")
     converted = read(tmp_path / "converted", "parquet")
-    assert (converted.channels, converted.units, converted.episodes) == (population.channels, population.units, population.episodes)
+    assert (converted.channels, converted.units, converted.episodes) == (
+        population.channels,
+        population.units,
+        population.episodes,
+    )
     assert converted.metadata == population.metadata
     for key in KEYS:
         np.testing.assert_array_equal(converted.read(key), population.read(key))

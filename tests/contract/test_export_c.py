@@ -107,7 +107,10 @@ def test_load_torque_with_its_level(precision, limit, tmp_path):
     at = kept.ctypes.data_as(ctypes.c_void_p)
     library._c.drive_load_init(at)
     for k in range(count):
-        x_hat, value = np.nan_to_num(estimate[k]).astype(real), (ctypes.c_float if precision == "float" else ctypes.c_double)(angle[k, 0])
+        x_hat, value = (
+            np.nan_to_num(estimate[k]).astype(real),
+            (ctypes.c_float if precision == "float" else ctypes.c_double)(angle[k, 0]),
+        )
         places = [ctypes.c_void_p(a.ctypes.data) for a in (x_hat, found[k, :1], found[k, 1:])]
         library._c.drive_load_step(at, places[0], value, *places[1:])
     for got, truth in zip(found.T, (wanted.load[:, 0], wanted.current[:, 0]), strict=True):
@@ -129,21 +132,29 @@ def test_a_thousand_turns_cost_no_accuracy(precision, tmp_path):
 @pytest.mark.parametrize("precision", ["double", "float"])
 def test_everything_compiles_without_a_warning(precision, tmp_path):
     folder = export_c(watched(drive(delay=2, **LIMITS)), tmp_path / "c", "drive", precision)
-    size = (
-        'extern int printf(const char *, ...);\n#include "drive.h"\nint main(void) { printf("%d", (int)sizeof(drive_state)); return 0; }\n'
-    )
+    size = 'extern int printf(const char *, ...);\n#include "drive.h"\nint main(void) { printf("%d", (int)sizeof(drive_state)); return 0; }\n'
     (folder / "size.c").write_text(size)
     for source in ("drive.c", "drive_selftest.c", "example_main.c"):
         subprocess.run(["cc", *STRICT, "-c", source, "-o", f"{source}.o"], cwd=folder, check=True)
     symbols = subprocess.run(["nm", "drive.c.o"], cwd=folder, check=True, capture_output=True, text=True).stdout
     kinds = {line.split()[-2] for line in symbols.splitlines()}
     assert not kinds & {"B", "b", "D", "d", "C"}  # no variables that can be written
-    assert {line.split()[-1] for line in symbols.splitlines() if " U " in line} <= {"sin", "cos", "floor", "sinf", "cosf"}
-    subprocess.run(["cc", "drive.c.o", "drive_selftest.c.o", "example_main.c.o", "-lm", "-o", "example"], cwd=folder, check=True)
+    assert {line.split()[-1] for line in symbols.splitlines() if " U " in line} <= {
+        "sin",
+        "cos",
+        "floor",
+        "sinf",
+        "cosf",
+    }
+    subprocess.run(
+        ["cc", "drive.c.o", "drive_selftest.c.o", "example_main.c.o", "-lm", "-o", "example"], cwd=folder, check=True
+    )
     subprocess.run(["./example"], cwd=folder, check=True)
     sources = ("drive.c", "drive_selftest.c", "example_main.c")
     sanitized = ["cc", *STRICT, "-fsanitize=address,undefined", *sources, "-lm", "-o", "sanitized"]
-    if subprocess.run(sanitized, cwd=folder, check=False, capture_output=True).returncode == 0:  # not every compiler comes with the library
+    if (
+        subprocess.run(sanitized, cwd=folder, check=False, capture_output=True).returncode == 0
+    ):  # not every compiler comes with the library
         subprocess.run(["./sanitized"], cwd=folder, check=True)
     subprocess.run(["cc", "size.c", "-o", "size"], cwd=folder, check=True)
     printed = subprocess.run(["./size"], cwd=folder, check=True, capture_output=True, text=True).stdout
@@ -172,7 +183,9 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
 
 @pytest.mark.skipif(bool(missing_tools()), reason="the tools for a Cortex-M4F are not on the PATH")
 def test_the_selftest_passes_on_a_board(tmp_path):
-    found = json.loads((export_c(replaced(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text())
+    found = json.loads(
+        (export_c(replaced(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text()
+    )
     assert found["cortex_m4f"]["selftest"] == 0
     assert found["cortex_m4f"]["state"] == found["state_bytes"]
     assert found["cortex_m4f"]["flash"] < 8192

@@ -34,9 +34,15 @@ def test_two_instances_at_once_and_after_a_reset(fmi, from_source, track, tmp_pa
         build_platform_binary(folder, tmp_path / "build")
     token, identifier = (model.guid if fmi == 2 else model.instantiationToken), model.coSimulation.modelIdentifier
     kind = fmi2.FMU2Slave if fmi == 2 else fmi3.FMU3Slave
-    units = [kind(guid=token, unzipDirectory=folder, modelIdentifier=identifier, instanceName=name) for name in ("one", "two")]
+    units = [
+        kind(guid=token, unzipDirectory=folder, modelIdentifier=identifier, instanceName=name)
+        for name in ("one", "two")
+    ]
     references = {v.name: v.valueReference for v in model.modelVariables}
-    seen, wanted = [references[n] for n in ("position", "target", "rate")], [references[f"{s}_hat"] for s in observer.recorded]
+    seen, wanted = (
+        [references[n] for n in ("position", "target", "rate")],
+        [references[f"{s}_hat"] for s in observer.recorded],
+    )
     for unit in units:
         unit.instantiate()
     for _ in range(2):

@@ -81,7 +81,9 @@ def run(*command, cwd, **options):
     return done.stdout
 
 
-@pytest.mark.skipif(shutil.which("cmake") is None or shutil.which("cc") is None, reason="CMake and a C compiler are not on the PATH")
+@pytest.mark.skipif(
+    shutil.which("cmake") is None or shutil.which("cc") is None, reason="CMake and a C compiler are not on the PATH"
+)
 def test_the_cmake_project_gives_the_estimates_of_python(tmp_path):
     observer, (y, u) = drive(), samples(300)
     shutil.copytree(GUIDES / "cmake", tmp_path / "project")
@@ -110,7 +112,10 @@ def test_the_sketch_and_the_node_compile_against_stand_ins(tmp_path):
         (tmp_path / name).write_text(text)
     shutil.copy(GUIDES / "arduino" / "axis_sketch" / "axis_sketch.ino", tmp_path)
     run("gcc", "-std=c99", "-c", folder / "axis.c", folder / "axis_selftest.c", cwd=tmp_path)
-    strict, objects = ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-I.", f"-I{folder}"), ("axis.o", "axis_selftest.o", "-lm")
+    strict, objects = (
+        ("-std=c++17", "-Wall", "-Wextra", "-Werror", "-I.", f"-I{folder}"),
+        ("axis.o", "axis_selftest.o", "-lm"),
+    )
     run("g++", *strict, "main.cpp", *objects, "-o", "sketch", cwd=tmp_path)
     assert len(run("./sketch", cwd=tmp_path).splitlines()) > 5
     run("g++", *strict, GUIDES / "ros2" / "src" / "axis_observer.cpp", *objects, "-o", "node", cwd=tmp_path)

@@ -69,7 +69,9 @@ def test_a_hostile_name_is_text_in_every_file(kind, slot, tmp_path):
         if file.suffix in (".c", ".h"):
             assert "EVIL" not in without_comments(text), file.name
         if file.suffix != ".json":
-            assert not re.search(r"[\x00-\x08\x0b-\x1f\x7f\x85\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]", text), file.name
+            assert not re.search(
+                r"[\x00-\x08\x0b-\x1f\x7f\x85\u2028\u2029\u200e\u200f\u202a-\u202e\u2066-\u2069\ufeff]", text
+            ), file.name
         if file.name == "CMakeLists.txt":
             assert "EVIL" not in text
         if file.suffix == ".md":

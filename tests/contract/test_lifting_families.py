@@ -64,7 +64,9 @@ def test_c_computes_what_numpy_does(lifting, tmp_path):
     found = np.array(out.split(), dtype=float).reshape(60, -1)
     p = len(lifting.functions)
     np.testing.assert_allclose(found[:, :p], lifting.lift(windows, {"phase": phase})[:, 2:], rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(found[:, p:], lifting.lift_inputs(u, windows, {"phase": phase})[:, 1:], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        found[:, p:], lifting.lift_inputs(u, windows, {"phase": phase})[:, 1:], rtol=1e-12, atol=1e-12
+    )
     assert depth == max(pointers.values())
 
 
@@ -76,7 +78,9 @@ def test_derivatives_are_finite_differences(lifting):
     step = 1e-6
     for j in range(windows.shape[1]):
         moved = step * np.eye(windows.shape[1])[j]
-        slope = (lifting.lift(windows + moved, {"phase": phase}) - lifting.lift(windows - moved, {"phase": phase}))[:, 2:] / (2 * step)
+        slope = (lifting.lift(windows + moved, {"phase": phase}) - lifting.lift(windows - moved, {"phase": phase}))[
+            :, 2:
+        ] / (2 * step)
         scale = np.maximum(np.abs(lifting.lift(windows, {"phase": phase})[:, 2:]), 1)
         # rounding of the difference: eps/step in units of the value; curvature: the fifth harmonic has third derivatives of 500**3
         tolerance = 1e-9 * scale + 1e-6 * np.abs(slopes[..., j]) + 5e-5

@@ -59,7 +59,10 @@ def assert_same(found, wanted):
 
 def machines_of(count=700):
     """Faulty samples of machines that differ, shape (count, machine, ...), and their phases."""
-    y, u = (np.stack(of, axis=1) for of in zip(*(samples(count, turns) for turns in np.linspace(0, 0.02, MACHINE_COUNT)), strict=True))
+    y, u = (
+        np.stack(of, axis=1)
+        for of in zip(*(samples(count, turns) for turns in np.linspace(0, 0.02, MACHINE_COUNT)), strict=True)
+    )
     rng = np.random.default_rng(0)
     y[rng.random(y.shape) < 0.02] = np.nan
     u[np.repeat(rng.random(u.shape[:2]) < 2e-3, 8, axis=0)[:count]] = np.nan  # longer than inputs are held: a new start
@@ -92,7 +95,9 @@ def test_monitors_remember_alike(both):
     noise, judged = rng.normal(size=(500, 3, 2)) * [1.0, 300.0], rng.random((500, 3)) < [0.9, 1.0, 0.0]
     noise[rng.random(noise.shape) < 0.02] = np.nan
     filters = octaves(9)  # more than are side by side at once
-    monitor = Monitor(filters, 0.01, 0, np.array([1.0, 0.1]), np.ones((2, 9)), np.pad([[8], [8]], ((0, 0), (0, 8))), 0.02, first=0.1)
+    monitor = Monitor(
+        filters, 0.01, 0, np.array([1.0, 0.1]), np.ones((2, 9)), np.pad([[8], [8]], ((0, 0), (0, 8))), 0.02, first=0.1
+    )
     assert_same(*both(lambda: [monitor.mean_squares(noise, judged)]))
 
 
@@ -107,7 +112,11 @@ def test_errors_and_spectra_are_alike(both):
 
     def run():
         found = summarise_all(estimates, truth, lengths, 0.01)
-        return [getattr(own, name) for own in found for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz")]
+        return [
+            getattr(own, name)
+            for own in found
+            for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz")
+        ]
 
     assert_same(*both(run))
 
@@ -117,7 +126,9 @@ def test_observers_some_at_a_time_find_what_all_of_them_do():
     observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
     together = run_observers(observers, y, u, {"phase": phase})
     for count in (1, 2):
-        np.testing.assert_array_equal(np.concatenate(list(run_some_at_a_time(observers, y, u, {"phase": phase}, count))), together)
+        np.testing.assert_array_equal(
+            np.concatenate(list(run_some_at_a_time(observers, y, u, {"phase": phase}, count))), together
+        )
 
 
 def model_of(lifting, units, rng):
@@ -132,7 +143,9 @@ def model_of(lifting, units, rng):
 
 
 def recorded(rng, count, batch):
-    return rng.uniform(0.6, 0.9, size=(count, batch, len(STATES))), rng.uniform(1.2, 1.8, size=(count, batch, len(INPUTS)))
+    return rng.uniform(0.6, 0.9, size=(count, batch, len(STATES))), rng.uniform(
+        1.2, 1.8, size=(count, batch, len(INPUTS))
+    )
 
 
 @needs_compiler
@@ -143,9 +156,14 @@ def test_free_runs_and_sensitivities_of_all_liftings_are_alike(family, both):
     (W, size), n = model_of(lifting, units, rng), lifting.n_states
     x, u = recorded(rng, h + 12, units * per_unit)
     segments = Segments(
-        *(np.moveaxis(a, 2, 1).reshape(len(a), -1, units, per_unit) for a in (x, u)), rng.random((len(x), units, per_unit)) > 0.1, h
+        *(np.moveaxis(a, 2, 1).reshape(len(a), -1, units, per_unit) for a in (x, u)),
+        rng.random((len(x), units, per_unit)) > 0.1,
+        h,
     )
-    T, phase = np.triu(rng.uniform(-0.1, 0.1, size=W.shape[2:] * 2)) + np.eye(len(size)), rng.uniform(0.2, 0.9, size=units)
+    T, phase = (
+        np.triu(rng.uniform(-0.1, 0.1, size=W.shape[2:] * 2)) + np.eye(len(size)),
+        rng.uniform(0.2, 0.9, size=units),
+    )
     T /= size[:, None]
     V = np.linalg.solve(T, W.swapaxes(1, 2)).swapaxes(1, 2)
 
@@ -154,7 +172,10 @@ def test_free_runs_and_sensitivities_of_all_liftings_are_alike(family, both):
         AB = np.zeros((units, lifting.n_lifted, W.shape[2]))
         AB[:, :n] = W
         first, own = x[: h + 1, :units].swapaxes(0, 1), {"phase": phase}
-        free = [free_run(*np.split(M, [lifting.n_lifted], axis=-1), lifting, own, first, u[:, :units].swapaxes(0, 1)) for M in (AB, AB[0])]
+        free = [
+            free_run(*np.split(M, [lifting.n_lifted], axis=-1), lifting, own, first, u[:, :units].swapaxes(0, 1))
+            for M in (AB, AB[0])
+        ]
         return normal.matrix, normal.squares, normal.counts, *free
 
     found, wanted = both(run)
@@ -174,7 +195,10 @@ def test_extended_kalman_filters_are_alike(functions, measured, both):
     W = model_of(lifting, 1, rng)[0][0]
     A = np.vstack([W[:, : lifting.n_lifted], np.zeros((len(functions), lifting.n_lifted))])
     B = np.vstack([W[:, lifting.n_lifted :], np.zeros((len(functions), 1 + len(gamma)))])
-    Q, R = np.stack([np.diag([0.01, 0.02]) * scale for scale in (0.1, 1.0, 10.0)]), np.diag([0.01, 0.03])[: len(measured), : len(measured)]
+    Q, R = (
+        np.stack([np.diag([0.01, 0.02]) * scale for scale in (0.1, 1.0, 10.0)]),
+        np.diag([0.01, 0.03])[: len(measured), : len(measured)],
+    )
     one = ExtendedKalman(lifting, A, B, measured, INPUTS, Q, R, np.eye(2), {"phase": 0.1} if lifting.parameters else {})
     x, u = recorded(rng, 200, MACHINE_COUNT)
     y = x[..., list(measured)]
@@ -192,7 +216,11 @@ def test_filters_and_recursions_are_alike(every, both):
     blocks = blocks_of(F, rng.normal(size=(5, 2)), rng.normal(size=(3, 5)))
 
     def run():
-        return *filtered(x, rest, -1.99, 0.9902, every), recursion(F, driven, driven[0]), moved(blocks, x[:2] - 1e3, every, 2)
+        return (
+            *filtered(x, rest, -1.99, 0.9902, every),
+            recursion(F, driven, driven[0]),
+            moved(blocks, x[:2] - 1e3, every, 2),
+        )
 
     found, wanted = both(run)
     assert_same(found, wanted)
@@ -224,7 +252,11 @@ def test_models_in_blocks_and_lattices_are_alike(every, both):
 
     def run():
         model = F, G, H, z, rest, held
-        return blocks_along(*model, every), blocks_along(*model, states=False), lattice_along(reflections, z[0] - 1e3, every)
+        return (
+            blocks_along(*model, every),
+            blocks_along(*model, states=False),
+            lattice_along(reflections, z[0] - 1e3, every),
+        )
 
     assert_same(*both(run))
 
@@ -321,9 +353,16 @@ def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, 
     held_out = HeldOut(y, u, np.zeros((*y.shape[:2], len(observer.recorded))))
     for use in (
         lambda: compiler.load(SOURCE, FLAGS),
-        lambda: read_json(export_c(observer, tmp_path / "c", "drive", held_out=held_out) / "manifest.json")["numerical_error"],
+        lambda: read_json(export_c(observer, tmp_path / "c", "drive", held_out=held_out) / "manifest.json")[
+            "numerical_error"
+        ],
         lambda: next(
-            (n for n in zipfile.ZipFile(export_fmu(observer, tmp_path / "d.fmu", 2, "drive")).namelist() if "binaries" in n), None
+            (
+                n
+                for n in zipfile.ZipFile(export_fmu(observer, tmp_path / "d.fmu", 2, "drive")).namelist()
+                if "binaries" in n
+            ),
+            None,
         ),
     ):
         caplog.clear()

@@ -34,7 +34,8 @@ def circles(arrows: dict[str, set[str]]) -> list[list[str]]:
 
 
 @pytest.mark.parametrize(
-    ("arrows", "expected"), [({"a": {"b"}, "b": {"c"}, "c": set()}, []), ({"a": {"b"}, "b": {"c"}, "c": {"a"}}, [["a", "b", "c"]])]
+    ("arrows", "expected"),
+    [({"a": {"b"}, "b": {"c"}, "c": set()}, []), ({"a": {"b"}, "b": {"c"}, "c": {"a"}}, [["a", "b", "c"]])],
 )
 def test_circles_are_found(arrows: dict[str, set[str]], expected: list[list[str]]) -> None:
     assert circles(arrows) == expected

@@ -97,7 +97,9 @@ def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPa
     folder = ROOT / "benchmarks" / "reliability"
     monkeypatch.syspath_prepend(folder)
     page = importlib.import_module("page")
-    assert (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8") == page.render(), "run benchmarks/reliability/page.py"
+    assert (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8") == page.render(), (
+        "run benchmarks/reliability/page.py"
+    )
 
 
 def test_the_drawn_ways_name_modules_that_are_there() -> None:
@@ -115,13 +117,23 @@ def page_of_keys(monkeypatch: pytest.MonkeyPatch) -> str:
 def test_every_key_of_a_study_is_on_the_page_of_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     page = page_of_keys(monkeypatch)
     schema = kros.study.StudyConfig.model_json_schema()
-    tables = {name: schema["$defs"][text["$ref"].rsplit("/", 1)[1]] for name, text in schema["properties"].items() if "$ref" in text}
+    tables = {
+        name: schema["$defs"][text["$ref"].rsplit("/", 1)[1]]
+        for name, text in schema["properties"].items()
+        if "$ref" in text
+    }
     assert len(tables) == 12
     for name, table in tables.items():
         section = page.split(f"### `[{name}]`\n")[1].split("\n### ")[0]
-        rows = {row.split("`")[1]: [cell.strip() for cell in row.split(" | ")] for row in section.splitlines() if row.startswith("| `")}
+        rows = {
+            row.split("`")[1]: [cell.strip() for cell in row.split(" | ")]
+            for row in section.splitlines()
+            if row.startswith("| `")
+        }
         assert list(rows) == list(table["properties"])
-        assert [key for key, cells in rows.items() if len(cells) != 4 or len(cells[3]) < 4] == [], "says nothing: add a description"
+        assert [key for key, cells in rows.items() if len(cells) != 4 or len(cells[3]) < 4] == [], (
+            "says nothing: add a description"
+        )
 
 
 def test_every_key_of_a_mapping_says_something(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,13 +164,21 @@ def test_every_public_object_has_a_page_and_a_row(monkeypatch: pytest.MonkeyPatc
 
 def packages() -> Iterator[ModuleType]:
     """Public packages of kros that list names."""
-    public = (m.name for m in pkgutil.walk_packages(kros.__path__, "kros.") if m.ispkg and m.name.split(".")[1] in kros.__all__)
+    public = (
+        m.name
+        for m in pkgutil.walk_packages(kros.__path__, "kros.")
+        if m.ispkg and m.name.split(".")[1] in kros.__all__
+    )
     return (package for package in map(importlib.import_module, public) if hasattr(package, "__all__"))
 
 
 def without_example(package: ModuleType) -> list[str]:
     """Names that a package lists and that show nobody how they are used; `test_examples_run` runs the examples of the others."""
-    return [name for name in package.__all__ if name != "__version__" and ">>> " not in (getattr(package, name).__doc__ or "")]
+    return [
+        name
+        for name in package.__all__
+        if name != "__version__" and ">>> " not in (getattr(package, name).__doc__ or "")
+    ]
 
 
 @pytest.mark.parametrize("package", [kros, *packages()], ids=lambda package: package.__name__)
@@ -194,7 +214,9 @@ def broken_links(path: Path, text: str) -> list[str]:
     for target, anchor in re.findall(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)", prose):
         to = path.parent / target if target else path
         headings = (
-            re.findall(r"^#+ (.+)$", to.read_text(encoding="utf-8"), flags=re.MULTILINE) if to.suffix == ".md" and to.is_file() else []
+            re.findall(r"^#+ (.+)$", to.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            if to.suffix == ".md" and to.is_file()
+            else []
         )
         if not to.exists() or (anchor and anchor not in map(slug, headings)):
             broken.append(f"{target}#{anchor}")

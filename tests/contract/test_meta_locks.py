@@ -48,7 +48,9 @@ def test_no_address_and_no_path(name: str) -> None:
 
 
 def test_locks_hold_what_the_project_asks_for() -> None:
-    run = PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"] + PROJECT["dependency-groups"]["build"]
+    run = (
+        PROJECT["project"]["dependencies"] + PROJECT["build-system"]["requires"] + PROJECT["dependency-groups"]["build"]
+    )
     assert names(run) <= set(pins(RUN))
     assert names(run + PROJECT["dependency-groups"]["dev"]) <= set(pins(DEV))
 

@@ -40,7 +40,11 @@ def test_wheel_holds_the_whole_package_and_nothing_else(wheel: zipfile.ZipFile) 
 def test_wheel_says_version_licence_and_command(wheel: zipfile.ZipFile) -> None:
     about = f"kros-{PROJECT['version']}.dist-info"
     said = HeaderParser().parsestr(wheel.read(f"{about}/METADATA").decode())
-    assert (said["Version"], said["License-Expression"], said["Requires-Python"]) == (PROJECT["version"], "MIT", ">=3.11")
+    assert (said["Version"], said["License-Expression"], said["Requires-Python"]) == (
+        PROJECT["version"],
+        "MIT",
+        ">=3.11",
+    )
     assert "kros = kros.cli:app" in wheel.read(f"{about}/entry_points.txt").decode()
     assert f"{about}/licenses/LICENSE" in wheel.namelist()
 
@@ -70,7 +74,10 @@ def test_targets_of_make_that_are_named_exist(path: str) -> None:
 
 def hosts_and_paths(text: str) -> list[str]:
     """Addresses that are not public ones of this project's kind, and absolute paths."""
-    return re.findall(r"https?://(?!github\.com|[\w.-]*\.org\b|semver\.org)\S+|(?<![\w.:/}*~-])/(?:work|home|root|tmp|opt|mnt)\b\S*", text)
+    return re.findall(
+        r"https?://(?!github\.com|[\w.-]*\.org\b|semver\.org)\S+|(?<![\w.:/}*~-])/(?:work|home|root|tmp|opt|mnt)\b\S*",
+        text,
+    )
 
 
 @pytest.mark.parametrize("path", [*PUBLIC, "CONTRIBUTING.md", "Makefile", ".ci/run", "pyproject.toml"])
@@ -79,5 +86,7 @@ def test_no_host_and_no_path_of_one_machine(path: str) -> None:
 
 
 def test_everything_in_the_list_of_the_source_distribution_exists() -> None:
-    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["build"]["targets"][
+        "sdist"
+    ]["include"]
     assert [name for name in listed if not (ROOT / name.lstrip("/")).exists()] == []

@@ -25,7 +25,9 @@ def public_definitions(tree: ast.Module | ast.ClassDef, prefix: str = "") -> Ite
 def undocumented(tree: ast.Module) -> list[str]:
     """Names without a docstring; ``module`` stands for the module itself."""
     missing = [] if ast.get_docstring(tree) else ["module"]
-    return missing + [name for name, node in public_definitions(tree) if not ast.get_docstring(node) and not is_overload(node)]
+    return missing + [
+        name for name, node in public_definitions(tree) if not ast.get_docstring(node) and not is_overload(node)
+    ]
 
 
 def is_overload(node: Definition) -> bool:
@@ -36,7 +38,9 @@ def parameters(node: Definition) -> list[str]:
     """Parameters of a function, or fields of a class."""
     if isinstance(node, ast.ClassDef):
         noted = [s for s in node.body if isinstance(s, ast.AnnAssign) and isinstance(s.target, ast.Name)]
-        names = [s.target.id for s in noted if isinstance(s.target, ast.Name) and "ClassVar" not in ast.unparse(s.annotation)]
+        names = [
+            s.target.id for s in noted if isinstance(s.target, ast.Name) and "ClassVar" not in ast.unparse(s.annotation)
+        ]
         return [n for n in names if not n.startswith("_")]
     arguments = node.args
     named = [*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs]
@@ -82,4 +86,6 @@ def test_wrong_parameters_are_found() -> None:
     section = "Parameters\n    ----------\n    a, b : int\n        Any.\n    d\n        Gone.\n\n    Returns\n    -------\n    int\n"
     docstring = f"    '''Add.\n\n    {section}    '''\n"
     assert wrongly_documented(ast.parse("def add(a, b, *c):\n" + docstring)) == ["add(c)", "add(d)"]
-    assert wrongly_documented(ast.parse("class Add:\n" + docstring + "    a: int\n    b: int = 0\n    d: int = 0\n")) == []
+    assert (
+        wrongly_documented(ast.parse("class Add:\n" + docstring + "    a: int\n    b: int = 0\n    d: int = 0\n")) == []
+    )

@@ -45,12 +45,18 @@ def found(tmp_path_factory) -> tuple[Any, dict[str, Any]]:
     folder = tmp_path_factory.mktemp("about")
     population = PLANTS["dc-motor"](n_units=4, n_episodes=3, seconds=1.5, seed=5).simulate().population
     names = [c.name for c in population.channels]
-    angle, current, voltage = (next(i for i, n in enumerate(names) if word in n) for word in ("position", "current", "voltage"))
+    angle, current, voltage = (
+        next(i for i, n in enumerate(names) if word in n) for word in ("position", "current", "voltage")
+    )
     (folder / "rec").mkdir()
     for key in population.episodes:
         values, dt = population.read(key), population.sample_period_s
-        rows = np.column_stack([dt * np.arange(len(values)), np.degrees(values[:, angle]), 1e3 * values[:, current], values[:, voltage]])
-        np.savetxt(folder / "rec" / f"{key.unit}_{key.episode}.csv", rows, delimiter=",", header="t,deg,I (mA),U", comments="")
+        rows = np.column_stack(
+            [dt * np.arange(len(values)), np.degrees(values[:, angle]), 1e3 * values[:, current], values[:, voltage]]
+        )
+        np.savetxt(
+            folder / "rec" / f"{key.unit}_{key.episode}.csv", rows, delimiter=",", header="t,deg,I (mA),U", comments=""
+        )
     quick: dict[str, Any] = {
         "identify": {"refine": False},
         "uncertainty": {"n_freqs": 60, "max_order": 1},
@@ -71,7 +77,10 @@ def test_the_file_is_complete(found) -> None:
     assert (about["kros"], about["study"]) == (version("kros"), "run")
     assert set(about) >= {"columns", "sensor", "trained_on", "as_it_runs", "recorded_signals", "uncertain_set"}
     assert about["trained_on"]["units"] == 4
-    assert about["as_it_runs"]["certified"] == study.metrics["observers"][study.metrics["study"]["deployed"]]["relift_certified"]
+    assert (
+        about["as_it_runs"]["certified"]
+        == study.metrics["observers"][study.metrics["study"]["deployed"]]["relift_certified"]
+    )
     assert about["sensor"]["angle"]["noise"] == pytest.approx(1e-4)
 
 
@@ -83,7 +92,13 @@ def test_columns_and_ranges_are_those_of_the_recordings(found) -> None:
         "column": 2, "factor": pytest.approx(np.pi / 180), "lag_samples": 0, "offset": "mean of current - angle over samples 0 to 0 of every episode",
         "converted": 1.0,
     }  # fmt: skip
-    assert about["columns"]["voltage"] == {"column": "U", "factor": 1.0, "lag_samples": 2, "offset": "", "converted": 1.0}
+    assert about["columns"]["voltage"] == {
+        "column": "U",
+        "factor": 1.0,
+        "lag_samples": 2,
+        "offset": "",
+        "converted": 1.0,
+    }
     training = [f for f in sorted(folder.iterdir()) if not f.stem.endswith("_2")]  # the last episode is held out
     voltage = max(np.abs(np.loadtxt(f, delimiter=",", skiprows=1)[2:, 3]).max() for f in training)
     assert about["largest_in_training"]["voltage"] == pytest.approx(voltage, rel=0.02)
@@ -169,9 +184,15 @@ def test_converted_recordings_are_recordings(tmp_path) -> None:
     turned = kros.data.prepare(population, [Scale(("angle",), np.pi / 180, unit="rad")])
     kros.data.write_parquet(turned, tmp_path / "rec")
     doubled = kros.data.prepare(kros.read(tmp_path / "rec"), [Scale(("angle",), 2.0)])
-    for population, factor, unit in ((turned, np.pi / 180, "deg"), (kros.read(tmp_path / "rec"), 1.0, "rad"), (doubled, 2.0, "2 rad")):
+    for population, factor, unit in (
+        (turned, np.pi / 180, "deg"),
+        (kros.read(tmp_path / "rec"), 1.0, "rad"),
+        (doubled, 2.0, "2 rad"),
+    ):
         about = {"columns": {"angle": asdict(population.scaling["angle"])}, "units_of_measure": {"angle": "rad"}}
-        observer = replace(Observer.open_loop("lag", Lifting(("angle",)), np.eye(1) / 2, np.ones((1, 0)), (0,), (), 0.01), about=about)
+        observer = replace(
+            Observer.open_loop("lag", Lifting(("angle",)), np.eye(1) / 2, np.ones((1, 0)), (0,), (), 0.01), about=about
+        )
         channel = recorded_channel(observer, "angle")
         assert (channel.factor, channel.unit) == (pytest.approx(factor), unit)
 

@@ -19,7 +19,11 @@ class Constant:
 
 def problem(injection):
     nominal = StateSpace(
-        [[1.0, 0.01, 0.0], [-0.05, 0.9, 0.1], [0.0, -0.1, 0.7]], [[0.0, 0.0], [0.05, 0.0], [0.1, 0.3]], np.eye(3), np.zeros((3, 2)), DT
+        [[1.0, 0.01, 0.0], [-0.05, 0.9, 0.1], [0.0, -0.1, 0.7]],
+        [[0.0, 0.0], [0.05, 0.0], [0.1, 0.3]],
+        np.eye(3),
+        np.zeros((3, 2)),
+        DT,
     )
     lag = StateSpace([[0.8]], [[1.0]], [[-0.03]], [[0.3]], DT)
     return ObserverProblem(
@@ -49,7 +53,9 @@ def test_claims_are_recomputed(method, injection):
     assert isinstance(found, Synthesis)
     assert found.injection is injection
     assert isinstance(found.status, Status)
-    assert (found.controller.n_outputs, found.controller.n_inputs) == ((2, 1) if injection is Injection.INPUT else (3, 1))
+    assert (found.controller.n_outputs, found.controller.n_inputs) == (
+        (2, 1) if injection is Injection.INPUT else (3, 1)
+    )
     K, J = found.controller, case.nominal.B if injection is Injection.INPUT else np.eye(3)
     error_dynamics = np.block([[case.nominal.A - J @ K.D @ case.C, -J @ K.C], [K.B @ case.C, K.A]])
     loop = np.abs(np.linalg.eigvals(error_dynamics)).max()
@@ -79,7 +85,9 @@ def test_constant_gains_are_certified_by_the_same_code():
 def test_noise_part_of_the_certificate_is_the_lyapunov_norm():
     """With weights that vanish only the noise is left, and the quadrature must give its H2 norm."""
     case = problem(Injection.STATE)
-    quiet = ObserverProblem(case.nominal, case.C, gain(1e-12 * np.eye(2), DT), case.W_R, case.input_scale, case.output_scale, case.noise)
+    quiet = ObserverProblem(
+        case.nominal, case.C, gain(1e-12 * np.eye(2), DT), case.W_R, case.input_scale, case.output_scale, case.noise
+    )
     K = gain([[0.3], [0.1], [0.0]], DT)
     loop = quiet.error_system(K)
     noise = StateSpace(loop.A, loop.B[:, 5:], loop.C, loop.D[:, 5:], DT)

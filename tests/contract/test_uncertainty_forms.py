@@ -60,7 +60,9 @@ def test_paper_variants_hold_the_identity_on_the_complement_of_a_tall_range() ->
     for form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE):
         np.testing.assert_allclose(residual(form, G, Gp, paper=True), residual(form, G, Gp), atol=1e-10)
     pinv = np.linalg.pinv(G[0])
-    np.testing.assert_allclose(residual("output_multiplicative", G[0], Gp[0], paper=True), Gp[0] @ pinv - np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(
+        residual("output_multiplicative", G[0], Gp[0], paper=True), Gp[0] @ pinv - np.eye(4), atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("shape", SHAPES)

@@ -113,7 +113,12 @@ def test_a_model_that_no_regularisation_was_allowed_to_stabilise(kros, study, tm
 
 @pytest.mark.parametrize("command", ["check", "estimate", "report", "figures"])
 def test_commands_on_something_that_is_not_a_run(kros, tmp_path, command):
-    arguments = {"check": [tmp_path], "estimate": [tmp_path, tmp_path / "x.parquet"], "report": [], "figures": [tmp_path / "f"]}[command]
+    arguments = {
+        "check": [tmp_path],
+        "estimate": [tmp_path, tmp_path / "x.parquet"],
+        "report": [],
+        "figures": [tmp_path / "f"],
+    }[command]
     result = kros(command, tmp_path, *arguments)
     assert result.exit_code == 2
     assert "study.json" in result.stderr

@@ -35,7 +35,9 @@ max_order = 1
 
 def drive(seed: int, bad: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """A drive under position control; a bad one has twice the torque and a spring half as stiff: four times the gain."""
-    inertia, friction, torque, stiffness = np.array([1.0, 3.0, 40.0, 60.0]) * np.exp(0.05 * np.random.default_rng([1, seed]).normal(size=4))
+    inertia, friction, torque, stiffness = np.array([1.0, 3.0, 40.0, 60.0]) * np.exp(
+        0.05 * np.random.default_rng([1, seed]).normal(size=4)
+    )
     if bad:
         torque, stiffness = 2 * torque, 0.5 * stiffness
     a = np.array([[0.0, 1.0], [-stiffness / inertia, -friction / inertia]])
@@ -52,7 +54,9 @@ def episode(system: tuple[np.ndarray, np.ndarray], samples: int, *seed: int) -> 
     return np.column_stack([x + rng.normal(size=x.shape) * (1e-4, 1e-2), u])
 
 
-def recordings(folder: Path, drives: Mapping[str, int], episodes: int, samples: int, bad: bool = False, first: int = 0) -> Path:
+def recordings(
+    folder: Path, drives: Mapping[str, int], episodes: int, samples: int, bad: bool = False, first: int = 0
+) -> Path:
     data = {u: [episode(drive(s, bad), samples, s, first + e) for e in range(episodes)] for u, s in drives.items()}
     write_parquet(from_arrays(data, CHANNELS, PERIOD_S), folder)
     return folder
@@ -63,7 +67,9 @@ def run(kros, tmp_path_factory) -> Path:
     """A study of twelve drives, ten episodes each, regularised as much as it needs not to be, so that the amount of data matters."""
     folder = tmp_path_factory.mktemp("check")
     source = recordings(folder / "batch", BATCH, 10, 400)
-    (folder / "study.toml").write_text(STUDY.format(source=source).replace("refine = false", "refine = false\nalpha = 30.0"))
+    (folder / "study.toml").write_text(
+        STUDY.format(source=source).replace("refine = false", "refine = false\nalpha = 30.0")
+    )
     result = kros("run", folder / "study.toml", "--out", folder / "run", "--until", "quantify", "--workers", 1)
     assert result.exit_code == 0, result.output
     return folder / "run"
@@ -110,7 +116,9 @@ def test_the_terminal_says_what_would_have_been_seen(kros, run, tmp_path) -> Non
     lines = good.stdout.splitlines()
     assert [line.split() for line in lines[::2]] == [["PASS", unit] for unit in NEW]
     assert all("would be detected" in line for line in lines[1::2])
-    short = kros("check", run, recordings(tmp_path / "b", NEW, 2, 100), "--workers", 1, "--junit", tmp_path / "units.xml")
+    short = kros(
+        "check", run, recordings(tmp_path / "b", NEW, 2, 100), "--workers", 1, "--junit", tmp_path / "units.xml"
+    )
     assert short.exit_code == 4
     assert all("are needed, found 1.9" in line for line in short.stdout.splitlines()[1::2])
     assert (tmp_path / "units.xml").read_text().count('<error type="UNDECIDED"') == 5
@@ -141,7 +149,17 @@ def test_a_name_of_the_study_with_other_recordings_is_refused(kros, run, tmp_pat
 
 def test_rows_of_metrics_say_as_much(run) -> None:
     rows = json.loads((run / "metrics.json").read_text())["outliers"]
-    assert {"unit", "condition", "score", "outlier", "status", "detectable", "detectable_db", "needed_s", "needed_episodes"} <= set(rows[0])
+    assert {
+        "unit",
+        "condition",
+        "score",
+        "outlier",
+        "status",
+        "detectable",
+        "detectable_db",
+        "needed_s",
+        "needed_episodes",
+    } <= set(rows[0])
     assert {r["episodes"] for r in rows} == {10}
     assert all(r["outlier"] == (r["status"] == "outlier") for r in rows)
 
@@ -150,7 +168,9 @@ def test_a_batch_of_unequal_recordings(kros, tmp_path) -> None:
     """A third of the units was recorded in two of ten episodes: none is flagged for that, and none blinds the others."""
     data = {u: [episode(drive(s), 400, s, e) for e in range(10 if s < 8 else 2)] for u, s in BATCH.items()}
     write_parquet(from_arrays(data, CHANNELS, PERIOD_S), tmp_path / "mixed")
-    (tmp_path / "study.toml").write_text(STUDY.format(source=tmp_path / "mixed").replace("refine = false", "refine = false\nalpha = 30.0"))
+    (tmp_path / "study.toml").write_text(
+        STUDY.format(source=tmp_path / "mixed").replace("refine = false", "refine = false\nalpha = 30.0")
+    )
     result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--until", "quantify", "--workers", 1)
     assert result.exit_code == 0, result.output
     rows = json.loads((tmp_path / "run" / "metrics.json").read_text())["outliers"]

@@ -61,7 +61,11 @@ class Cluster:
         return address
 
     def _run(self, what: str, *options: object) -> subprocess.Popen[bytes]:
-        own = {"OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
+        own = {
+            "OMP_NUM_THREADS": "2",
+            "OPENBLAS_NUM_THREADS": "2",
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+        }
         path = os.pathsep.join((str(Path(__file__).parent), *filter(None, sys.path)))
         command = [
             sys.executable,
@@ -73,7 +77,9 @@ class Cluster:
             *map(str, options),
         ]
         with (self.folder / f"{what}.log").open("ab") as log:
-            return subprocess.Popen(command, cwd=self.folder, env={**os.environ, **own, "PYTHONPATH": path}, stdout=log, stderr=log)
+            return subprocess.Popen(
+                command, cwd=self.folder, env={**os.environ, **own, "PYTHONPATH": path}, stdout=log, stderr=log
+            )
 
     def stop(self) -> None:
         """End every process."""
@@ -218,7 +224,10 @@ def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp
 
 def test_workers_have_the_same_kros(cluster, monkeypatch):
     monkeypatch.setattr("kros.study.engine.cluster.code_key", lambda: "another")
-    with open_executor(scheduler=cluster.start(1)) as executor, pytest.raises(KrosError, match="install the same version on every worker"):
+    with (
+        open_executor(scheduler=cluster.start(1)) as executor,
+        pytest.raises(KrosError, match="install the same version on every worker"),
+    ):
         list(executor.map(square, [0]))
 
 
@@ -242,7 +251,9 @@ def test_a_study_with_a_worker_killed_half_way_leaves_the_same_bytes(cluster, st
 def test_a_run_whose_scheduler_is_lost_says_so_and_goes_on_with_another(cluster, study, wanted, kros, tmp_path):
     address = cluster.start(1)
     with pytest.raises(KrosError, match=r"connection was lost.*the same command goes on"):
-        run_study(load_config(study), tmp_path / "run", Stage.IDENTIFY, scheduler=address, progress=Ends(cluster.scheduler))
+        run_study(
+            load_config(study), tmp_path / "run", Stage.IDENTIFY, scheduler=address, progress=Ends(cluster.scheduler)
+        )
     again = kros("run", study, "--out", tmp_path / "run", "--until", "identify", "--scheduler", cluster.start(1))
     assert again.exit_code == 0, again.output
     assert re.search(r"read +unchanged", again.stderr)

@@ -31,13 +31,20 @@ CHANNELS = {"position", "velocity", "current"}
 def test_metrics_keep_the_contract(metrics):
     assert metrics["schema"] == 1
     study = metrics["study"]
-    assert (study["units"], study["conditions"], study["identify_on"], study["sample_period_s"]) == (5, ["load", "noload"], "noload", 0.001)
+    assert (study["units"], study["conditions"], study["identify_on"], study["sample_period_s"]) == (
+        5,
+        ["load", "noload"],
+        "noload",
+        0.001,
+    )
     assert study["alpha"] > 0
     assert metrics["observers"][study["deployed"]]["relift_certified"]
     assert metrics["observers"][study["deployed"]]["blind_error_percent"] < 100
     assert list(metrics["timing_s"]) == [*STAGES, "total"]
     assert {u["unit"]: u["group"] for u in metrics["units"]}["000000"] == "outliers"
-    assert all(u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers")
+    assert all(
+        u["status"] == "ok" and 0.9 < u["concentration"] <= 1 for u in metrics["units"] if u["group"] != "outliers"
+    )
     assert list(metrics["models"]) == ["koopman", "linear", "koopman_edmd", "linear_edmd"]
     for name, model in metrics["models"].items():
         assert model["order"] == {"koopman": 4, "linear": 3}[name.removesuffix("_edmd")]
@@ -54,7 +61,9 @@ def test_metrics_keep_the_contract(metrics):
         if observer.get("set") == "signals":
             assert observer["set_certified"]
             bounds = observer["set_lower_bound_percent"]
-            assert all(bound is None or bound <= observer["set_bound_percent"][state] for state, bound in bounds.items())
+            assert all(
+                bound is None or bound <= observer["set_bound_percent"][state] for state, bound in bounds.items()
+            )
             assert observer["set_bound_to_error_min"] >= 1
             continue
         assert 0 < observer["lower_bound"] <= observer["worst_case_h2"]
@@ -66,11 +75,18 @@ def test_every_unit_is_evaluated_in_every_condition_with_every_observer(metrics)
     rows = {(r["observer"], r["unit"], r["condition"], r["channel"]) for r in metrics["evaluation"]}
     made = {name for name, o in metrics["observers"].items() if o.get("status") != "failed"}
     estimated = {
-        name: {"velocity"} if name == "filtered_difference" else {"velocity", "current"} if name == "learned" else CHANNELS for name in made
+        name: {"velocity"}
+        if name == "filtered_difference"
+        else {"velocity", "current"}
+        if name == "learned"
+        else CHANNELS
+        for name in made
     }
     assert "held-out episode" in metrics["observers"]["mean_profile"]["reason"]  # drives of a demo repeat no motion
     assert len(rows) == len(metrics["evaluation"]) == sum(len(channels) for channels in estimated.values()) * 6 * 2
-    assert {(name, channel) for name, _, _, channel in rows} == {(name, c) for name, channels in estimated.items() for c in channels}
+    assert {(name, channel) for name, _, _, channel in rows} == {
+        (name, c) for name, channels in estimated.items() for c in channels
+    }
     assert {r["role"] for r in metrics["evaluation"]} == {"nominal", "off_nominal", "outlier"}
     assert all(r["gearbox_band_power"] >= 0 for r in metrics["evaluation"] if r["error_percent"] is not None)
 
@@ -78,7 +94,10 @@ def test_every_unit_is_evaluated_in_every_condition_with_every_observer(metrics)
 def test_estimates_and_recordings_are_judged_against_the_true_velocity_too(demo, metrics):
     """The drive's own velocity is a difference, half a sample late, behind a low-pass at 150 Hz, `pole / (1 - pole)` samples late."""
     late = 1e-3 * (0.5 + VELOCITY_POLE / (1 - VELOCITY_POLE))
-    assert {(r["channel"], r["condition"]) for r in metrics["recorded"]} == {("velocity", "noload"), ("velocity", "load")}
+    assert {(r["channel"], r["condition"]) for r in metrics["recorded"]} == {
+        ("velocity", "noload"),
+        ("velocity", "load"),
+    }
     assert all(r["true_lag_s"] == pytest.approx(late, abs=0.1e-3) for r in metrics["recorded"])
     assert len(metrics["recorded"]) == 6 * 2
     assert "lag (ms)" in (demo / "report.html").read_text()
@@ -105,7 +124,9 @@ def test_the_models_on_disk_are_what_the_design_promises(demo, metrics, recorded
 
 
 def test_a_second_run_changes_nothing_and_skips_everything(kros, demo, metrics):
-    before = {p: p.stat().st_mtime_ns for p in demo.rglob("*") if p.is_file() and p.name not in ("metrics.json", "study.json")}
+    before = {
+        p: p.stat().st_mtime_ns for p in demo.rglob("*") if p.is_file() and p.name not in ("metrics.json", "study.json")
+    }
     result = kros("run", demo.parent / "demo.toml", "--out", demo, "--workers", 1)
     assert result.exit_code == 0, result.output
     assert result.stderr.count("unchanged") == len(STAGES)
@@ -132,7 +153,8 @@ def test_estimates_are_written_one_row_group_an_episode(kros, demo, tmp_path, me
     expected = [
         r["error_percent"]
         for r in metrics["evaluation"]
-        if (r["observer"], r["unit"], r["condition"], r["channel"]) == (metrics["study"]["deployed"], "001002", "noload", "velocity")
+        if (r["observer"], r["unit"], r["condition"], r["channel"])
+        == (metrics["study"]["deployed"], "001002", "noload", "velocity")
     ]
     assert error == pytest.approx(expected[0], rel=1e-9)
     assert kros("estimate", demo, recorded, out).exit_code == 2
@@ -148,7 +170,10 @@ def test_in_the_field_measured_channels_and_inputs_are_enough(kros, demo, record
     (tmp_path / "field").mkdir()
     for key in keys:
         table = population.read(key)[:, columns]
-        rows = [",".join(["t", *seen]), *(",".join(map(repr, [0.001 * i, *row])) for i, row in enumerate(table.tolist()))]
+        rows = [
+            ",".join(["t", *seen]),
+            *(",".join(map(repr, [0.001 * i, *row])) for i, row in enumerate(table.tolist())),
+        ]
         (tmp_path / "field" / f"fresh_{key.episode}.csv").write_text("\n".join(rows))
     channels = ", ".join(
         f'{{name = "{name}", column = "{name}", role = "{"input" if "target" in name else "state"}", measured = {str(name == "position").lower()}}}'
@@ -164,7 +189,9 @@ def test_in_the_field_measured_channels_and_inputs_are_enough(kros, demo, record
     assert result.exit_code == 0, result.output
     assert "unit fresh: parameters calibrated on the derivative of position" in result.output
     rows = pq.read_table(whole).to_pandas()
-    wanted = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == keys[0].episode)]["velocity_hat"].to_numpy()
+    wanted = rows[(rows.unit == "001002") & (rows.condition == "noload") & (rows.episode == keys[0].episode)][
+        "velocity_hat"
+    ].to_numpy()
     lines = [line.split(",") for line in field.read_text().splitlines()]
     at = lines[0].index("velocity_hat")
     found = np.array([float(line[at]) for line in lines[1:] if line[2] == keys[0].episode])
@@ -173,7 +200,9 @@ def test_in_the_field_measured_channels_and_inputs_are_enough(kros, demo, record
     )  # of phases that differ by the little that the rate differs
     given = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "given.csv", "--parameter", "fresh.phase=1.2")
     assert "unit fresh: parameters given" in given.output
-    assert kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv", "--parameter", "fresh.phi=1").exit_code == 2
+    assert (
+        kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv", "--parameter", "fresh.phi=1").exit_code == 2
+    )
     assert kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.txt").exit_code == 2
 
 
@@ -191,12 +220,17 @@ def test_the_deployed_observer_is_exported(kros, demo, tmp_path, command):
 def test_new_units_are_scored(kros, demo, recorded, tmp_path):
     """One of them has the name of a unit of the study. It makes no difference whether the study's own recordings are still there."""
     fresh = tmp_path / "new"
-    assert kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code == 0
+    assert (
+        kros("simulate", fresh, "--units", 2, "--episodes", 4, "--seconds", 12, "--seed", 77, "--outlier").exit_code
+        == 0
+    )
     assert "unit 000000" in (refused := kros("check", demo, fresh, "--workers", 1)).stderr
     assert refused.exit_code == 2
     result = kros("check", demo, fresh, "--json", "--workers", 1, "--same-unit")
     scores = json.loads(result.stdout)
-    assert {(r["unit"], r["condition"]) for r in scores} == {(u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")}
+    assert {(r["unit"], r["condition"]) for r in scores} == {
+        (u, c) for u in ("000000", "001001", "001002") for c in ("noload", "load")
+    }
     assert all(np.isfinite(r["score"]) for r in scores)
     assert result.exit_code == 4
     assert all(r["verdict"] == "UNDECIDED" and "needs at least 8 units" in r["reason"] for r in scores)

@@ -44,6 +44,8 @@ def test_the_demo_command_runs_everything_and_says_where_the_report_is(kros, tmp
     page = (out / "report.html").read_bytes()
     assert kros("report", out).exit_code == 0
     assert len((out / "report.html").read_bytes()) == pytest.approx(len(page), rel=0.02)
-    monkeypatch.setattr("kros.report.files.to_pdf", lambda figure: b"%PDF")  # which takes longest, and is made in tests of figures
+    monkeypatch.setattr(
+        "kros.report.files.to_pdf", lambda figure: b"%PDF"
+    )  # which takes longest, and is made in tests of figures
     assert kros("figures", out, tmp_path / "figures").exit_code == 0
     assert len(list((tmp_path / "figures").glob("*.png"))) >= 8

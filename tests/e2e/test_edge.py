@@ -13,7 +13,11 @@ import pytest
 
 from kros.data import Channel, Role, from_arrays, write_parquet
 
-CHANNELS = (Channel("position", Role.STATE, "rad", measured=True), Channel("velocity", Role.STATE, "rad/s"), Channel("torque", Role.INPUT))
+CHANNELS = (
+    Channel("position", Role.STATE, "rad", measured=True),
+    Channel("velocity", Role.STATE, "rad/s"),
+    Channel("torque", Role.INPUT),
+)
 
 
 def motion(seed: int, n: int = 400) -> np.ndarray:
@@ -67,7 +71,8 @@ def said(result, code, *words):
     ids=lambda value: type(value).__name__,
 )
 @pytest.mark.parametrize(
-    "command", ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor", "init", "list"]
+    "command",
+    ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor", "init", "list"],
 )
 def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command, error, words):
     def fail(*_, **__):
@@ -86,7 +91,17 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
         "init": "kros.study.commands.init.init_study",
         "list": "kros.study.commands.summary.list_run",
     }
-    arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "convert": 2, "simulate": 1, "init": 1, "list": 1}
+    arguments = {
+        "run": 1,
+        "report": 1,
+        "check": 2,
+        "estimate": 3,
+        "figures": 2,
+        "convert": 2,
+        "simulate": 1,
+        "init": 1,
+        "list": 1,
+    }
     monkeypatch.setattr(places[command], fail)
     said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), 1, *words)
     debugged = kros("--debug", command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))])
@@ -112,7 +127,9 @@ def test_folders_that_cannot_be_made(kros, store, tmp_path, out):
 
 def shell(*arguments: str, **options) -> subprocess.CompletedProcess:
     code = "from kros.cli import app; app()"
-    return subprocess.run([sys.executable, "-c", code, *map(str, arguments)], stderr=subprocess.PIPE, text=True, check=False, **options)
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], stderr=subprocess.PIPE, text=True, check=False, **options
+    )
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

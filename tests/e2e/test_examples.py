@@ -28,7 +28,9 @@ def test_double_pendulum(recordings, tmp_path):
         "uncertainty.max_order=1",
         "evaluate.robustness=false",
     ]
-    metrics = run_example("double_pendulum", recordings, tmp_path / "run", *(part for setting in quick for part in ("--set", setting)))
+    metrics = run_example(
+        "double_pendulum", recordings, tmp_path / "run", *(part for setting in quick for part in ("--set", setting))
+    )
     assert metrics["study"]["units"] == 6
     assert metrics["study"]["sample_period_s"] == 0.0025
     assert {u["status"] for u in metrics["units"]} == {"ok"}
@@ -43,7 +45,11 @@ def test_one_model_a_double_pendulum_predicts_better_than_linear_models(recordin
     ahead = json.loads(done.stdout)
     upto, last = ahead["all samples up to 0.2 s"], ahead["the sample at 0.2 s"]
     # two samples of history, the same episodes held out: figures found independently, with windows of their own
-    arx = {"A.0": (0.965, 0.987, 0.851, 0.922), "C.0": (0.989, 0.990, 0.977, 0.976), "C.1": (0.981, 0.985, 0.959, 0.973)}
+    arx = {
+        "A.0": (0.965, 0.987, 0.851, 0.922),
+        "C.0": (0.989, 0.990, 0.977, 0.976),
+        "C.1": (0.981, 0.985, 0.959, 0.973),
+    }
     for build, figures in arx.items():
         assert upto[build]["ARX"] == pytest.approx(figures, abs=0.006)
         assert all(r > f for r, f in zip(upto[build]["refined"], figures, strict=True))
@@ -95,7 +101,9 @@ def test_pneumatic_cylinders(recordings, tmp_path):
     assert all(m["spectral_radius_max"] < 1 for m in metrics["models"].values())
 
 
-@pytest.mark.parametrize("name", ["double_pendulum/run.py", "double_pendulum/builds.py", "quanser_qube/run.py", "pneumatic/run.py"])
+@pytest.mark.parametrize(
+    "name", ["double_pendulum/run.py", "double_pendulum/builds.py", "quanser_qube/run.py", "pneumatic/run.py"]
+)
 def test_without_recordings_it_says_what_to_do(name):
     environment = {k: v for k, v in os.environ.items() if k != "KROS_DATA"}
     done = subprocess.run([sys.executable, EXAMPLES / name], env=environment, capture_output=True, text=True)

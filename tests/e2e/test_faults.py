@@ -20,7 +20,10 @@ def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:
     facts = json.loads((demo / "population" / "facts.json").read_text())
     population = read_parquet(Path(demo, facts["recordings"]))
     n, key = len(population.states), population.episodes[0]
-    values, largest = population.read(key), np.max([np.abs(population.read(k)).max(axis=0) for k in population.episodes], axis=0)
+    values, largest = (
+        population.read(key),
+        np.max([np.abs(population.read(k)).max(axis=0) for k in population.episodes], axis=0),
+    )
     phase = PhaseCalibration.load(demo / "calibration").units[key.unit].phase_rad
     names = json.loads((demo / "observers" / "observers.json").read_text())["names"]
     late, missed = [], {}

@@ -34,7 +34,14 @@ channel = [
 @pytest.fixture(scope="module")
 def machines() -> Population:
     """Two drives that the study never saw, and a badly assembled one."""
-    settings: dict[str, Any] = {"n_units": 2, "n_episodes": 2, "seconds": 10.0, "seed": 79, "conditions": ("noload",), "outlier": True}
+    settings: dict[str, Any] = {
+        "n_units": 2,
+        "n_episodes": 2,
+        "seconds": 10.0,
+        "seed": 79,
+        "conditions": ("noload",),
+        "outlier": True,
+    }
     return PLANTS["harmonic-drive"](**settings).simulate().population
 
 
@@ -105,7 +112,9 @@ def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, 
     np.testing.assert_allclose(table(tmp_path / "n.csv")[1], values, rtol=1e-6, atol=1e-9)
 
 
-def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation_is_smallest(kros, demo, field, tmp_path) -> None:
+def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation_is_smallest(
+    kros, demo, field, tmp_path
+) -> None:
     result = kros("estimate", demo, field(), tmp_path / "whole.csv")
     calibrated = json.loads((tmp_path / "whole.csv-metadata.json").read_text())["parameters"]
     for file in (tmp_path / "logged").iterdir():
@@ -121,7 +130,10 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
         apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
     assert (
-        kros("estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2").output.count("given") == 1
+        kros(
+            "estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2"
+        ).output.count("given")
+        == 1
     )
     assert np.isfinite(values).all()
 
@@ -135,7 +147,9 @@ def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> N
     result = kros("estimate", demo, field(with_holes), tmp_path / "x.parquet")
     assert result.exit_code == 0, result.output
     assert result.output.count("20 samples MISSING; 2 samples INVALID_INPUT") == 3  # of two episodes each
-    assert all(np.isfinite(pq.read_table(tmp_path / "x.parquet")[c].to_numpy()).all() for c in ("velocity_hat", "current_hat"))
+    assert all(
+        np.isfinite(pq.read_table(tmp_path / "x.parquet")[c].to_numpy()).all() for c in ("velocity_hat", "current_hat")
+    )
 
 
 def test_what_does_not_fit_is_said(kros, demo, field, tmp_path) -> None:
@@ -168,11 +182,17 @@ def test_check_says_what_it_can_without_hidden_channels(kros, demo, field) -> No
     for row in rows.values():
         assert row["score"] is None
         assert row["missing"] == ["velocity", "current"]
-        assert (row["status"], row["outlier"], row["level_units"]) == ("cannot tell", False, 5)  # too few units for a verdict
+        assert (row["status"], row["outlier"], row["level_units"]) == (
+            "cannot tell",
+            False,
+            5,
+        )  # too few units for a verdict
         assert set(row["bands_db"]) == {"position"}
     bad, *good = (row["level_db"] for row in rows.values())
     assert bad > max(0.0, max(good) + 1.0)
     assert result.exit_code == 4
     lines = kros("check", demo, data).stdout.splitlines()
     assert [line.split() for line in lines[::2]] == [["UNDECIDED", unit] for unit in rows]
-    assert all("without velocity, current" in line and "the monitor's bound, from 5 units" in line for line in lines[1::2])
+    assert all(
+        "without velocity, current" in line and "the monitor's bound, from 5 units" in line for line in lines[1::2]
+    )

@@ -57,8 +57,13 @@ def results(run: Path) -> dict[str, Any]:
             return {k: cleaned(v) for k, v in value.items() if k not in TIMES}
         return [cleaned(v) for v in value] if isinstance(value, list) else value
 
-    files = [p for p in sorted(run.rglob("*")) if p.is_file() and p.relative_to(run).parts[0] not in ("stages", ".kros.lock")]
-    return {p.relative_to(run).as_posix(): cleaned(json.loads(p.read_text())) if p.suffix == ".json" else p.read_bytes() for p in files}
+    files = [
+        p for p in sorted(run.rglob("*")) if p.is_file() and p.relative_to(run).parts[0] not in ("stages", ".kros.lock")
+    ]
+    return {
+        p.relative_to(run).as_posix(): cleaned(json.loads(p.read_text())) if p.suffix == ".json" else p.read_bytes()
+        for p in files
+    }
 
 
 def folders(raw: Path) -> list[Path]:
@@ -68,7 +73,9 @@ def folders(raw: Path) -> list[Path]:
 
 def without(raw: Path, out: Path, *left_out: Path) -> Path:
     """Copy recordings, with their times, but for some files or folders."""
-    shutil.copytree(raw, out, ignore=lambda place, names: [n for n in names if any(Path(place) / n == p for p in left_out)])
+    shutil.copytree(
+        raw, out, ignore=lambda place, names: [n for n in names if any(Path(place) / n == p for p in left_out)]
+    )
     return out
 
 
@@ -94,7 +101,12 @@ def test_a_unit_that_is_new_is_the_only_one_that_is_computed(drives, tmp_path, c
     put_back(drives, source)
     computed.clear()
     study(source, run)
-    assert computed == {"read": ["001005"] * 2, "calibrate": ["001005"], "identify (noload)": ["001005"], "identify (load)": ["001005"]}
+    assert computed == {
+        "read": ["001005"] * 2,
+        "calibrate": ["001005"],
+        "identify (noload)": ["001005"],
+        "identify (load)": ["001005"],
+    }
     assert results(run) == fresh(source, tmp_path)
 
 
@@ -105,7 +117,12 @@ def test_an_episode_that_is_new_changes_its_unit_alone(drives, tmp_path, compute
     put_back(drives, source)
     computed.clear()
     study(source, run)
-    assert computed == {"read": ["001002"], "calibrate": ["001002"], "identify (noload)": ["001002"], "identify (load)": []}
+    assert computed == {
+        "read": ["001002"],
+        "calibrate": ["001002"],
+        "identify (noload)": ["001002"],
+        "identify (load)": [],
+    }
     assert results(run) == fresh(source, tmp_path)
 
 
@@ -136,13 +153,19 @@ def test_a_unit_that_is_gone_leaves_nothing_behind(drives, tmp_path, computed):
     assert results(run) == fresh(source, tmp_path)
 
 
-def test_another_regularisation_or_lifting_takes_from_earlier_runs_what_does_not_depend_on_it(drives, tmp_path, computed):
+def test_another_regularisation_or_lifting_takes_from_earlier_runs_what_does_not_depend_on_it(
+    drives, tmp_path, computed
+):
     run = study(drives, tmp_path / "run")
     computed.clear()
     study(drives, run, alpha=90.0)
     assert computed == {"identify (noload)": [], "identify (load)": []}
     assert results(run) == fresh(drives, tmp_path, alpha=90.0)
-    content = {"name": "grown", "data": {"source": str(drives), "reader": "motor-drive-raw"}, "identify": {"refine": False, "alpha": 90.0}}
+    content = {
+        "name": "grown",
+        "data": {"source": str(drives), "reader": "motor-drive-raw"},
+        "identify": {"refine": False, "alpha": 90.0},
+    }
     content |= {"lifting": {"functions": ["cos(100*position + phase)"]}}
     computed.clear()
     run_study(validate_config(content, drives), run, Stage.IDENTIFY)

@@ -36,7 +36,11 @@ def comma(value: float) -> str:
 def european(path: Path, values: Array, period_s: float) -> None:
     """Semicolons, decimal commas, latin-1, units in a second row, milliseconds, degrees, CR LF."""
     rows = np.column_stack([1e3 * period_s * np.arange(len(values)), values / [DEGREE, np.pi / 30, 1, 1]])
-    lines = ["Zeit;Winkel Abtrieb;Drehzahl;Strom;Spannung (Klemmen)", "ms;°;1/min;A;V", *(";".join(map(comma, r)) for r in rows.tolist())]
+    lines = [
+        "Zeit;Winkel Abtrieb;Drehzahl;Strom;Spannung (Klemmen)",
+        "ms;°;1/min;A;V",
+        *(";".join(map(comma, r)) for r in rows.tolist()),
+    ]
     path.write_bytes(("\r\n".join(lines) + "\r\n").encode("latin-1"))
 
 
@@ -59,7 +63,10 @@ def tabs(path: Path, values: Array, period_s: float) -> None:
 def plain(path: Path, values: Array, period_s: float) -> None:
     """Commas and points; a counter, a column that rests, a note."""
     lines = ["index,time_us,position,velocity,current,voltage,spare,note"]
-    lines += [f"{k},{1e6 * k * period_s:.6g},{','.join(f'{x:.12g}' for x in r)},0.5,fine" for k, r in enumerate(values.tolist())]
+    lines += [
+        f"{k},{1e6 * k * period_s:.6g},{','.join(f'{x:.12g}' for x in r)},0.5,fine"
+        for k, r in enumerate(values.tolist())
+    ]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -83,7 +90,9 @@ def written(folder: Path, population: Population, kind: str) -> Path:
     """Write all episodes as a stranger would."""
     write, name = WRITERS[kind]
     for key in population.episodes:
-        path = folder / name.format(unit=int(key.unit.lstrip("abcdefghijklmnopqrstuvwxyz-_")), episode=int(key.episode) + 1)
+        path = folder / name.format(
+            unit=int(key.unit.lstrip("abcdefghijklmnopqrstuvwxyz-_")), episode=int(key.episode) + 1
+        )
         path.parent.mkdir(parents=True, exist_ok=True)
         write(path, population.read(key), population.sample_period_s)
     return folder
@@ -108,9 +117,22 @@ def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
     result = kros("init", folder, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
     assert "winkel_abtrieb [rad]" in result.output
-    quick = ["uncertainty.n_freqs=60", "synthesis.input_weight=3.0", 'synthesis.methods=["worst_case_h2"]', "identify.refine=false"]
+    quick = [
+        "uncertainty.n_freqs=60",
+        "synthesis.input_weight=3.0",
+        'synthesis.methods=["worst_case_h2"]',
+        "identify.refine=false",
+    ]
     quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "predictor.effort=quick"]
-    result = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--workers", 1, *(a for q in quick for a in ("--set", q)))
+    result = kros(
+        "run",
+        tmp_path / "study.toml",
+        "--out",
+        tmp_path / "run",
+        "--workers",
+        1,
+        *(a for q in quick for a in ("--set", q)),
+    )
     assert result.exit_code == 0, result.output
     assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
     assert json.loads((tmp_path / "run" / "metrics.json").read_text())["study"]["units"] == 4
@@ -122,7 +144,9 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     shutil.copy(folder / units[0] / "2024-05-01.csv", folder / units[1] / "2024-05-01.csv")
     stuck = folder / units[2] / "2024-05-02.csv"
     lines = stuck.read_text().splitlines()
-    stuck.write_text("\n".join([lines[0], *(",".join([*(c := line.split(","))[:4], "1.5", *c[5:]]) for line in lines[1:])]))
+    stuck.write_text(
+        "\n".join([lines[0], *(",".join([*(c := line.split(","))[:4], "1.5", *c[5:]]) for line in lines[1:])])
+    )
     gap = folder / units[3] / "2024-05-03.csv"
     lines = gap.read_text().splitlines()
     gap.write_text("\n".join(lines[:500] + lines[600:]))
@@ -138,7 +162,10 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
         assert part in result.output
     found = open_source(load_config(study))
     assert len(found.episodes) == 13
-    assert EpisodeKey(units[0], "default", "01") not in found.episodes or EpisodeKey(units[1], "default", "01") not in found.episodes
+    assert (
+        EpisodeKey(units[0], "default", "01") not in found.episodes
+        or EpisodeKey(units[1], "default", "01") not in found.episodes
+    )
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
 
 
@@ -147,23 +174,37 @@ def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, t
     folder.mkdir()
     for key in motors.episodes[:8]:
         np.savetxt(
-            folder / f"{key.unit}_{key.episode}.csv", motors.read(key), delimiter=",", header="aa,bb,cc,dd", comments="", fmt="%.10g"
+            folder / f"{key.unit}_{key.episode}.csv",
+            motors.read(key),
+            delimiter=",",
+            header="aa,bb,cc,dd",
+            comments="",
+            fmt="%.10g",
         )
     result = kros("init", folder, "--out", tmp_path / "study.toml")
     assert result.exit_code == 2
     assert "--period SECONDS" in result.output
     result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002)
     assert result.exit_code == 2
-    assert "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd" in result.output
-    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "d")
+    assert (
+        "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd"
+        in result.output
+    )
+    result = kros(
+        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "d"
+    )
     assert result.exit_code == 2
     assert "there is no column 'd'" in result.output
-    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd")
+    result = kros(
+        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd"
+    )
     assert result.exit_code == 0, result.output
     found = open_source(load_config(tmp_path / "study.toml"))
     assert (found.measured, found.states, found.inputs) == (("aa",), ("aa", "bb", "cc"), ("dd",))
     before = (tmp_path / "study.toml").read_bytes()
-    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd")
+    result = kros(
+        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd"
+    )
     assert result.exit_code == 2
     assert "exists; name another file" in result.output
     assert (tmp_path / "study.toml").read_bytes() == before
@@ -175,7 +216,9 @@ def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path
             path = tmp_path / name / key.unit / f"run_{key.episode}.csv"
             path.parent.mkdir(parents=True, exist_ok=True)
             rows = enumerate(motors.read(key).tolist())
-            lines = [",".join([f"{motors.sample_period_s * k:.{digits}f}", *(f"{x:.12g}" for x in row)]) for k, row in rows]
+            lines = [
+                ",".join([f"{motors.sample_period_s * k:.{digits}f}", *(f"{x:.12g}" for x in row)]) for k, row in rows
+            ]
             path.write_text("\n".join([header, *lines, behind]))
         return tmp_path / name
 
@@ -183,10 +226,13 @@ def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path
     result = kros("init", doubled, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
     np.testing.assert_allclose(
-        open_source(load_config(tmp_path / "study.toml")).read(motors.episodes[0])[:, 2], motors.read(motors.episodes[0])[:, 2]
+        open_source(load_config(tmp_path / "study.toml")).read(motors.episodes[0])[:, 2],
+        motors.read(motors.episodes[0])[:, 2],
     )
     rounded = folder("rounded", "time,position,velocity,current,u", 2)
-    assert "'time' stands still or runs back in places" in kros("init", rounded, "--out", tmp_path / "rounded.toml").output
+    assert (
+        "'time' stands still or runs back in places" in kros("init", rounded, "--out", tmp_path / "rounded.toml").output
+    )
     assert kros("init", rounded, "--out", tmp_path / "rounded.toml", "--period", motors.sample_period_s).exit_code == 0
     ended = folder("ended", "time,position,velocity,current,u", 6, "End of file\n")
     assert "Expected 5 columns, got 1: End of file" in kros("init", ended, "--out", tmp_path / "ended.toml").output
@@ -195,7 +241,9 @@ def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path
 def test_roles_are_asked_at_a_terminal(tmp_path, monkeypatch, motors):
     folder = written(tmp_path / "recordings", motors, "plain")
     monkeypatch.setattr("kros.cli._on_terminal", lambda: True)
-    result = CliRunner().invoke(app, ["init", str(folder), "--out", str(tmp_path / "study.toml")], input="position, velocity\n\n")
+    result = CliRunner().invoke(
+        app, ["init", str(folder), "--out", str(tmp_path / "study.toml")], input="position, velocity\n\n"
+    )
     assert result.exit_code == 0, result.output
     assert "Measured states [position]: " in result.output
     assert "Inputs [voltage]: " in result.output
@@ -210,7 +258,9 @@ def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):
     for key in pendulums.episodes:
         t = pendulums.sample_period_s * np.arange(len(pendulums.read(key)))
         rows = np.column_stack([t, pendulums.read(key)])
-        np.savetxt(folder / f"{key.unit}.csv", rows, delimiter=",", header="t,angle,rate,torque_cmd", comments="", fmt="%.10g")
+        np.savetxt(
+            folder / f"{key.unit}.csv", rows, delimiter=",", header="t,angle,rate,torque_cmd", comments="", fmt="%.10g"
+        )
     result = kros("init", folder, "--out", tmp_path / "study.toml")
     assert result.exit_code == 2
     assert r"--files '^(?P<unit>\d+)\.csv$'" in result.stderr  # or episodes of one unit: the names do not say

@@ -100,11 +100,21 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     folder = run[0]
     again = kros("run", folder.parent / "study.toml", "--out", folder, "--until", "left_out")
     assert again.exit_code == 0
-    assert all(line.endswith("unchanged") for line in again.stderr.splitlines() if line[:1].islower() or line[:1].isdigit())
+    assert all(
+        line.endswith("unchanged") for line in again.stderr.splitlines() if line[:1].islower() or line[:1].isdigit()
+    )
     made = json.loads((folder / "left_out" / "1" / "stages" / "synthesize.json").read_text())
     shutil.copytree(folder, folder.parent / "copy")
     off = kros(
-        "run", folder.parent / "study.toml", "--out", folder.parent / "copy", "--until", "left_out", "--set", "evaluate.folds=0", "--json"
+        "run",
+        folder.parent / "study.toml",
+        "--out",
+        folder.parent / "copy",
+        "--until",
+        "left_out",
+        "--set",
+        "evaluate.folds=0",
+        "--json",
     )
     assert "left_out" not in json.loads(off.stdout)
     assert not (folder.parent / "copy" / "left_out" / "left_out.json").exists()
@@ -148,7 +158,8 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     """Its phase comes from its own training episodes; what the fold knows of it is the branch."""
     assert kros("simulate", tmp_path / "drives", "--units", 3, "--episodes", 2, "--seconds", 8).exit_code == 0
     config = load_config(
-        study(tmp_path, tmp_path / "drives"), ['data.exclude=["001003"]', "observer.deployed='learned'", "require.robust=true"]
+        study(tmp_path, tmp_path / "drives"),
+        ['data.exclude=["001003"]', "observer.deployed='learned'", "require.robust=true"],
     )
     fold, whole = tmp_path / "fold", tmp_path / "whole"
     run_study(config, fold, until=Stage.CALIBRATE)
@@ -178,7 +189,9 @@ def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run
     excluded = "data.exclude=" + json.dumps(reserve)
     run_study(load_config(study(tmp_path, pendulums), [excluded]), tmp_path / "alone", until=Stage.EVALUATE)
     for part in ("models", "uncertainty", "observers", "evaluation"):
-        files = [p.relative_to(folder) for p in (folder / part).rglob("*.json") if p.name != "relift.json"]  # that one holds seconds
+        files = [
+            p.relative_to(folder) for p in (folder / part).rglob("*.json") if p.name != "relift.json"
+        ]  # that one holds seconds
         assert files
         assert all((folder / p).read_bytes() == (tmp_path / "alone" / p).read_bytes() for p in files)
 
@@ -195,7 +208,9 @@ def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run
     assert {u: r["rms"] for u, r in rows.items()} == pytest.approx(errors)
     bound = found["bounds"]["velocity"]
     assert found["reason"] is None
-    assert [m for m in bound if bound[m] == pytest.approx(max(r[m] for r in rows.values()))]  # the second of two: one measure decides
+    assert [
+        m for m in bound if bound[m] == pytest.approx(max(r[m] for r in rows.values()))
+    ]  # the second of two: one measure decides
     assert all(bound[m] >= 0.999999 * r[m] for m in bound for r in rows.values())
 
 

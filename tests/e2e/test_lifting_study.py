@@ -78,7 +78,11 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
     free = metrics["models"]["koopman_edmd"]
     assert free["order"] == 10
     assert all(np.isfinite(e["worst"]) for e in free["freerun_error_percent"].values())
-    made = [name for name, o in metrics["observers"].items() if name.startswith("koopman_edmd/") and o.get("status") != "failed"]
+    made = [
+        name
+        for name, o in metrics["observers"].items()
+        if name.startswith("koopman_edmd/") and o.get("status") != "failed"
+    ]
     assert "koopman_edmd/open_loop" in made
     observer = Observer.load(run / "observers" / "koopman_edmd" / "open_loop.json")
     assert (observer.inputs, observer.lifting.input_functions, observer.lifting.history) == (INPUTS, INPUT_FUNCTIONS, 2)
@@ -115,7 +119,9 @@ def machines(n_samples, still_input=False):
 def test_models_with_delays_and_input_functions_are_refined(study, kros, tmp_path):
     write_parquet(machines([150, 150, 150]), tmp_path / "data")
     extra = "[lifting]\nfunctions = ['tanh(v)', 'x[-2]']\ninput_functions = ['v*u']"
-    result = kros("run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1)
+    result = kros(
+        "run", study(extra, source=tmp_path / "data"), "--out", tmp_path / "run", "--until", "identify", "--workers", 1
+    )
     assert result.exit_code == 0, result.output
     models, linear = (ModelSet.load(tmp_path / "run" / "models" / name) for name in ("koopman", "linear"))
     assert (models.lifting.history, models.inputs) == (2, ("u", "w", "v*u"))

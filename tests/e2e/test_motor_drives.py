@@ -37,7 +37,9 @@ def test_claims_are_those_of_the_run(claims, metrics):
 
     def band(kind):
         rows = [r for r in metrics["evaluation"] if r["observer"] == f"{kind}/mixed" and r["role"] == "off_nominal"]
-        return np.mean([r["gearbox_band_power"] for r in rows if r["channel"] == "current" and r["condition"] == "noload"])
+        return np.mean(
+            [r["gearbox_band_power"] for r in rows if r["channel"] == "current" and r["condition"] == "noload"]
+        )
 
     ratio = 10 * math.log10(band("koopman_edmd") / band("linear_edmd"))
     (ripple,) = [answer for _, says, answer in found if "off-nominal" in says and "gearbox" in says]
@@ -51,6 +53,13 @@ def test_the_study_begins_on_simulated_drives(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "run" / "models" / "koopman_edmd" / "model.json").is_file()
-    command = [*command[:3], tmp_path / "again", "--recordings", tmp_path / "run-recordings", "--until", "read"]  # as published ones
+    command = [
+        *command[:3],
+        tmp_path / "again",
+        "--recordings",
+        tmp_path / "run-recordings",
+        "--until",
+        "read",
+    ]  # as published ones
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

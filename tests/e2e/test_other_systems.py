@@ -78,7 +78,10 @@ def test_refined_models_are_close_to_the_pendulums_themselves(pendulums):
     population = read_parquet(pendulums / "recordings")
     truths = json.loads((pendulums / "recordings" / "truth.json").read_text())["units"]
     folder = pendulums / "run" / "models"
-    found = {name: percent_from_truth(ModelSet.load(folder / name), population, truths) for name in ("koopman", "koopman_edmd", "linear")}
+    found = {
+        name: percent_from_truth(ModelSet.load(folder / name), population, truths)
+        for name in ("koopman", "koopman_edmd", "linear")
+    }
     assert found["koopman"].max() < 0.5  # the sensor's noise alone is half a percent of the velocity's range
     assert (found["koopman"].mean(axis=0) < found["koopman_edmd"].mean(axis=0)).all()
     assert (found["koopman"].mean(axis=0) < 0.25 * found["linear"].mean(axis=0)).all()

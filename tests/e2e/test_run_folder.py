@@ -71,7 +71,9 @@ def files(folder: Path) -> set[str]:
 def results(folder: Path) -> dict[str, Any]:
     """Contents of all files but records; without times, and without the keys that depend on them."""
     return {
-        name: timeless(json.loads((folder / name).read_text())) if name.endswith(".json") else (folder / name).read_bytes()
+        name: timeless(json.loads((folder / name).read_text()))
+        if name.endswith(".json")
+        else (folder / name).read_bytes()
         for name in files(folder)
         if "stages/" not in name
     }
@@ -108,7 +110,9 @@ def test_any_file_that_was_changed_is_made_again(kros, fast, run, finished, patt
     assert results(run)[name] == results(finished)[name]
 
 
-@pytest.mark.parametrize("settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.false_alarm_rate=0.01")])
+@pytest.mark.parametrize(
+    "settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.false_alarm_rate=0.01")]
+)
 def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     for _ in range(2):
         (run / "stages" / "quantify.json").unlink(missing_ok=True)  # as if it had been killed
@@ -126,7 +130,9 @@ def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, fi
 
 def test_what_does_not_follow_from_the_study_any_more_goes(kros, fast, run):
     assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.max_order=2").exit_code == 0
-    assert not any(name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run))
+    assert not any(
+        name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run)
+    )
     assert "models" in {name.partition("/")[0] for name in files(run)}
 
 
@@ -193,7 +199,12 @@ def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
     for name in ("notes.txt", "observers/notes.txt", "left_out/0/notes.txt"):
         (run / name).write_text("remember")
     crafted(run, ["notes.txt"])
-    assert kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha_factor=5").exit_code == 0
+    assert (
+        kros(
+            "run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha_factor=5"
+        ).exit_code
+        == 0
+    )
     assert {"notes.txt", "observers/notes.txt", "left_out/0/notes.txt"} <= files(run)
     assert not any(name.startswith("left_out/") for name in files(run) - {"left_out/0/notes.txt"})
 
@@ -320,7 +331,9 @@ def lives(pid: int) -> bool:
 def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finished, tmp_path, number):
     run = tmp_path / "run"
     process = start(fast, run, "--workers", "2", "--until", "synthesize")
-    wait_for(lambda: (run / "stages" / "read.json").exists() or process.poll() is not None)  # early: a busy machine may be late
+    wait_for(
+        lambda: (run / "stages" / "read.json").exists() or process.poll() is not None
+    )  # early: a busy machine may be late
     workers = children(process.pid)
     assert len(workers) >= 2
     process.send_signal(number)
@@ -334,7 +347,11 @@ def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finishe
     found = kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize")
     assert found.exit_code == 0
     assert "unchanged" in found.stderr
-    whole = {k: v for k, v in results(finished).items() if not k.startswith(("evaluation/", "left_out/", "report", "metrics", "study"))}
+    whole = {
+        k: v
+        for k, v in results(finished).items()
+        if not k.startswith(("evaluation/", "left_out/", "report", "metrics", "study"))
+    }
     assert {k: v for k, v in results(run).items() if not k.startswith(("metrics", "study"))} == whole
 
 

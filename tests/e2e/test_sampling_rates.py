@@ -30,7 +30,9 @@ def errors(few_figures, tmp_path_factory):
     found = {}
     for period in PERIODS_S:
         folder = tmp_path_factory.mktemp("rate")
-        population = from_arrays(units, states=["voltage", "heat"], measured=["voltage"], inputs=["current"], sample_period_s=period)
+        population = from_arrays(
+            units, states=["voltage", "heat"], measured=["voltage"], inputs=["current"], sample_period_s=period
+        )
         write_parquet(population, folder / "recordings")
         (folder / "study.toml").write_text('[data]\nsource = "recordings"\nreader = "parquet"\n')
         run_study(load_config(folder / "study.toml"), folder / "run")
@@ -47,7 +49,16 @@ def test_errors_do_not_depend_on_the_sampling_period(errors, period):
 
 
 def test_measured_cells_at_a_tenth_of_a_hertz_run_with_defaults(kros, few_figures, recordings, tmp_path):
-    found = kros("init", recordings / "dmegc_cells", "--measured", "voltage", "--input", "current", "--out", tmp_path / "study.toml")
+    found = kros(
+        "init",
+        recordings / "dmegc_cells",
+        "--measured",
+        "voltage",
+        "--input",
+        "current",
+        "--out",
+        tmp_path / "study.toml",
+    )
     assert found.exit_code == 0, found.output
     done = kros("run", tmp_path / "study.toml", "--out", tmp_path / "run", "--workers", 1)
     assert done.exit_code == 0, done.output

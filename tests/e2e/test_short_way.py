@@ -24,11 +24,17 @@ from kros.study import load_config, run_study
 from kros.uncertainty import UncertainModels
 
 ROOT = Path(__file__).parents[2]
-ROLES = {"position": 'role = "state"\nmeasured = true', "target_position": 'role = "input"', "target_velocity": 'role = "input"'}
+ROLES = {
+    "position": 'role = "state"\nmeasured = true',
+    "target_position": 'role = "input"',
+    "target_velocity": 'role = "input"',
+}
 STATE = 'role = "state"'
 # Fewer candidates, and methods that take long for one kind of models each: what chooses among them is the same.
 FEWER: dict[str, Any] = {
-    "design.synthesize.suitable": lambda *asked: [m for m in table.suitable(*asked) if ONCE.get(m.name, asked[1]) == asked[1]],
+    "design.synthesize.suitable": lambda *asked: [
+        m for m in table.suitable(*asked) if ONCE.get(m.name, asked[1]) == asked[1]
+    ],
     "design.methods.disturbance_model._CORNERS": (1e-3,),
     "design.methods.predictor.EFFORTS": {"full": predictor.EFFORTS["quick"]},
     "design.methods.signals._ROUNDS": 0,
@@ -40,19 +46,34 @@ LIFTING = "sin(100*position + phase)"
 
 def write_csv(folder: Path) -> None:
     """Write a few drives as anybody's CSV files, and the mapping that says what is in them."""
-    population = PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=2, conditions=("noload",)).simulate().population
+    population = (
+        PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=2, conditions=("noload",))
+        .simulate()
+        .population
+    )
     names = [c.name for c in population.channels]
     for key in population.episodes:
         path = folder / "recordings" / key.unit / f"{key.episode}.csv"
         path.parent.mkdir(parents=True, exist_ok=True)
         values = population.read(key)
         time = np.arange(len(values)) * population.sample_period_s
-        np.savetxt(path, np.column_stack([time, values]), delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.17g")
+        np.savetxt(
+            path,
+            np.column_stack([time, values]),
+            delimiter=",",
+            header=",".join(["time", *names]),
+            comments="",
+            fmt="%.17g",
+        )
     channels = [f'[[channel]]\nname = "{n}"\ncolumn = "{n}"\n{ROLES.get(n, STATE)}\n' for n in names]
     head = "files = '(?P<unit>[^/]+)/(?P<episode>[^/]+)\\.csv'\ntime = \"time\"\n"
     (folder / "mapping.toml").write_text(head + "".join(channels))
-    tables = head.replace("files", "[data.csv]\nfiles") + "".join(channels).replace("[[channel]]", "[[data.csv.channel]]")
-    (folder / "study.toml").write_text(f'[data]\nsource = "recordings"\nreader = "csv"\n{tables}\n[lifting]\nfunctions = ["{LIFTING}"]\n')
+    tables = head.replace("files", "[data.csv]\nfiles") + "".join(channels).replace(
+        "[[channel]]", "[[data.csv.channel]]"
+    )
+    (folder / "study.toml").write_text(
+        f'[data]\nsource = "recordings"\nreader = "csv"\n{tables}\n[lifting]\nfunctions = ["{LIFTING}"]\n'
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +102,9 @@ def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> Non
     assert without_study(observers / f"{named.name}.json") == saved(named, folder / "named.json")
     assert named.lower_bound == named.synthesis.lower_bound > 0
     other = replace(named.synthesis, worst_case_h2=None)
-    assert replace(named, synthesis=other).lower_bound is None  # the optimum of another norm bounds nothing in the worst case
+    assert (
+        replace(named, synthesis=other).lower_bound is None
+    )  # the optimum of another norm bounds nothing in the worst case
     assert names["study"].folder == Path("runs/x")
     assert (folder / "runs" / "x" / "report.html").is_file()
 
@@ -94,7 +117,9 @@ def saved(design: Design, path: Path) -> bytes:
 def without_study(path: Path) -> bytes:
     """What a study wrote but for its name."""
     observer = Observer.load(path)
-    replace(observer, about={k: v for k, v in observer.about.items() if k != "study"}).save(path.with_suffix(".unnamed"))
+    replace(observer, about={k: v for k, v in observer.about.items() if k != "study"}).save(
+        path.with_suffix(".unnamed")
+    )
     return path.with_suffix(".unnamed").read_bytes()
 
 
@@ -119,9 +144,14 @@ def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(example: tuple[
     assert len(set(written)) == 1
     models = kros.identify(names["population"], [LIFTING], **quick["identify"])
     uncertain = kros.quantify(models, **quick["uncertainty"])
-    assert saved(kros.synthesize(uncertain, observer=quick["observer"], **quick["synthesis"]), folder / "quick.json") == written[0]
+    assert (
+        saved(kros.synthesize(uncertain, observer=quick["observer"], **quick["synthesis"]), folder / "quick.json")
+        == written[0]
+    )
     again = kros.run(names["population"], folder / "b", until="synthesize", lifting=[LIFTING], **quick)
-    assert again.metrics["timing_s"]["identify"] == runs[1].metrics["timing_s"]["identify"]  # skipped: the arrays are the same
+    assert (
+        again.metrics["timing_s"]["identify"] == runs[1].metrics["timing_s"]["identify"]
+    )  # skipped: the arrays are the same
 
 
 @pytest.mark.slow
@@ -135,6 +165,7 @@ def test_everything_is_saved_and_loaded(example: tuple[Path, dict[str, Any]], tm
     uncertain = UncertainModels.load(tmp_path / "uncertain")
     assert repr(uncertain) == repr(names["uncertain"])
     same, first = (
-        kros.synthesize(own, method="kalman_tuned", methods=()).synthesis.controller.D for own in (uncertain, names["uncertain"])
+        kros.synthesize(own, method="kalman_tuned", methods=()).synthesis.controller.D
+        for own in (uncertain, names["uncertain"])
     )
     np.testing.assert_array_equal(same, first)

@@ -25,7 +25,9 @@ def test_version_and_module():
     assert said.stdout == f"kros {package.__version__}\n"
 
 
-@pytest.mark.parametrize(("command", "part"), [("check", "a TOML with [data]"), ("estimate", "a TOML with [data]"), ("run", "KEY=VALUE")])
+@pytest.mark.parametrize(
+    ("command", "part"), [("check", "a TOML with [data]"), ("estimate", "a TOML with [data]"), ("run", "KEY=VALUE")]
+)
 def test_help_keeps_its_brackets(kros, command, part):
     found = kros(command, "--help")
     assert found.exit_code == 0
@@ -34,7 +36,11 @@ def test_help_keeps_its_brackets(kros, command, part):
 
 @pytest.mark.parametrize(
     ("tables", "hint"),
-    [({"identify": {"alpa": 1}}, "'alpha'"), ({"data": {"source": ".", "exlude": []}}, "'exclude'"), ({"evalute": {}}, "'evaluate'")],
+    [
+        ({"identify": {"alpa": 1}}, "'alpha'"),
+        ({"data": {"source": ".", "exlude": []}}, "'exclude'"),
+        ({"evalute": {}}, "'evaluate'"),
+    ],
 )
 def test_keys_that_are_nearly_right(tmp_path, tables, hint):
     with pytest.raises(ConfigError, match=rf"did you mean {hint}\? known are"):
@@ -69,7 +75,11 @@ def test_warnings_are_said_once_in_one_line(capsys):
     logger.warning("unit b is odd")
     shown = warnings.formatwarning("a bound is loose", UserWarning, "/x/y.py", 7, "line of code")
     handler.handle(logging.LogRecord("py.warnings", logging.WARNING, "", 0, "%s", (shown,), None))
-    assert capsys.readouterr().err.splitlines() == ["warning: unit a is odd", "warning: unit b is odd", "warning: a bound is loose"]
+    assert capsys.readouterr().err.splitlines() == [
+        "warning: unit a is odd",
+        "warning: unit b is odd",
+        "warning: a bound is loose",
+    ]
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs POSIX signals")

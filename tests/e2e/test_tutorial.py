@@ -12,7 +12,12 @@ import pytest
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
 # the study of the page takes a minute; what it does is the same
-QUICKER = ["identify.refine=false", 'synthesis.methods=["worst_case_h2"]', 'observer.baselines=["open_loop"]', "synthesis.input_weight=3.0"]
+QUICKER = [
+    "identify.refine=false",
+    'synthesis.methods=["worst_case_h2"]',
+    'observer.baselines=["open_loop"]',
+    "synthesis.input_weight=3.0",
+]
 QUICKER += ["evaluate.robustness=false", "predictor.effort=quick", "uncertainty.n_freqs=60"]
 
 
@@ -44,7 +49,10 @@ def test_the_tutorial_from_csv_to_a_board(kros, tmp_path, monkeypatch: pytest.Mo
             assert ran.returncode == 0, f"{text}: {ran.stdout}{ran.stderr}"
         done.append(" ".join([name, *arguments][:2]))
     assert done[:6] == ["kros init", "kros run", "kros list", "kros estimate", "kros check", "kros export"]
-    assert Path("estimates.csv").read_text().splitlines()[0] == "unit,condition,episode,k,position_hat,velocity_hat,current_hat"
+    assert (
+        Path("estimates.csv").read_text().splitlines()[0]
+        == "unit,condition,episode,k,position_hat,velocity_hat,current_hat"
+    )
     for path in ("runs/study/report.html", "axis/axis.c", "axis/axis.h", "axis/README.md", "axis/example_main.c"):
         assert Path(path).is_file()
     called = set(re.findall(r"\baxis_\w+(?=\()", PAGE.read_text(encoding="utf-8")))

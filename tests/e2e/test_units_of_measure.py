@@ -40,7 +40,9 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
     scaled = replace(
         population,
         source=Multiplied(population.source, factors),
-        channels=tuple(replace(c, unit=c.unit if f == 1 else "") for c, f in zip(population.channels, factors, strict=True)),
+        channels=tuple(
+            replace(c, unit=c.unit if f == 1 else "") for c, f in zip(population.channels, factors, strict=True)
+        ),
     )
     write_parquet(scaled, folder / "recordings")
     raw = {
@@ -65,7 +67,9 @@ def first(motors, tmp_path_factory):
 def errors(metrics):
     found = {(r["observer"], r["unit"], r["channel"]): r["error_percent"] for r in metrics["evaluation"]}
     for name, model in metrics["models"].items():
-        found |= {(name, channel, which): v for channel, e in model["freerun_error_percent"].items() for which, v in e.items()}
+        found |= {
+            (name, channel, which): v for channel, e in model["freerun_error_percent"].items() for which, v in e.items()
+        }
     return found
 
 
@@ -80,7 +84,9 @@ def test_errors_scores_and_estimates_are_the_same(motors, first, factors, tmp_pa
     assert "filtered_difference" in {key[0] for key in found}
     assert found.keys() == expected.keys()
     np.testing.assert_allclose(list(found.values()), [expected[key] for key in found], rtol=WITHIN)
-    np.testing.assert_allclose([r["score"] for r in metrics["outliers"]], [r["score"] for r in one["outliers"]], atol=1e-6)
+    np.testing.assert_allclose(
+        [r["score"] for r in metrics["outliers"]], [r["score"] for r in one["outliers"]], atol=1e-6
+    )
     assert metrics["study"]["deployed"] == one["study"]["deployed"]
     assert metrics["study"]["alpha"] == pytest.approx(one["study"]["alpha"], rel=1e-6)
     for name, facts in one["observers"].items():

@@ -74,7 +74,9 @@ def test_random_systems_against_a_dense_grid_and_scipy(dt):
         assert norm <= grid * 1.05
         B = system.B @ system.B.T
         P = sl.solve_discrete_lyapunov(system.A, B) if dt > 0 else sl.solve_continuous_lyapunov(system.A, -B)
-        assert h2_norm(system) == pytest.approx(np.sqrt(np.trace(system.C @ P @ system.C.T) + np.sum(system.D**2)), rel=1e-6)
+        assert h2_norm(system) == pytest.approx(
+            np.sqrt(np.trace(system.C @ P @ system.C.T) + np.sum(system.D**2)), rel=1e-6
+        )
 
 
 def test_h2_norm_is_the_integral_of_the_spectrum():
@@ -109,7 +111,9 @@ def stiff_loop(rng, n=4):
     A = np.diag(poles)
     A[:2, :2] = np.exp(rng.uniform(-3, 2)) * np.array([[-0.1, 1.0], [-1.0, -0.1]])
     T = np.linalg.qr(rng.standard_normal((n + 1, n + 1)))[0]
-    return StateSpace(T @ A @ T.T, T @ rng.standard_normal((n + 1, 2)), rng.standard_normal((2, n + 1)) @ T.T, np.zeros((2, 2)), 0.0)
+    return StateSpace(
+        T @ A @ T.T, T @ rng.standard_normal((n + 1, 2)), rng.standard_normal((2, n + 1)) @ T.T, np.zeros((2, 2)), 0.0
+    )
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -45,7 +45,10 @@ NO_LIMITS = {
     "noise": lambda k: (noise(k), swing(k)),
     "levels": lambda k: (np.clip(np.rint(swing(k)), -1, 1), swing(k)),
     "a commanded plateau": lambda k: (trapezoid(k, 1.0) + noise(k), trapezoid(k, 1.0)),
-    "a commanded plateau beside another input": lambda k: (trapezoid(k, 1.0) + noise(k), np.stack([trapezoid(k, 1.0), swing(k)], 1)),
+    "a commanded plateau beside another input": lambda k: (
+        trapezoid(k, 1.0) + noise(k),
+        np.stack([trapezoid(k, 1.0), swing(k)], 1),
+    ),
     "answers to two levels": lambda k: (
         lagged(held(np.random.default_rng(k).choice([-1.0, 1.0], 10), 400)),
         held(np.random.default_rng(k).choice([-1.0, 1.0], 10), 400),

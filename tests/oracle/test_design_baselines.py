@@ -58,7 +58,11 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
     assert np.sqrt(np.prod(own / known)) < 1.01
     assert (
         own[0]
-        < 0.2 * percent(run_observer(in_sizes(task(uncertain, "open_loop").open_loop(), {}), test.states[..., :1], test.inputs), test)[0]
+        < 0.2
+        * percent(
+            run_observer(in_sizes(task(uncertain, "open_loop").open_loop(), {}), test.states[..., :1], test.inputs),
+            test,
+        )[0]
     )
     assert "position" in found.facts["rows_fitted_to_single_steps"]
     assert "rows fitted to single steps" in found.uncovered

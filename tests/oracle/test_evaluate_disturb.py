@@ -25,7 +25,9 @@ def observer(lifting=LINEAR, L=L):
     grown[:2, :2] = A
     grown[:2, 2:] = 0.02
     pad = ((0, n - 2), (0, 0))
-    return Observer("test", lifting, grown, np.pad(B, pad), (0,), ("u",), gain(np.pad(L, pad), 0.01), Injection.STATE, 0.01)
+    return Observer(
+        "test", lifting, grown, np.pad(B, pad), (0,), ("u",), gain(np.pad(L, pad), 0.01), Injection.STATE, 0.01
+    )
 
 
 def plant(n_samples=3000, batch=4, seed=0):
@@ -73,7 +75,10 @@ def test_losing_everything_is_the_open_loop():
     y = lost.y.copy()
     y[0] = x[0, :, :1]
     np.testing.assert_allclose(
-        run_observers([o], y, u, phases)[0], run_observers([open_loop], measured(x).y, u, phases)[0], rtol=1e-12, atol=1e-12
+        run_observers([o], y, u, phases)[0],
+        run_observers([open_loop], measured(x).y, u, phases)[0],
+        rtol=1e-12,
+        atol=1e-12,
     )
 
 
@@ -81,7 +86,11 @@ def test_many_observers_with_missing_samples_do_what_each_does_by_itself_sample_
     x, u = plant(400)
     rng = np.random.default_rng(5)
     K = StateSpace(
-        0.3 * rng.normal(size=(2, 2)), rng.normal(size=(2, 1)), 0.1 * rng.normal(size=(3, 2)), 0.3 * rng.normal(size=(3, 1)), 0.01
+        0.3 * rng.normal(size=(2, 2)),
+        rng.normal(size=(2, 1)),
+        0.1 * rng.normal(size=(3, 2)),
+        0.3 * rng.normal(size=(3, 1)),
+        0.01,
     )
     first = observer(LIFTED)
     second = Observer("memory", LIFTED, first.A, first.B, (0,), ("u",), K, Injection.STATE, 0.01)
@@ -116,7 +125,8 @@ def test_every_kind_does_what_its_name_says():
     x, _ = plant(5000)
     given = measured(x, np.zeros(4))
     low, high, gaps = (
-        given.under([d], 2).y[..., 0] for d in (Disturbance("dropped", 0.1), Disturbance("dropped", 0.4), Disturbance("gap", 50))
+        given.under([d], 2).y[..., 0]
+        for d in (Disturbance("dropped", 0.1), Disturbance("dropped", 0.4), Disturbance("gap", 50))
     )
     share = [np.isnan(y).mean() for y in (low, high, gaps)]
     np.testing.assert_allclose(share, [0.1, 0.4, 0.1], atol=0.01)
@@ -136,10 +146,14 @@ def test_every_kind_does_what_its_name_says():
     np.testing.assert_array_equal(wrong.y, np.concatenate([given.y, given.y], axis=1))
     still = measured(0 * x)
     for kind in (Kind.QUANTISATION, Kind.NOISE, Kind.BIAS):
-        np.testing.assert_array_equal(still.under([Disturbance(kind, 0.1)]).y, still.y)  # shares of no range are nothing
+        np.testing.assert_array_equal(
+            still.under([Disturbance(kind, 0.1)]).y, still.y
+        )  # shares of no range are nothing
 
 
-@pytest.mark.parametrize(("kind", "severity"), [("dropped", 1.2), ("bias", -1.0), ("noise", np.nan), ("gap", np.inf), ("delay", 1.5)])
+@pytest.mark.parametrize(
+    ("kind", "severity"), [("dropped", 1.2), ("bias", -1.0), ("noise", np.nan), ("gap", np.inf), ("delay", 1.5)]
+)
 def test_severities_out_of_range_are_refused(kind, severity):
     with pytest.raises(ConfigError, match=kind):
         Disturbance(kind, severity)

@@ -48,7 +48,9 @@ def test_the_start_and_the_rest_make_up_the_whole():
     for b, length in enumerate(lengths):
         size = np.abs(truth[:length, b]).max(axis=0)
         error = (estimate - truth)[:length, b]
-        np.testing.assert_allclose(found.start_percent[b], 100 * np.sqrt(np.mean(error[:50] ** 2, axis=0)) / size, rtol=1e-12)
+        np.testing.assert_allclose(
+            found.start_percent[b], 100 * np.sqrt(np.mean(error[:50] ** 2, axis=0)) / size, rtol=1e-12
+        )
         rest = 100 * np.sqrt(np.mean(error[50:] ** 2, axis=0)) / size if length > 50 else 0.0
         np.testing.assert_allclose(found.rest_percent[b], rest, rtol=1e-9, atol=1e-6)
 

@@ -13,7 +13,9 @@ from kros.evaluate import next_unit_bound
 from kros.evaluate.next_unit import draw_reserve, fewest_units
 
 
-@pytest.mark.parametrize(("confidence", "fewest"), [(0.95, 19), (0.9, 9), (0.99, 99), (0.5, 1), (0.8, 4), (0.75, 3), (2 / 3, 2)])
+@pytest.mark.parametrize(
+    ("confidence", "fewest"), [(0.95, 19), (0.9, 9), (0.99, 99), (0.5, 1), (0.8, 4), (0.75, 3), (2 / 3, 2)]
+)
 def test_fewer_units_than_the_confidence_needs_bound_nothing(confidence, fewest):
     errors = np.arange(float(fewest))[:, None]
     assert fewest_units(confidence) == fewest
@@ -21,7 +23,9 @@ def test_fewer_units_than_the_confidence_needs_bound_nothing(confidence, fewest)
     assert next_unit_bound(errors, [1.0], confidence) == pytest.approx([fewest - 1])  # the largest of them
 
 
-@pytest.mark.parametrize(("n", "confidence", "rank"), [(19, 0.95, 19), (39, 0.95, 38), (20, 0.95, 20), (30, 0.9, 28), (9, 0.9, 9)])
+@pytest.mark.parametrize(
+    ("n", "confidence", "rank"), [(19, 0.95, 19), (39, 0.95, 38), (20, 0.95, 20), (30, 0.9, 28), (9, 0.9, 9)]
+)
 def test_the_share_of_next_units_below_the_bound_has_the_distribution_of_an_order_statistic(n, confidence, rank):
     """Of uniform errors the bound is its own coverage: Beta(rank, n + 1 - rank), whose mean is at least the confidence."""
     rng = np.random.default_rng(n)
@@ -39,7 +43,9 @@ def test_errors_are_bounded_together_by_the_largest_scaled_one():
     assert next_unit_bound([[1.0], [np.nan], [2.0], [3.0]], [1.0], 0.6) == pytest.approx([3.0])
 
 
-@pytest.mark.parametrize(("scale", "confidence"), [([0.0], 0.9), ([np.inf], 0.9), ([1.0, 1.0], 0.9), ([1.0], 1.0), ([1.0], 0.0)])
+@pytest.mark.parametrize(
+    ("scale", "confidence"), [([0.0], 0.9), ([np.inf], 0.9), ([1.0, 1.0], 0.9), ([1.0], 1.0), ([1.0], 0.0)]
+)
 def test_scales_and_confidences_that_are_none(scale, confidence):
     with pytest.raises(DataError, match="Bound of the next unit"):
         next_unit_bound(np.ones((30, 1)), scale, confidence)
@@ -103,7 +109,9 @@ def test_the_next_units_of_two_hundred_populations_are_covered():
     K = np.stack([kalman_gain(m, np.eye(1, 3))[:, 0] for m in A])
     errors = errors_of(A, b, K, states, u)
     scale = errors[:, :made_from].mean(axis=1)
-    bounds = np.stack([next_unit_bound(e, s, confidence) for e, s in zip(errors[:, made_from:-new], scale, strict=True)])
+    bounds = np.stack(
+        [next_unit_bound(e, s, confidence) for e, s in zip(errors[:, made_from:-new], scale, strict=True)]
+    )
     inside = (errors[:, -new:] <= bounds[:, None]).all(axis=2).sum(axis=1)
 
     rank = round(confidence * (reserve + 1))

@@ -31,7 +31,9 @@ def test_power_of_white_noise_is_its_variance() -> None:
     assert density.sum() * freqs[1] == pytest.approx(1.0, rel=0.02)
 
 
-@pytest.mark.parametrize(("n_samples", "segment", "axis"), [(5000, 512, 0), (777, 401, 1), (100, 512, 0), (513, 512, -1), (1, 8, 0)])
+@pytest.mark.parametrize(
+    ("n_samples", "segment", "axis"), [(5000, 512, 0), (777, 401, 1), (100, 512, 0), (513, 512, -1), (1, 8, 0)]
+)
 def test_spectrum_is_that_of_scipy(n_samples: int, segment: int, axis: int) -> None:
     """Odd and even segments, signals shorter than one, and what is left behind the last."""
     signal = np.moveaxis(np.random.default_rng(4).normal(1.0, size=(n_samples, 2, 3)), 0, axis)
@@ -53,6 +55,8 @@ def test_a_diverged_estimate_spoils_no_other_spectrum() -> None:
 def test_observers_of_one_model_share_a_run() -> None:
     lifting = Lifting(("x", "v"))
     first = Observer.open_loop("a", lifting, np.eye(2), np.ones((2, 1)), (0,), ("u",), DT)
-    names = [[o.name for o in g] for g in alike([first, replace(first, name="b", measured=(1,)), replace(first, name="c")])]
+    names = [
+        [o.name for o in g] for g in alike([first, replace(first, name="b", measured=(1,)), replace(first, name="c")])
+    ]
     assert names == [["a", "c"], ["b"]]
     assert [len(g) for g in alike([first] * 20)] == [8, 8, 4]

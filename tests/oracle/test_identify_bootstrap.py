@@ -47,7 +47,8 @@ def bands(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Quantiles over the draws of sigma_max of the scaled deviation, and of every entry's magnitude: (unit, frequency[, n, m])."""
     off = (
-        np.stack([models.responses(row, freqs, dt) for row in range(len(models.unit_ids))]) - models.estimate.responses(freqs, dt)[:, None]
+        np.stack([models.responses(row, freqs, dt) for row in range(len(models.unit_ids))])
+        - models.estimate.responses(freqs, dt)[:, None]
     )
     spectral = np.linalg.norm(off * input_scale / np.asarray(output_scale)[:, None], ord=2, axis=(-2, -1))
     return np.quantile(spectral, level, axis=1), np.quantile(np.abs(off), level, axis=1)
@@ -63,7 +64,9 @@ def test_covariance_of_resampled_models_is_that_of_repeated_experiments(alpha: f
     repeated, found = np.cov(of(models).T), np.einsum("uda,udb->ab", W, W) / (59 * 1500)
     scale = np.sqrt(np.diagonal(repeated))
     np.testing.assert_allclose(np.diagonal(found), np.diagonal(repeated), rtol=4 * np.sqrt(2 / 1499))
-    np.testing.assert_allclose(found / np.outer(scale, scale), repeated / np.outer(scale, scale), atol=4 * np.sqrt(2 / 1499))
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), repeated / np.outer(scale, scale), atol=4 * np.sqrt(2 / 1499)
+    )
 
 
 def test_bands_hold_the_truth_as_often_as_they_say() -> None:
@@ -74,7 +77,9 @@ def test_bands_hold_the_truth_as_often_as_they_say() -> None:
     scale_out, scale_in = np.array([2.0, 0.5]), np.array([3.0])
     freqs = np.array([0.1, 5.0, 15.0, 45.0])
     spectral, entry = bands(models, freqs, DT, scale_out, scale_in, level=0.9)
-    truth = np.array([np.linalg.solve(x * np.eye(2) - TRUE[:, :2], TRUE[:, 2:]) for x in np.exp(2j * np.pi * freqs * DT)])
+    truth = np.array(
+        [np.linalg.solve(x * np.eye(2) - TRUE[:, :2], TRUE[:, 2:]) for x in np.exp(2j * np.pi * freqs * DT)]
+    )
     off = models.estimate.responses(freqs, DT) - truth
     inside = np.linalg.norm(off * scale_in / scale_out[:, None], ord=2, axis=(-2, -1)) <= spectral
     coverage = np.concatenate([inside.mean(axis=0), (np.abs(off) <= entry).mean(axis=0).ravel()])
@@ -177,7 +182,10 @@ def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
 def resampled(factors: Factor, problem: RefinementProblem, counts: np.ndarray) -> RefinementProblem:
     """The problem without prior and edge on so many copies of every episode, (unit, episode)."""
     owners = segment_owners({f"u{i}": tuple(range(EPISODES)) for i in range(3)}, OPTIONS.segments)
-    picks = [np.concatenate([np.repeat(np.flatnonzero(owners[i] == e), int(w)) for e, w in enumerate(counts[i])]) for i in range(3)]
+    picks = [
+        np.concatenate([np.repeat(np.flatnonzero(owners[i] == e), int(w)) for e, w in enumerate(counts[i])])
+        for i in range(3)
+    ]
     whole = (problem.segments.states, problem.segments.inputs, problem.segments.valid)
     chosen = Segments(*(np.stack([a[..., i, pick] for i, pick in enumerate(picks)], axis=-2) for a in whole))
     R = (np.sqrt(counts)[..., None, None] * factors.R).reshape(3, -1, factors.R.shape[-1])

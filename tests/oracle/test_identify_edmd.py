@@ -37,7 +37,10 @@ def lifted_R(episodes, phase=0.7, model=LIFTING):
 def test_equals_pykoop(alpha):
     pykoop = pytest.importorskip("pykoop")
     episodes = [simulate(seed, noise=0.01) for seed in range(4)]
-    rows = [np.column_stack([np.full(len(x), float(i)), x, np.sin(3 * x[:, :1] + 0.7), u]) for i, (x, u) in enumerate(episodes)]
+    rows = [
+        np.column_stack([np.full(len(x), float(i)), x, np.sin(3 * x[:, :1] + 0.7), u])
+        for i, (x, u) in enumerate(episodes)
+    ]
     pipeline = pykoop.KoopmanPipeline(regressor=pykoop.Edmd(alpha=alpha))
     pipeline.fit(np.vstack(rows), n_inputs=2, episode_feature=True)
     expected = pipeline.regressor_.coef_.T
@@ -82,7 +85,10 @@ def test_residual_covariance_equals_the_residuals():
     theta = LIFTING.lift(x, {"phase": np.full(len(x), 0.7)})
     residual = theta[1:] - theta[:-1] @ matrices.A[0].T - u[:-1] @ matrices.B[0].T
     np.testing.assert_allclose(
-        residual_covariance(factor.R, 3, matrices, factor.n_samples)[0], residual.T @ residual / len(residual), rtol=1e-9, atol=1e-12
+        residual_covariance(factor.R, 3, matrices, factor.n_samples)[0],
+        residual.T @ residual / len(residual),
+        rtol=1e-9,
+        atol=1e-12,
     )
 
 
@@ -93,7 +99,9 @@ def test_smallest_alpha_is_that_of_a_search_over_all_models_of_all_units(seed):
     factors = []
     for n in (2, 3):
         R = np.triu(rng.normal(size=(6, 2 * n + 1, 2 * n + 1)))
-        R[:, :n, n + 1 :] = R[:, :n, :n] @ (rng.uniform(0.9, 1.1, size=(6, 1, 1)) * np.linalg.qr(rng.normal(size=(6, n, n)))[0])
+        R[:, :n, n + 1 :] = R[:, :n, :n] @ (
+            rng.uniform(0.9, 1.1, size=(6, 1, 1)) * np.linalg.qr(rng.normal(size=(6, n, n)))[0]
+        )
         factors.append((R, n))
 
     def stable(exponent):

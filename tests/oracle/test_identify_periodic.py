@@ -9,7 +9,11 @@ from kros.data import Channel, Population, Role, from_arrays
 from kros.identify.periodic import periodic_term
 from kros.plants import DcMotorPopulation, HarmonicDrivePopulation, PendulumPopulation
 
-CHANNELS = (Channel("angle", Role.STATE, "rad", measured=True), Channel("rate", Role.STATE, "rad/s"), Channel("torque", Role.INPUT, "N m"))
+CHANNELS = (
+    Channel("angle", Role.STATE, "rad", measured=True),
+    Channel("rate", Role.STATE, "rad/s"),
+    Channel("torque", Role.INPUT, "N m"),
+)
 
 
 def gears(ratio: float, size: float, units: int = 3, noise: float = 1e-3, travel: float = 6.0) -> Population:

@@ -13,11 +13,15 @@ DT = 1e-3
 def recording(phase, lag, directions=(1, -1, 1, -1), noise=0.0, seed=0, speed=np.pi):
     """Constant-velocity stretches with rests between them; the disturbance reaches the error with a lag."""
     rng = np.random.default_rng(seed)
-    reference = np.concatenate([np.concatenate([np.zeros(200), np.full(1500, d * speed)]) for d in directions] + [np.zeros(200)])
+    reference = np.concatenate(
+        [np.concatenate([np.zeros(200), np.full(1500, d * speed)]) for d in directions] + [np.zeros(200)]
+    )
     angle = np.cumsum(reference) * DT + rng.uniform(0, 1)
     direction = np.sign(reference)
     error = 0.02 * np.sin(100 * angle + phase + direction * lag) * np.abs(direction)
-    error += 0.005 * np.sin(200 * angle + 1.0) + 0.01 * np.linspace(-1, 1, len(angle)) + noise * rng.normal(size=len(angle))
+    error += (
+        0.005 * np.sin(200 * angle + 1.0) + 0.01 * np.linspace(-1, 1, len(angle)) + noise * rng.normal(size=len(angle))
+    )
     return angle, reference, reference - error
 
 
@@ -52,7 +56,10 @@ def test_branches_are_resolved_for_the_whole_population(mean_lag):
     """Every unit must land on the same branch, also where lags straddle 90 degrees; one pi common to all is free."""
     rng = np.random.default_rng(3)
     truth = {f"{i:03d}": (rng.uniform(0, 2 * np.pi), mean_lag + rng.normal(scale=0.15)) for i in range(20)}
-    units = {u: unit_phase(find_segments(*recording(*values, seed=i), DT, SPEC), u) for i, (u, values) in enumerate(truth.items())}
+    units = {
+        u: unit_phase(find_segments(*recording(*values, seed=i), DT, SPEC), u)
+        for i, (u, values) in enumerate(truth.items())
+    }
     calibration = resolve_branches(units, list(units), SPEC)
     offsets = np.array([np.exp(1j * (calibration.units[u].phase_rad - truth[u][0])) for u in truth])
     common = np.sign(offsets[0].real)

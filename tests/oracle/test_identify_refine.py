@@ -26,7 +26,9 @@ def simulated(lifting: Lifting, n_units: int, noise: float, seed: int, spread: f
     """Population, keys, parameters, factors and the true rows of the states (unit, 2, n_lifted + 1)."""
     rng = np.random.default_rng(seed)
     phase = rng.uniform(0, 2 * np.pi, n_units)
-    W = np.concatenate([A[:, : lifting.n_lifted], B], axis=1) * (1 + spread * rng.standard_normal((n_units, 1, 1)) * [[[0], [1]]])
+    W = np.concatenate([A[:, : lifting.n_lifted], B], axis=1) * (
+        1 + spread * rng.standard_normal((n_units, 1, 1)) * [[[0], [1]]]
+    )
     data = {}
     for row in range(n_units):
         for episode in range(4):
@@ -35,13 +37,17 @@ def simulated(lifting: Lifting, n_units: int, noise: float, seed: int, spread: f
             full = np.zeros((1, lifting.n_lifted, lifting.n_lifted + 1))
             full[0, :2] = W[row]
             x = free_run(full[..., :-1], full[..., -1:], lifting, own, rng.normal(size=(1, 2)), u[None])[0]
-            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack([x + noise * rng.standard_normal(x.shape), u])
+            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack(
+                [x + noise * rng.standard_normal(x.shape), u]
+            )
     channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
     units = tuple(Unit(f"u{row}") for row in range(n_units))
     population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
     keys = {unit.id: population.keys(unit.id) for unit in units}
     parameters = {"phase": phase} if lifting.parameters else {}
-    reduced = [combine(stack([reduce_episode(data[k][:, :2], data[k][:, 2:], lifting) for k in ks])) for ks in keys.values()]
+    reduced = [
+        combine(stack([reduce_episode(data[k][:, :2], data[k][:, 2:], lifting) for k in ks])) for ks in keys.values()
+    ]
     return population, keys, parameters, lifted_factor(stack(reduced), lifting, parameters, lifting), W
 
 
@@ -92,7 +98,9 @@ def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
 
 def test_stronger_priors_bring_units_closer_together() -> None:
     population, keys, parameters, factor, _ = simulated(KOOPMAN, 3, 0.02, seed=4)
-    models = refine_population(population, keys, KOOPMAN, parameters, factor, options=replace(OPTIONS, strengths=(1e5, 1.0)))
+    models = refine_population(
+        population, keys, KOOPMAN, parameters, factor, options=replace(OPTIONS, strengths=(1e5, 1.0))
+    )
     peaks = [row.peak_db for row in models.trade_off]
     assert peaks[0] == -np.inf
     assert peaks[1] < peaks[2] - 3
@@ -103,4 +111,6 @@ def test_diverging_free_runs_name_unit_and_episode() -> None:
     population, keys, parameters, factor, _ = simulated(KOOPMAN, 2, 0.02, seed=6)
     tight = Factor(factor.R, factor.peak * 1e-3, factor.n_samples)
     with pytest.raises(IdentificationError, match=r"episode 0 of unit u0 .* reaches"):
-        refine_population(population, keys, KOOPMAN, parameters, tight, options=RefineOptions(horizons=(5, 20), segments=4, bound=1.0))
+        refine_population(
+            population, keys, KOOPMAN, parameters, tight, options=RefineOptions(horizons=(5, 20), segments=4, bound=1.0)
+        )

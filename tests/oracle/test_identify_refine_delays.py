@@ -42,7 +42,9 @@ def test_gradient_of_free_runs_with_delays_is_that_of_finite_differences(stride:
     T = np.eye(p) + 0.1 * rng.normal(size=(p, p))
     sigma, phase = np.array([0.5, 2.0]), np.array([0.3, 1.2])
     shape = (units, segments)
-    data = Segments(rng.normal(size=(length, n, *shape)), rng.normal(size=(length, 2, *shape)), np.ones((length, *shape), bool), 4)
+    data = Segments(
+        rng.normal(size=(length, n, *shape)), rng.normal(size=(length, 2, *shape)), np.ones((length, *shape), bool), 4
+    )
     data.valid[15:, 1, 2] = False
     compared = np.arange(4 + stride, length, stride)
 
@@ -83,12 +85,17 @@ def machines(n_units: int, noise: float, seed: int, spread: float = 0.02) -> tup
             x[:4] = 0.3 * rng.normal(size=(4, 2))
             for k in range(3, 599):
                 x[k + 1] = W[row] @ [*x[k], np.sin(2 * x[k - 3, 0]), u[k - 1, 0], u[k, 0], x[k, 1] * u[k, 0]]
-            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack([x + noise * rng.standard_normal(x.shape), u])
+            data[EpisodeKey(f"u{row}", "default", str(episode))] = np.hstack(
+                [x + noise * rng.standard_normal(x.shape), u]
+            )
     channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
     units = tuple(Unit(f"u{row}") for row in range(n_units))
     population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
     keys = {unit.id: population.keys(unit.id) for unit in units}
-    reduced = [combine(Factor.stack([reduce_episode(data[k][:, :2], data[k][:, 2:], BILINEAR) for k in ks])) for ks in keys.values()]
+    reduced = [
+        combine(Factor.stack([reduce_episode(data[k][:, :2], data[k][:, 2:], BILINEAR) for k in ks]))
+        for ks in keys.values()
+    ]
     return population, keys, lifted_factor(Factor.stack(reduced), BILINEAR, {}, BILINEAR), W
 
 
@@ -110,7 +117,9 @@ def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
     shift = np.concatenate([models.units.A, models.units.B], axis=-1)[:, 3]
-    np.testing.assert_allclose(shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6)  # u[-1] of the next sample is u
+    np.testing.assert_allclose(
+        shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6
+    )  # u[-1] of the next sample is u
     x = population.read(keys["u0"][0])
     run = free_run(models.units.A[:1], models.units.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
     np.testing.assert_allclose(run, x[:, :2], atol=1e-5)
@@ -119,10 +128,14 @@ def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
 def test_normal_equations_by_episode_add_up_with_delays() -> None:
     population, keys, factor, _ = machines(2, 0.05, seed=8)
     models = refine_population(population, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,)))
-    by_episode = episode_normals(models, population, keys, BILINEAR, {}, episode_factors(population, keys, BILINEAR), OPTIONS)
+    by_episode = episode_normals(
+        models, population, keys, BILINEAR, {}, episode_factors(population, keys, BILINEAR), OPTIONS
+    )
     segments = read_segments(population, keys, 80, OPTIONS.segments, 0, BILINEAR.history)
     W = np.concatenate([models.units.A, models.units.B], axis=-1)
     V = np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
     whole = normal_equations(V[:, :2], models.whitening, BILINEAR, {}, segments, models.sigma)
     place = np.r_[0:12]
-    np.testing.assert_allclose(by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9
+    )

@@ -10,7 +10,16 @@ import pytest
 from kros.core.errors import IdentificationError
 from kros.data.checks import check_episode, is_constant
 from kros.data.scaled import scale_population
-from kros.identify import Factor, PhaseSpec, combine, edmd, find_segments, lifted_factor, reduce_episode, smallest_stabilising_alpha
+from kros.identify import (
+    Factor,
+    PhaseSpec,
+    combine,
+    edmd,
+    find_segments,
+    lifted_factor,
+    reduce_episode,
+    smallest_stabilising_alpha,
+)
 from kros.identify.excitation import require_excitation
 from kros.identify.ranges import Ranges
 from kros.identify.refine import RefineOptions, refine_population
@@ -20,7 +29,9 @@ from kros.plants import DcMotorPopulation, HarmonicDrivePopulation
 CHANNELS = ("position", "velocity", "current", "voltage")
 SCALINGS = [{name: factor} for name in CHANNELS for factor in (1e-9, 1e9)]
 SCALINGS.append({"position": 1e9, "velocity": 1e-9, "current": 1e-9, "voltage": 1e9})
-QUICK = RefineOptions(horizons=(5, 60), starts=((5, 0.65),), strengths=(10.0, 1.0), iterations=6, path_iterations=3, segments=4)
+QUICK = RefineOptions(
+    horizons=(5, 60), starts=((5, 0.65),), strengths=(10.0, 1.0), iterations=6, path_iterations=3, segments=4
+)
 
 
 @dataclass(frozen=True)
@@ -60,7 +71,10 @@ def lifting_of(factors):
 
 
 def factor_of(population, lifting):
-    whole = [Factor.stack([reduce_episode(*population.read_parts(k), lifting) for k in population.keys(u)]) for u in population.unit_ids]
+    whole = [
+        Factor.stack([reduce_episode(*population.read_parts(k), lifting) for k in population.keys(u)])
+        for u in population.unit_ids
+    ]
     return lifted_factor(Factor.stack([combine(f) for f in whole]), lifting, {}, lifting)
 
 
@@ -127,12 +141,16 @@ def test_phases_and_lags_are_those_of_the_machine(factors):
     spec = PhaseSpec()
     one = find_segments(*columns, population.sample_period_s, spec)
     scaled = find_segments(
-        *(c * f for c, f in zip(columns, factors, strict=True)), population.sample_period_s, replace(spec, ratio=spec.ratio / factors[0])
+        *(c * f for c, f in zip(columns, factors, strict=True)),
+        population.sample_period_s,
+        replace(spec, ratio=spec.ratio / factors[0]),
     )
     assert len(scaled) == len(one) > 1
     np.testing.assert_allclose([s.phase for s in scaled], [s.phase for s in one], rtol=1e-6)
     np.testing.assert_allclose([s.speed / factors[0] for s in scaled], [s.speed for s in one], rtol=1e-9)
-    assert abs(one[0].speed) == pytest.approx(np.abs(columns[1]).max(), rel=0.01)  # where units match it is the reference's
+    assert abs(one[0].speed) == pytest.approx(
+        np.abs(columns[1]).max(), rel=0.01
+    )  # where units match it is the reference's
 
 
 def test_a_constant_is_a_constant_in_any_unit():

@@ -18,7 +18,9 @@ def motors(count: int, seed: int = 0) -> list:
     """Continuous position and velocity of second-order motors from torque, parameters spread by ten percent."""
     rng = np.random.default_rng(seed)
     spread = np.exp(0.1 * rng.normal(size=(count, 3)))
-    return [control.ss([[0, 1], [-4 * k[0], -1.5 * k[1]]], [[0], [3 * k[2]]], np.eye(2), np.zeros((2, 1))) for k in spread]
+    return [
+        control.ss([[0, 1], [-4 * k[0], -1.5 * k[1]]], [[0], [3 * k[2]]], np.eye(2), np.zeros((2, 1))) for k in spread
+    ]
 
 
 def response(system, freqs: np.ndarray) -> np.ndarray:
@@ -32,7 +34,9 @@ def largest_ratio(found, models: list, define, freqs: np.ndarray) -> float:
     worst = 0.0
     for model in models:
         E = define(g, response(model, freqs))
-        worst = max(worst, float(np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2, axis=(-2, -1)).max()))
+        worst = max(
+            worst, float(np.linalg.norm(np.linalg.solve(left, E) @ np.linalg.inv(right), 2, axis=(-2, -1)).max())
+        )
     return worst
 
 
@@ -99,7 +103,9 @@ def test_bilinear_axis_maps_responses_exactly() -> None:
     )
     np.testing.assert_allclose(axis.continuous_hz(axis.discrete_hz(freqs)), freqs, rtol=1e-9)
     known = axis.continuous(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.3))
-    np.testing.assert_allclose(known.A, [[2 / 0.3 * (0.5 - 1) / (0.5 + 1)]])  # s = (2 / T) (z - 1) / (z + 1) at the pole
+    np.testing.assert_allclose(
+        known.A, [[2 / 0.3 * (0.5 - 1) / (0.5 + 1)]]
+    )  # s = (2 / T) (z - 1) / (z + 1) at the pole
     assert axis.continuous_hz(0.5 / 0.3) == 1e6
 
 

@@ -18,7 +18,9 @@ def test_energy_is_what_enters_less_what_leaves(loaded):
     """Kinematic error, hysteresis, gravity and friction included; what the integrator leaves out shrinks with its step."""
     missing = []
     for finer in (1, 4):
-        physics = drive.Physics(parameters(error_1=2e-3), np.full(N, loaded), np.array([0.3, 1.0, -2.0]), drive.PERIOD_S / 5 / finer)
+        physics = drive.Physics(
+            parameters(error_1=2e-3), np.full(N, loaded), np.array([0.3, 1.0, -2.0]), drive.PERIOD_S / 5 / finer
+        )
         start, balance, turned = physics.energy(), 0.0, 0.0
         for k in range(4000 * finer):
             powers = physics.advance(np.full(N, 0.6 * np.sign(np.sin(8 * k * physics.step_s + 0.5))))
@@ -50,7 +52,16 @@ def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
     for row in range(N):
         Jm, Jl, k, c, b, Kt, R, L = (
             float(p[n][row])
-            for n in ("motor_inertia", "link_inertia", "stiffness", "damping", "viscous", "torque_constant", "resistance", "inductance")
+            for n in (
+                "motor_inertia",
+                "link_inertia",
+                "stiffness",
+                "damping",
+                "viscous",
+                "torque_constant",
+                "resistance",
+                "inductance",
+            )
         )
         A = np.zeros((5, 5))  # q, w, q_l, w_l, i
         A[0, 1] = A[2, 3] = 1
@@ -58,7 +69,10 @@ def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
         A[3] = np.array([k, c, -k, -c, 0]) / Jl
         A[4] = np.array([0, -Kt / drive.SUPPLY_W, 0, 0, -R]) / L
         _, y, _ = lsim(
-            StateSpace(A, np.array([[0], [0], [0], [0], [1 / L]]), np.eye(5)[[0, 1, 3, 4]], np.zeros((4, 1))), voltage, time, interp=False
+            StateSpace(A, np.array([[0], [0], [0], [0], [1 / L]]), np.eye(5)[[0, 1, 3, 4]], np.zeros((4, 1))),
+            voltage,
+            time,
+            interp=False,
         )
         difference = np.array(found)[..., row] - y
         assert np.all(np.abs(difference).max(axis=0) < 5e-3 * np.abs(y).max(axis=0))
@@ -66,8 +80,15 @@ def test_without_friction_error_and_gravity_it_is_a_linear_two_mass_system():
 
 def test_a_population_is_one_for_a_study():
     population, _ = drive.simulate(n_units=2, n_episodes=2, seconds=3.0, seed=3)
-    assert (population.states, population.inputs) == (("position", "velocity", "current"), ("target_position", "target_velocity"))
-    assert (population.measured, population.true_states, population.conditions) == (("position",), (1,), ("load", "noload"))
+    assert (population.states, population.inputs) == (
+        ("position", "velocity", "current"),
+        ("target_position", "target_velocity"),
+    )
+    assert (population.measured, population.true_states, population.conditions) == (
+        ("position",),
+        (1,),
+        ("load", "noload"),
+    )
     states, inputs = population.read_parts(population.episodes[0])
     true = population.read_with_truths(population.episodes[0])[1][:, 0]
     travelled = np.concatenate([[0.0], np.cumsum(true[1:] + true[:-1])]) * drive.PERIOD_S / 2

@@ -113,7 +113,9 @@ def test_learned_estimator_is_ridge_regression_from_the_first_sample_on():
         z = np.concatenate([states[:, i, [1]] - features.static[0, 0], u[:, i]], axis=1)
         for k in range(length):
             past = [z[max(k - 1 - j, 0)] for j in range(taps)]
-            rows.append([1.0, *(v[c] if j == 0 else v[c] - past[j - 1][c] for c in range(2) for j, v in enumerate(past))])
+            rows.append(
+                [1.0, *(v[c] if j == 0 else v[c] - past[j - 1][c] for c in range(2) for j, v in enumerate(past))]
+            )
             truths.append(states[k, i, [0, 2]])
             weights.append([1.0, 1.0, 2.0][i] / length / np.abs(states[:length, i][:, [0, 2]]).max(axis=0) ** 2)
     rows, truths, weights = np.array(rows), np.array(truths), np.array(weights) / 4
@@ -122,7 +124,9 @@ def test_learned_estimator_is_ridge_regression_from_the_first_sample_on():
     for column, state in enumerate((0, 2)):
         half = np.sqrt(weights[:, [column]])
         penalty = np.diag(np.sqrt(ridge * np.sum((half * rows) ** 2, axis=0)) * [0, *[1] * (2 * taps)])
-        wanted = np.linalg.lstsq(np.vstack([half * rows, penalty]), np.append(half[:, 0] * truths[:, column], np.zeros(1 + 2 * taps)))[0]
+        wanted = np.linalg.lstsq(
+            np.vstack([half * rows, penalty]), np.append(half[:, 0] * truths[:, column], np.zeros(1 + 2 * taps))
+        )[0]
         np.testing.assert_allclose(found[: lengths[0], 0, state], (rows @ wanted)[: lengths[0]], rtol=1e-7, atol=1e-9)
 
 
@@ -134,9 +138,13 @@ def test_learned_estimator_chooses_what_does_best_on_units_left_out():
     percent = {}
     for choice in (chosen, *(Choice(taps, ridge) for taps in (2, 5, 12) for ridge in (1e-8, 1e-3, 0.1))):
         folds = [[str(i) for i in range(fold, 5, 4)] for fold in range(4)]
-        runs = {unit: moments.estimator(fold, [choice]).run(states[..., :1], u, phases) for fold in folds for unit in fold}
+        runs = {
+            unit: moments.estimator(fold, [choice]).run(states[..., :1], u, phases) for fold in folds for unit in fold
+        }
         errors = [runs[unit][:, int(unit), 1] - states[:, int(unit), 1] for unit in batch.units]
-        percent[choice] = np.mean([np.sqrt(np.mean(e**2)) / np.abs(states[:, i, 1]).max() for i, e in enumerate(errors)])
+        percent[choice] = np.mean(
+            [np.sqrt(np.mean(e**2)) / np.abs(states[:, i, 1]).max() for i, e in enumerate(errors)]
+        )
     assert percent[chosen] == min(percent.values())
 
 

@@ -70,7 +70,9 @@ def random_observer(
 def test_a_scalar_error_shrinks_by_hand(a: float, b: float) -> None:
     found = relift_certificate(scalar(a, b))
     assert found.certified
-    assert found.gain == pytest.approx(1 / (1 - abs(a) - abs(b)), rel=5e-3)  # a constant residual, slopes at the corner of the sign of a
+    assert found.gain == pytest.approx(
+        1 / (1 - abs(a) - abs(b)), rel=5e-3
+    )  # a constant residual, slopes at the corner of the sign of a
     # Alone from rest, |r+| <= (|a| + |b|) |r| + |b| |q|.
     assert found.mismatch_gain == pytest.approx(abs(b) / (1 - abs(a) - abs(b)), rel=5e-3)
 
@@ -82,11 +84,16 @@ def test_slopes_closed_around_the_error_system_give_its_corners(mismatch: bool) 
     system = system.mismatch() if mismatch else system
     d, width, multipliers = np.array([0.3, -0.8]), 2, np.array([4.0, 0.09])
     (A, B), C, D = system.multiplied(multipliers, 1.0)
-    by_hand = A + B[:, :width] @ (d[:, None] * C[:width]), B[:, width:] + B[:, :width] @ (d[:, None] * D[:width, width:])
+    by_hand = (
+        A + B[:, :width] @ (d[:, None] * C[:width]),
+        B[:, width:] + B[:, :width] @ (d[:, None] * D[:width, width:]),
+    )
     for found, expected in zip(system.corner(d), by_hand, strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
     assert np.any(system.corner(d)[1] != system.B) == mismatch
-    louder = system.multiplied(multipliers, 3.0)[0][1]  # the gain that is asked for scales what enters by the slopes alone
+    louder = system.multiplied(multipliers, 3.0)[0][
+        1
+    ]  # the gain that is asked for scales what enters by the slopes alone
     np.testing.assert_allclose(louder, np.hstack([3.0 * B[:, :width], B[:, width:]]))
 
 
@@ -107,7 +114,9 @@ def test_a_scalar_error_that_may_grow_is_said_to(a: float, b: float) -> None:
 
 
 def test_correction_certifies_what_is_unstable_without() -> None:
-    assert relift_certificate(scalar(1.02, 0.1, correction=0.6)).gain == pytest.approx(np.hypot(1, 0.6) / (1 - 0.42 - 0.1), rel=5e-3)
+    assert relift_certificate(scalar(1.02, 0.1, correction=0.6)).gain == pytest.approx(
+        np.hypot(1, 0.6) / (1 - 0.42 - 0.1), rel=5e-3
+    )
 
 
 @pytest.mark.parametrize("injection", list(Injection)[:2])
@@ -167,7 +176,9 @@ def test_brute_force_over_all_slope_sequences_stays_below_the_gain() -> None:
 
 
 @pytest.mark.parametrize("injection", list(Injection)[:2])
-@pytest.mark.parametrize("functions", [("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)])
+@pytest.mark.parametrize(
+    "functions", [("a[-1]",), ("b[-2]", "a[-1]"), ("sin(2*a)",), ("sin(a + b)", "u[-1]*1"), ("cos(b[-1])",)]
+)
 def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...], injection: Injection) -> None:
     """Linear functions of earlier states leave nothing to bound: the frozen response is the error, to rounding. Others stay within the bound."""
     rng = np.random.default_rng(7)
@@ -178,7 +189,9 @@ def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...],
     rows = relift_report(found, observer, batch_of(states, inputs, 0.01))
     assert all(row.holds for row in rows)
     estimates = run_observer(observer, states[..., :1], inputs)
-    assert [row.error for row in rows] == pytest.approx(np.sqrt(np.mean(np.sum((states - estimates) ** 2, axis=2), axis=0)), rel=1e-12)
+    assert [row.error for row in rows] == pytest.approx(
+        np.sqrt(np.mean(np.sum((states - estimates) ** 2, axis=2), axis=0)), rel=1e-12
+    )
     if not found.channels:
         assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
     else:
@@ -188,7 +201,15 @@ def test_the_error_system_is_the_observer_as_it_runs(functions: tuple[str, ...],
 def test_a_product_of_state_and_input_is_covered_inside_its_box() -> None:
     lifting = Lifting(("x",), (), (), ("u",), ("u*x",))
     observer = Observer(
-        "bilinear", lifting, np.array([[0.5]]), np.array([[1.0, 0.3]]), (0,), ("u",), gain([[0.0]], 1.0), Injection.STATE, 1.0
+        "bilinear",
+        lifting,
+        np.array([[0.5]]),
+        np.array([[1.0, 0.3]]),
+        (0,),
+        ("u",),
+        gain([[0.0]], 1.0),
+        Injection.STATE,
+        1.0,
     )
     free = relift_certificate(observer)
     assert free.status is ReliftStatus.UNBOUNDED
@@ -213,7 +234,9 @@ def test_an_adversary_comes_close_and_never_exceeds(seed: int) -> None:
     observer = random_observer(rng, ("sin(a)", "sin(b + c)")[: 1 + seed % 2], order=seed)
     found = relift_certificate(observer, scales=ReliftScales(np.ones(3), np.array([0.1, 1.0, 2.0]), np.array([0.5])))
     worst = attack(found, observer, steps=20000, seed=seed)
-    assert (0.2 if seed % 2 else 0.75) * found.gain < worst.gain <= found.gain  # two slopes: the multipliers lose against the corners
+    assert (
+        (0.2 if seed % 2 else 0.75) * found.gain < worst.gain <= found.gain
+    )  # two slopes: the multipliers lose against the corners
     assert worst.share <= 1
     inputs = rng.standard_normal((len(worst.disturbance) + 1, 6, 1))
     share, _ = attack_running(found, observer, worst.disturbance, rng.standard_normal((6, 3)), inputs, seed=seed)
@@ -228,7 +251,12 @@ def test_the_adversary_refutes_a_gain_that_is_too_small() -> None:
     assert attack(wrong, observer, steps=5000).share > 1
     assert (
         attack_running(
-            wrong, observer, np.full((200, 2), [1.0, 0.0]), np.full((40, 1), 0.0), np.zeros((201, 40, 1)), amplitudes=(1e-4, 1e-2)
+            wrong,
+            observer,
+            np.full((200, 2), [1.0, 0.0]),
+            np.full((40, 1), 0.0),
+            np.zeros((201, 40, 1)),
+            amplitudes=(1e-4, 1e-2),
         )[0]
         > 1
     )
@@ -249,7 +277,9 @@ def test_definiteness_of_large_integers_is_that_of_their_determinant(share: floa
     sizes = [1 << 400, 1 << 201, 3]
     off = int(share * (1 << 60)) * math.isqrt(sizes[0] * sizes[1]) >> 60
     F = np.array([[sizes[0], off, 0], [off, sizes[1], 1], [0, 1, sizes[2]]], dtype=object)
-    assert (sizes[0] * sizes[1] > off**2) == (positive or share == 1)  # the root is rounded down, by less than can be told
+    assert (sizes[0] * sizes[1] > off**2) == (
+        positive or share == 1
+    )  # the root is rounded down, by less than can be told
     assert _positive(F) == positive
 
 
@@ -305,7 +335,9 @@ def test_a_certificate_survives_saving(tmp_path) -> None:  # type: ignore[no-unt
     for name in ReliftCertificate.__dataclass_fields__:
         if name not in ("scales", "box"):
             np.testing.assert_array_equal(getattr(loaded, name), getattr(found, name))
-    assert proven(loaded.roots[0], loaded.system(scalar(0.5, 0.2)).corners(), loaded.system(scalar(0.5, 0.2)).C, loaded.gain)
+    assert proven(
+        loaded.roots[0], loaded.system(scalar(0.5, 0.2)).corners(), loaded.system(scalar(0.5, 0.2)).C, loaded.gain
+    )
 
 
 @pytest.mark.parametrize(("seed", "size"), [(0, 0.1), (1, 0.005), (2, 0.01), (3, 2.0)])
@@ -321,7 +353,9 @@ def test_multipliers_are_nearly_the_best_of_a_direct_search(seed: int, size: flo
         F = np.diag(np.concatenate([np.exp(log), np.zeros(2)])) - np.conj(np.swapaxes(H, 1, 2)) @ (t[:, None] * H)
         if np.linalg.eigvalsh(F[:, :width, :width])[:, 0].min() <= 0:
             return 1e30
-        schur = F[:, width:, width:] - F[:, width:, :width] @ np.linalg.solve(F[:, :width, :width], F[:, :width, width:])
+        schur = F[:, width:, width:] - F[:, width:, :width] @ np.linalg.solve(
+            F[:, :width, :width], F[:, :width, width:]
+        )
         return -float(np.linalg.eigvalsh(schur)[:, 0].min())
 
     starts = [np.array([a, a + b]) for a in np.linspace(-10, 14, 25) for b in np.linspace(-12, 12, 25)]

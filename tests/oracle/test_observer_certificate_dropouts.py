@@ -18,7 +18,17 @@ NO_NOISE = ReliftScales(np.ones(1), np.ones(1), np.zeros(1))
 
 
 def scalar(a: float, correction: float) -> Observer:
-    return Observer("s", Lifting(("x",)), np.array([[a]]), np.ones((1, 1)), (0,), ("u",), gain([[correction]], 1.0), Injection.STATE, 1.0)
+    return Observer(
+        "s",
+        Lifting(("x",)),
+        np.array([[a]]),
+        np.ones((1, 1)),
+        (0,),
+        ("u",),
+        gain([[correction]], 1.0),
+        Injection.STATE,
+        1.0,
+    )
 
 
 @pytest.mark.parametrize(("a", "correction"), [(1.05, 0.6), (1.2, 1.0), (1.4, 1.1)])

@@ -20,12 +20,17 @@ from kros.synthesis import Injection
 DT = 0.01
 
 
-def observer(functions: tuple[str, ...] = (), order: int = 2, injection: Injection = Injection.STATE, **runtime: object) -> Observer:
+def observer(
+    functions: tuple[str, ...] = (), order: int = 2, injection: Injection = Injection.STATE, **runtime: object
+) -> Observer:
     """Three states, stable without correction too, so that a certificate exists whatever limits do."""
     rng = np.random.default_rng(11)
     lifting, n, p = Lifting(("a", "b", "c"), functions, inputs=("u",)), 3, len(functions)
     A = np.vstack(
-        [np.hstack([0.85 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.03 * rng.standard_normal((n, p))]), np.zeros((p, n + p))]
+        [
+            np.hstack([0.85 * np.linalg.qr(rng.standard_normal((n, n)))[0], 0.03 * rng.standard_normal((n, p))]),
+            np.zeros((p, n + p)),
+        ]
     )
     width = 1 if injection is Injection.INPUT else n + p
     C, D = 0.05 * rng.standard_normal((width, order)), 0.1 * rng.standard_normal((width, 1))
@@ -47,7 +52,9 @@ def late(states: np.ndarray, delay: int) -> np.ndarray:
 
 @pytest.mark.parametrize("functions", [(), ("b[-2]", "a[-1]")])
 @pytest.mark.parametrize("delay", [1, 4])
-def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(delay: int, functions: tuple[str, ...]) -> None:
+def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(
+    delay: int, functions: tuple[str, ...]
+) -> None:
     """Start, chain of predictions and correction filter: the equations are the code, to rounding."""
     late_one = observer(functions, delay=delay, upper=np.array([np.inf, 9.0, np.inf]) if delay == 1 else None)
     found = relift_certificate(late_one, mismatch=False)
@@ -89,7 +96,9 @@ def test_limits_that_bind_wholly_or_not_at_all_are_corners(injection: Injection)
     kept = error_system(replace(free, runtime=Runtime(lower=np.full(3, -1.0), upper=np.full(3, 1.0))))
     A, B = kept.corner(np.ones(3))
     np.testing.assert_allclose(A, error_system(free).A, atol=1e-12)
-    gone = kept.corner(-np.ones(3))[0]  # clipped to the true states: the error of the estimate is gone, the filter's state acts
+    gone = kept.corner(-np.ones(3))[
+        0
+    ]  # clipped to the true states: the error of the estimate is gone, the filter's state acts
     np.testing.assert_allclose(gone[:, :3], 0.0, atol=1e-12)
     np.testing.assert_allclose(gone[:, 3:], error_system(free).A[:, 3:], atol=1e-12)
 
@@ -123,7 +132,12 @@ RUNTIMES = {
     "delay": {"delay": 3},
     "limits": {"lower": np.full(3, -0.35), "upper": np.full(3, 0.35)},
     "correction": {"correction": np.full(5, 2e-3)},
-    "all": {"delay": 1, "upper": np.array([0.35, np.inf, np.inf]), "correction": np.full(4, 5e-3), "input_upper": np.array([0.5])},
+    "all": {
+        "delay": 1,
+        "upper": np.array([0.35, np.inf, np.inf]),
+        "correction": np.full(4, 5e-3),
+        "input_upper": np.array([0.5]),
+    },
 }
 
 
@@ -146,7 +160,12 @@ def test_bounds_hold_for_the_observer_as_it_runs(what: str) -> None:
     for disturbance in (worst.disturbance, rng.standard_normal((400, 4))):
         start = 0.2 * rng.uniform(-1, 1, (40, 3))
         share, steps = attack_running(
-            found, o, disturbance, start, 0.1 * rng.standard_normal((len(disturbance) + 1, 40, 1)), amplitudes=(1e-3, 10.0)
+            found,
+            o,
+            disturbance,
+            start,
+            0.1 * rng.standard_normal((len(disturbance) + 1, 40, 1)),
+            amplitudes=(1e-3, 10.0),
         )
         assert 0.05 < share <= 1
         assert steps > 500

@@ -64,7 +64,13 @@ def test_majorants_are_above_the_response_at_every_frequency(seed: int) -> None:
     M = majorants(system, edges, weight)
     poles = np.abs(np.angle(np.linalg.eigvals(system.A)))
     theta = np.unique(
-        np.concatenate([np.linspace(0, np.pi, 8000), edges, *[np.clip(p + np.linspace(-0.02, 0.02, 2000), 0, np.pi) for p in poles]])
+        np.concatenate(
+            [
+                np.linspace(0, np.pi, 8000),
+                edges,
+                *[np.clip(p + np.linspace(-0.02, 0.02, 2000), 0, np.pi) for p in poles],
+            ]
+        )
     )
     T = system.frequency_response(theta / (2 * np.pi * DT))
     for b in range(len(edges) - 1):
@@ -72,7 +78,10 @@ def test_majorants_are_above_the_response_at_every_frequency(seed: int) -> None:
         size = np.sqrt(np.diagonal(M[:, b], axis1=1, axis2=2).real)
         for j in range(2):
             height = np.einsum(
-                "ki,ij,kj->k", rows[:, j] / size[j], np.linalg.inv(M[j, b] / np.outer(size[j], size[j])), (rows[:, j] / size[j]).conj()
+                "ki,ij,kj->k",
+                rows[:, j] / size[j],
+                np.linalg.inv(M[j, b] / np.outer(size[j], size[j])),
+                (rows[:, j] / size[j]).conj(),
             ).real
             assert 0.5 < height.max() <= 1 + 1e-6  # on the edge: nothing more could be taken away at once
 
@@ -88,7 +97,10 @@ def observer(functions: tuple[str, ...] = (), **runtime: object) -> Observer:
     rng, p = np.random.default_rng(3), len(functions)
     lifting = Lifting(("a", "b", "c"), functions, inputs=("u",))
     A = np.vstack(
-        [np.hstack([0.7 * np.linalg.qr(rng.standard_normal((3, 3)))[0], 0.02 * rng.standard_normal((3, p))]), np.zeros((p, 3 + p))]
+        [
+            np.hstack([0.7 * np.linalg.qr(rng.standard_normal((3, 3)))[0], 0.02 * rng.standard_normal((3, p))]),
+            np.zeros((p, 3 + p)),
+        ]
     )
     D = np.vstack([0.1 * rng.standard_normal((3, 1)), np.zeros((p, 1))])
     B = np.vstack([rng.standard_normal((3, 1)), np.zeros((p, 1))])
@@ -184,7 +196,9 @@ def test_recordings_may_be_beyond_limits_by_their_noise(relift: bool) -> None:
 def test_what_leaves_the_assumptions_has_no_bound() -> None:
     x, u = recordings()
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
-    refuses = replace(observer(), seen=Seen(np.array([float(np.sort(np.abs(x[..., 0]).max(axis=0))[-2]) / 1.5]), np.array([9.0])))
+    refuses = replace(
+        observer(), seen=Seen(np.array([float(np.sort(np.abs(x[..., 0]).max(axis=0))[-2]) / 1.5]), np.array([9.0]))
+    )
     found = signal_bound(relift_certificate(refuses), refuses, batch)
     assert len(found.outside) == 1
     assert found.facts((0,))["set_outside"] == list(found.outside)
@@ -202,13 +216,17 @@ def test_what_leaves_the_assumptions_has_no_bound() -> None:
 @pytest.mark.parametrize("gap", [0.5, 1e-9])
 def test_a_search_over_arcs_ends_at_its_cap(gap, monkeypatch):
     """Sharp resonances need more arcs than there may be: there is no majorant, where a wider one is enclosed."""
-    A = block_diag(*((1 - gap) * np.array([[np.cos(w), np.sin(w)], [-np.sin(w), np.cos(w)]]) for w in (0.3, 1.0, 1.7, 2.4)))
+    A = block_diag(
+        *((1 - gap) * np.array([[np.cos(w), np.sin(w)], [-np.sin(w), np.cos(w)]]) for w in (0.3, 1.0, 1.7, 2.4))
+    )
     system = StateSpace(A, np.ones((8, 1)), np.eye(8)[:1], np.zeros((1, 1)), 1.0)
     tried = []
     segments = majorants_of.Enclosure.segments
     monkeypatch.setattr(majorants_of, "_MOST_ARCS", 100)
     monkeypatch.setattr(majorants_of, "_ARCS", 50)
-    monkeypatch.setattr(majorants_of.Enclosure, "segments", lambda self, *arcs: tried.append(len(arcs[0])) or segments(self, *arcs))
+    monkeypatch.setattr(
+        majorants_of.Enclosure, "segments", lambda self, *arcs: tried.append(len(arcs[0])) or segments(self, *arcs)
+    )
     found = majorants_of.majorants(system, np.linspace(0, np.pi, 5), np.ones((4, 1, 1)))
     assert (found is None) == (gap < 1e-6), tried
     assert sum(tried) <= 100, tried

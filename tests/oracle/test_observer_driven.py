@@ -73,7 +73,9 @@ def test_without_lifted_functions_the_bound_is_the_error():
     observer, x, u, _ = remembering(functions=())
     own = driven_coordinates(observer, batch_of(x, u, DT), SIZES)
     other, v, _ = machine(seed=2, gain=0.5, cubic=0.05)
-    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3))
+    certificate = relift_certificate(
+        own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3)
+    )
     rows = relift_report(certificate, own, batch_of(other, v, DT))
     for row in rows:
         assert row.frozen == pytest.approx(row.error, rel=1e-8)
@@ -96,10 +98,14 @@ def test_no_error_exceeds_its_bound_on_machines_of_any_kind(made, unlike):
 
 def test_nobody_exceeds_the_gain_and_it_is_nearly_attained(made):
     own, rng = settled(made), np.random.default_rng(0)
-    certificate = relift_certificate(own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3))
+    certificate = relift_certificate(
+        own, scales=ReliftScales(np.array(SIZES), np.array([1e-3, 1e-2]), np.array([1e-4])).with_internal(3)
+    )
     found = attack(certificate, own)
     assert 0.5 < found.share <= 1
     inputs = rng.normal(size=(len(found.disturbance) + 1, 4, 1))
-    share, steps = attack_running(certificate, own, found.disturbance, rng.normal(size=(4, 5)), inputs, {"phase": rng.uniform(-3, 3, 4)})
+    share, steps = attack_running(
+        certificate, own, found.disturbance, rng.normal(size=(4, 5)), inputs, {"phase": rng.uniform(-3, 3, 4)}
+    )
     assert steps > 0
     assert share <= 1

@@ -51,7 +51,9 @@ def observer(kind="lifted", seen=SEEN, runtime=None):
         C[:n] = [[0.01, 0.0], [0.02, -0.01]]
         K = StateSpace(np.diag([0.99, 0.9]), np.array([[0.1], [1.0]]), C, D, DT)
     parameters = {"phase": 0.3} if lifting is DRIVE else {}
-    return Observer(kind, lifting, A, B, (0,), ("a", "b"), K, Injection.STATE, DT, parameters, runtime or Runtime(), seen)
+    return Observer(
+        kind, lifting, A, B, (0,), ("a", "b"), K, Injection.STATE, DT, parameters, runtime or Runtime(), seen
+    )
 
 
 @cache
@@ -138,7 +140,9 @@ def require_forgotten(found):
 def test_a_fault_is_forgotten(kind):
     """Within one percent of the estimate's RMS after 2000 good samples; the slowest time constant is a fifth of that at most."""
     o = observer(kind)
-    slowest = np.abs(np.linalg.eigvals(error_system(o, box={"a": (-1, 1), "position": (-2, 2), "velocity": (-2, 2)}).A)).max()
+    slowest = np.abs(
+        np.linalg.eigvals(error_system(o, box={"a": (-1, 1), "position": (-2, 2), "velocity": (-2, 2)}).A)
+    ).max()
     assert -1 / np.log(slowest) < 400
     require_forgotten(run_observer(o, *together()))
 
@@ -154,7 +158,9 @@ def test_the_phase_locked_loop_forgets_too():
 @pytest.mark.parametrize("kind", ["lifted", "delays"])
 @pytest.mark.parametrize("delay", [0, 3])
 def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
-    limits = Runtime(delay, lower=np.array([-0.7, -np.inf]), upper=np.array([0.7, 5.0]), input_upper=np.array([0.9, np.inf]))
+    limits = Runtime(
+        delay, lower=np.array([-0.7, -np.inf]), upper=np.array([0.7, 5.0]), input_upper=np.array([0.9, np.inf])
+    )
     y, u, bad_y, bad_u = (x[AT - 40 : AT + 40] if not fault.startswith("the first") else x[:40] for x in spoiled(fault))
     for o in (observer(kind, runtime=limits), observer(kind, runtime=Runtime(delay))):
         found, status = single(o, bad_y, bad_u)
@@ -184,7 +190,10 @@ def test_every_kind_of_fault_has_its_bit():
         assert running.status == expected
         running.step(*good)
         assert running.status == SampleStatus.GOOD
-    assert [b.value for b in (SampleStatus.MISSING, SampleStatus.INVALID_INPUT, SampleStatus.LIMIT, SampleStatus.UNCERTIFIED)] == [
+    assert [
+        b.value
+        for b in (SampleStatus.MISSING, SampleStatus.INVALID_INPUT, SampleStatus.LIMIT, SampleStatus.UNCERTIFIED)
+    ] == [
         1,
         2,
         4,
@@ -205,18 +214,24 @@ def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, missing, u))
     assert np.flatnonzero(sample_status(o, y, u)).tolist() == [20]
     assert not sample_status(replace(o, seen=None), 1e6 * y, u).any()
-    zero = replace(o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0])))  # nothing is known of an input that never was anything but zero
+    zero = replace(
+        o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0]))
+    )  # nothing is known of an input that never was anything but zero
     assert not sample_status(zero, np.clip(y, -1, 1), u).any()
 
 
 def test_a_declared_limit_takes_the_place_of_the_range():
     o = observer(
-        runtime=Runtime(lower=np.array([-3.0, -9.0]), upper=np.array([2.0, 9.0]), input_lower=[-0.5, -0.5], input_upper=[0.5, 0.5])
+        runtime=Runtime(
+            lower=np.array([-3.0, -9.0]), upper=np.array([2.0, 9.0]), input_lower=[-0.5, -0.5], input_upper=[0.5, 0.5]
+        )
     )
     y, u = recordings(50)
     y[10:12], u[20] = 2.5, [1e9, -0.7]
     clipped = replace(o, runtime=replace(o.runtime, input_lower=None, input_upper=None))
-    np.testing.assert_array_equal(run_observer(o, y, u), run_observer(clipped, np.clip(y, -3, 2), np.clip(u, -0.5, 0.5)))
+    np.testing.assert_array_equal(
+        run_observer(o, y, u), run_observer(clipped, np.clip(y, -3, 2), np.clip(u, -0.5, 0.5))
+    )
     status = sample_status(o, y, np.clip(u, -0.5, 0.5))
     assert np.flatnonzero(status == SampleStatus.LIMIT).tolist() == [10, 11]
     y[10:12] = 4.6  # beyond 1.5 times the declared range
@@ -337,7 +352,10 @@ def test_baselines_judge_samples_as_observers_do():
         start_covariance(np.ones(2), np.array([[1e-4]]), (0,)),
         {"phase": 0.3},
     )
-    for estimator, states, knows in ((extended, (0, 1), True), (FilteredDifference(2, ((0, 1),), 20.0, DT), (1,), False)):
+    for estimator, states, knows in (
+        (extended, (0, 1), True),
+        (FilteredDifference(2, ((0, 1),), 20.0, DT), (1,), False),
+    ):
         baseline = Baseline({"": estimator}, (0,), states, {}, knows, seen=SEEN)
         found = baseline.estimate(keys, y, u, {})[..., list(states)]
         away = np.abs(found[:, 1:] - found[:, :1]) / np.sqrt(np.mean(found[:, :1] ** 2, axis=0))

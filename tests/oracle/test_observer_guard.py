@@ -16,7 +16,19 @@ K = StateSpace([[0.3]], [[0.1]], [[0.2], [0.1]], [[1.1], [1.4]], DT)
 
 def unstable(**changes):
     guard = Guard(-BOUND, BOUND, np.array([2.0]), SETTLE)
-    return Observer("o", Lifting(("x", "v")), A, B, (0,), ("u",), K, Injection.STATE, DT, guard=changes.pop("guard", guard), **changes)
+    return Observer(
+        "o",
+        Lifting(("x", "v")),
+        A,
+        B,
+        (0,),
+        ("u",),
+        K,
+        Injection.STATE,
+        DT,
+        guard=changes.pop("guard", guard),
+        **changes,
+    )
 
 
 def recordings(n_samples=400, batch=6, seed=0):
@@ -73,7 +85,9 @@ def test_a_batch_one_machine_and_c_agree(delay, guard, tmp_path):
     compiled = CompiledObserver.build(export_c(o, tmp_path / "c", "o"))
     for i in range(y.shape[1]):
         running = o.start(y[0, i])
-        found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y[:, i], u[:, i], strict=True)]
+        found = [
+            (np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y[:, i], u[:, i], strict=True)
+        ]
         ahead = np.array([x for x, _ in found])
         np.testing.assert_allclose(ahead[:-1], batch[1:, i], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(np.array([s for _, s in found]) & 16, status[:, i] & 16)

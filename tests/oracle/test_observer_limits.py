@@ -21,7 +21,11 @@ from kros.observer.predictor.moments import PastMoments
 from kros.plants import DcMotorPopulation
 from kros.synthesis import Injection
 
-BACK, LEAK, LIMIT = 0.1, 0.995, 0.4  # of the controller: share of the excess taken off its integrator, its leak, the current's limit
+BACK, LEAK, LIMIT = (
+    0.1,
+    0.995,
+    0.4,
+)  # of the controller: share of the excess taken off its integrator, its leak, the current's limit
 
 
 def machine(u, limit=LIMIT, noise=0.0, seed=0):
@@ -50,7 +54,9 @@ def predictor():
     lifting = Lifting(("y", "current", "memory_1"))
     A = np.array([[0.98, 0.1, 0.0], [-0.5, 0.0, 1.0], [-0.02, 0.0, LEAK]])
     B = np.array([[0.0], [0.5], [0.02]])
-    return Observer("p", lifting, A, B, (0,), ("u",), gain(A[:, :1], 1e-3), Injection.STATE, 1e-3, replaces=True, internal=1)
+    return Observer(
+        "p", lifting, A, B, (0,), ("u",), gain(A[:, :1], 1e-3), Injection.STATE, 1e-3, replaces=True, internal=1
+    )
 
 
 def errors(observer, batch):
@@ -60,7 +66,9 @@ def errors(observer, batch):
 def test_without_limits_the_predictor_winds_up_and_cut_off_it_is_never_worse(predictor):
     batch = recorded()
     limited = with_limits(predictor, [-np.inf, -LIMIT], [np.inf, LIMIT])
-    cut = replace(predictor, runtime=Runtime(lower=[-np.inf, -LIMIT, -np.inf], upper=[np.inf, LIMIT, np.inf], relift=False))
+    cut = replace(
+        predictor, runtime=Runtime(lower=[-np.inf, -LIMIT, -np.inf], upper=[np.inf, LIMIT, np.inf], relift=False)
+    )
     free, ours, plain = errors(predictor, batch), errors(limited, batch), errors(cut, batch)
     assert np.abs(free[..., 1]).max() > 5 * LIMIT
     assert np.all(np.abs(ours[..., 1]) <= np.abs(free[..., 1]) + 1e-12)
@@ -73,7 +81,9 @@ def test_conditioning_finds_what_the_controller_does_at_its_limit(predictor):
     before, after = (np.sqrt(np.mean(errors(o, recorded(seed=5)) ** 2, axis=(0, 1))) for o in (limited, found))
     assert np.all(after < 1e-6 * before)
     memory, current, raw = 2, 1, 3
-    np.testing.assert_allclose(found.A[[memory, raw], current], [BACK, 0.0], atol=1e-6)  # the machine's own back-calculation
+    np.testing.assert_allclose(
+        found.A[[memory, raw], current], [BACK, 0.0], atol=1e-6
+    )  # the machine's own back-calculation
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.01])
@@ -82,7 +92,9 @@ def test_within_the_limits_nothing_changes(predictor, noise):
     quiet = recorded(seed=1, size=0.1)
     assert np.abs(quiet.states[..., 1]).max() < 0.9 * LIMIT
     y = quiet.states[..., :1] + noise * 0.1 * np.random.default_rng(3).normal(size=quiet.states[..., :1].shape)
-    np.testing.assert_allclose(run_observer(found, y, quiet.inputs)[..., :2], run_observer(predictor, y, quiet.inputs)[..., :2], atol=1e-11)
+    np.testing.assert_allclose(
+        run_observer(found, y, quiet.inputs)[..., :2], run_observer(predictor, y, quiet.inputs)[..., :2], atol=1e-11
+    )
 
 
 def test_conditioned_predictors_run_in_coordinates_and_sample_by_sample_alike_and_are_certified(predictor):
@@ -94,7 +106,9 @@ def test_conditioned_predictors_run_in_coordinates_and_sample_by_sample_alike_an
     driven = with_internal(turned, batch.states, batch.inputs)
     assert np.abs(driven[..., 2:]).max() < 100 * np.sqrt(np.mean(driven[..., 2:] ** 2))
     running = turned.start(batch.states[0, 0, :1])
-    by_hand = [np.asarray(running.step(y, u))[:2] for y, u in zip(batch.states[:-1, 0, :1], batch.inputs[:-1, 0], strict=True)]
+    by_hand = [
+        np.asarray(running.step(y, u))[:2] for y, u in zip(batch.states[:-1, 0, :1], batch.inputs[:-1, 0], strict=True)
+    ]
     np.testing.assert_allclose(by_hand, estimates[1:, 0], atol=1e-9)
     certificate = relift_certificate(turned)
     assert certificate.certified
@@ -124,7 +138,9 @@ def test_recorded_signals_within_the_limits_have_the_bound_of_an_observer_withou
 
 def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predictor):
     batch = recorded(batch=3, n=1000)
-    batch = replace(batch, states=batch.states + 0.02 * np.random.default_rng(1).normal(size=batch.states.shape) * [0, 1])
+    batch = replace(
+        batch, states=batch.states + 0.02 * np.random.default_rng(1).normal(size=batch.states.shape) * [0, 1]
+    )
     held = np.clip(batch.states, [-np.inf, -LIMIT], [np.inf, LIMIT])
     batch = replace(batch, states=held)
     limited = with_limits(predictor, [-np.inf, -LIMIT], [np.inf, LIMIT])
@@ -135,7 +151,9 @@ def test_what_limits_cut_off_is_a_residual_of_the_observer_without_them(predicto
     system = error_system(free, ReliftScales.ones(free))
     z, _ = frozen_response(system, seen.omega, seen.first)
     assert np.abs(seen.omega - course(observer, batch).omega).max() > LIMIT  # they do cut off
-    np.testing.assert_allclose(z[..., :2], (batch.states - run_observer(observer, held[..., :1], batch.inputs)[..., :2]), atol=1e-9)
+    np.testing.assert_allclose(
+        z[..., :2], (batch.states - run_observer(observer, held[..., :1], batch.inputs)[..., :2]), atol=1e-9
+    )
     bound = signal_bound(relift_certificate(observer), observer, batch)
     assert bound.facts((0,))["set_within_limits"] is False
     assert np.all(bound.ratios[:, 1] >= 1)

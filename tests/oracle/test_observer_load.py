@@ -97,19 +97,27 @@ def drives() -> SimpleNamespace:
     """Three drives, the load known on the first; an observer that learned from it, and what it says of the others."""
     simulated = HarmonicDrivePopulation(n_units=3, n_episodes=3, seconds=7.0, seed=1, loop="soft").simulate()
     population, truth = simulated.population, simulated.truth
-    train = [k for k in population.episodes if k.episode != "2" and (k.condition == "noload" or k.unit == population.unit_ids[0])]
+    train = [
+        k
+        for k in population.episodes
+        if k.episode != "2" and (k.condition == "noload" or k.unit == population.unit_ids[0])
+    ]
     test = [k for k in population.episodes if k.episode == "2" and k.unit != population.unit_ids[0]]
     phases = dict(zip(truth.unit_ids, truth.phase_rad, strict=True))
 
     def read(keys: list) -> SimpleNamespace:
         values = np.stack([population.read(k) for k in keys], axis=1)
-        load = np.stack([truth.load_torque(k) if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1)
+        load = np.stack(
+            [truth.load_torque(k) if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1
+        )
         phase = np.array([phases[k.unit] for k in keys])
         return SimpleNamespace(x=values[..., :3], u=values[..., 3:], load=load.astype(float), phase={"phase": phase})
 
     known, others = read(train), read(test)
     lifting = Lifting(population.states, ("sin(100*position + phase)",), ("phase",))
-    calibration = calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT, known.phase), known.load, 2, corner_hz=20.0)
+    calibration = calibrate_load(
+        lifting, (0,), batch_of(known.x, known.u, DT, known.phase), known.load, 2, corner_hz=20.0
+    )
     observer = load_observer("koopman/load", calibration, population.inputs, 6, samples=3000, iterations=2)
     estimate = run_observer(observer, others.x[..., :1], others.u, others.phase)
     leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
@@ -129,7 +137,9 @@ def test_ripple_in_the_load_is_far_below_that_of_the_current(drives: SimpleNames
     """The gear's share of the recorded current, which the paper's linear estimate hands on, is down by more than 10 dB."""
     free = ~drives.others.load.any(axis=0)
     position, speed = drives.others.x[:, free, 0], drives.others.u[:, free, 1]
-    powers = [ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.estimate[..., 3], drives.others.x[..., 2])]
+    powers = [
+        ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.estimate[..., 3], drives.others.x[..., 2])
+    ]
     assert 10 * np.log10(powers[1].mean() / powers[0].mean()) > 10
 
 

@@ -134,7 +134,15 @@ def test_the_bound_is_that_of_one_more_unit():
     A, B = np.array([[1.0, DT], [0.0, 1.0]]), np.zeros((2, 2))
     K = gain(np.array([[0.2], [10.0]]), DT)
     observer = Observer(
-        "tracking", Lifting(("position", "velocity")), A, B, (0,), ("target_position", "target_velocity"), K, Injection.STATE, DT
+        "tracking",
+        Lifting(("position", "velocity")),
+        A,
+        B,
+        (0,),
+        ("target_position", "target_velocity"),
+        K,
+        Injection.STATE,
+        DT,
     )
     population = simulated.population
     training = TrainingSet(population, population.episodes, {u: {} for u in population.unit_ids})

@@ -85,7 +85,9 @@ def test_as_exact_as_in_the_first_turn(kind, monkeypatch):
 
     def off():
         found = run_observer(observer, y, u)[..., : len(observer.recorded)] - exact
-        return float((np.sqrt(np.mean(found**2, axis=(0, 1))) / np.std(np.asarray(exact[:, 1], dtype=float), axis=0)).max())
+        return float(
+            (np.sqrt(np.mean(found**2, axis=(0, 1))) / np.std(np.asarray(exact[:, 1], dtype=float), axis=0)).max()
+        )
 
     with_origin = off()
     monkeypatch.setattr(Origins, "beyond", lambda self, values: False)
@@ -102,7 +104,9 @@ def test_a_machine_that_turns_on_and_on(kind, tmp_path, monkeypatch):
     u[700:720], y[900, 1], y[1200:1250] = np.nan, np.nan, np.nan
     batch = run_observer(observer, y, u)[..., : len(observer.recorded)]
     monkeypatch.setattr(step, "library", lambda: None)
-    np.testing.assert_allclose(run_observer(observer, y[:800], u[:800])[..., : batch.shape[2]], batch[:800], rtol=0, atol=1e-8)
+    np.testing.assert_allclose(
+        run_observer(observer, y[:800], u[:800])[..., : batch.shape[2]], batch[:800], rtol=0, atol=1e-8
+    )
     builds = {p: CompiledObserver.build(export_c(observer, tmp_path / p, "drive", p)) for p in ("double", "float")}
     for machine in range(2):
         one, _ = in_python(observer, y[:, machine], u[:, machine])

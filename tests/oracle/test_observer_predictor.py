@@ -104,23 +104,31 @@ def test_it_starts_at_rest(made):
     u = np.concatenate([y / past.static[0, 0], np.zeros_like(y)], axis=-1)  # target and measurement in balance, no push
     estimates = run_observer(observer, y, u, phase)
     np.testing.assert_allclose(estimates[1, :, 1:], estimates[0, :, 1:], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(observer.start([0.7], {"phase": phase["phase"][2]}).step([0.7], u[0, 2]), estimates[1, 2], rtol=1e-12)
+    np.testing.assert_allclose(
+        observer.start([0.7], {"phase": phase["phase"][2]}).step([0.7], u[0, 2]), estimates[1, 2], rtol=1e-12
+    )
 
 
 def test_tuning_finds_the_controller_of_which_the_hidden_state_is_the_command():
     x, u, phase = controlled(home=3.0)
     past = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
-    (F, _, _), criterion = tune_predictor(past.model(2), past, batch_of(x, u, DT, phase, units=UNITS), iterations=40, least_gain=1e-6)
+    (F, _, _), criterion = tune_predictor(
+        past.model(2), past, batch_of(x, u, DT, phase, units=UNITS), iterations=40, least_gain=1e-6
+    )
     assert list(criterion) == sorted(criterion, reverse=True)
     np.testing.assert_allclose(np.sort(np.linalg.eigvals(F).real), [0.5, 0.99], atol=2e-3)
 
 
 def test_the_whole_way_gives_an_observer_that_is_certified():
     x, u, phase = controlled(home=3.0)
-    observer = identify_predictor("o", LIFTING, (0,), NAMES, batch_of(x, u, DT, phase, units=UNITS), internal=1, deviation=0.0)
+    observer = identify_predictor(
+        "o", LIFTING, (0,), NAMES, batch_of(x, u, DT, phase, units=UNITS), internal=1, deviation=0.0
+    )
     fresh, v, other = controlled(seed=1, home=3.0)
     missed = (observer.run(fresh[..., :1], v, other)[..., :2] - fresh)[..., 1]
-    assert size(missed) < 0.02 * size(fresh[..., 1])  # one memory is all there is to know: what is left are starts, forgotten as 0.99^k
+    assert size(missed) < 0.02 * size(
+        fresh[..., 1]
+    )  # one memory is all there is to know: what is left are starts, forgotten as 0.99^k
     assert relift_certificate(observer, mismatch=False).certified
 
 
@@ -129,4 +137,6 @@ def test_a_model_that_is_not_stable_is_refused():
     past = PastMoments.of(LIFTING, (0,), batch_of(x, u, DT, phase, units=UNITS), Basis(20))
     F, G, H = past.model(2)
     with pytest.raises(DataError, match="not stable"):
-        tune_predictor((1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, batch_of(x, u, DT, phase, units=UNITS))
+        tune_predictor(
+            (1.5 * F / np.abs(np.linalg.eigvals(F)).max(), G, H), past, batch_of(x, u, DT, phase, units=UNITS)
+        )

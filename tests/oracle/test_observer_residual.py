@@ -55,7 +55,11 @@ def achieved(K, system):
         ]
     )
     drive = np.vstack(
-        [np.hstack([system.D, -K.D * NOISE]), np.hstack([np.zeros((c, 2)), K.B * NOISE]), np.hstack([system.B, np.zeros((s, 1))])]
+        [
+            np.hstack([system.D, -K.D * NOISE]),
+            np.hstack([np.zeros((c, 2)), K.B * NOISE]),
+            np.hstack([system.B, np.zeros((s, 1))]),
+        ]
     )
     P = solve_discrete_lyapunov(loop, drive @ drive.T)
     return float(np.sqrt(np.sum(np.diag(P)[:n] / SCALE**2)))
@@ -82,7 +86,9 @@ def test_known_shaping_filter_gives_its_optimum():
     assert (found.status, found.injection, found.method) == (Status.OPTIMAL, Injection.STATE, "residual_h2")
     assert found.h2_norm == pytest.approx(best, rel=1e-5)
     assert achieved(found.controller, truth) == pytest.approx(best, rel=1e-5)
-    np.testing.assert_allclose(response(found.controller), response(reference), rtol=1e-4, atol=1e-4 * np.abs(response(reference)).max())
+    np.testing.assert_allclose(
+        response(found.controller), response(reference), rtol=1e-4, atol=1e-4 * np.abs(response(reference)).max()
+    )
 
 
 def test_measured_residual_gives_nearly_that_optimum():
@@ -145,13 +151,20 @@ def test_worst_unit_against_a_search_over_mixtures():
 
     def observer(weights, **options):
         return residual_h2(
-            ResidualProblem(A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, **options
+            ResidualProblem(A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT),
+            [Basis(8)],
+            tolerance_percent=0,
+            **options,
         ).controller
 
     found = hidden(
-        residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, worst_unit=True).controller
+        residual_h2(
+            ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, worst_unit=True
+        ).controller
     )
-    mean = hidden(residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0).controller)
+    mean = hidden(
+        residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0).controller
+    )
     best = min(hidden(observer([t, 1 - t])).max() for t in np.linspace(0, 1, 21))
     assert found.max() <= mean.max()
     assert found.max() <= 1.03 * best
@@ -241,5 +254,9 @@ def test_mean_error_dynamics_by_differences():
     step = 1e-6
     for i in range(2):
         moved = states + step * np.eye(2)[i]
-        difference = (lifting.lift(moved, values) - lifting.lift(states - step * np.eye(2)[i], values)) @ dynamics[:2].T / (2 * step)
+        difference = (
+            (lifting.lift(moved, values) - lifting.lift(states - step * np.eye(2)[i], values))
+            @ dynamics[:2].T
+            / (2 * step)
+        )
         np.testing.assert_allclose(found[:, i], difference.mean(axis=(0, 1)), rtol=1e-6)

@@ -28,7 +28,17 @@ def observer(lifting=LIFTING, runtime=None, injection=Injection.STATE, order=2, 
         DT,
     )
     return Observer(
-        "o", lifting, A, B, (0,), ("a", "b")[:m], K, injection, DT, {"phase": 0.3} if lifting is LIFTING else {}, runtime or Runtime()
+        "o",
+        lifting,
+        A,
+        B,
+        (0,),
+        ("a", "b")[:m],
+        K,
+        injection,
+        DT,
+        {"phase": 0.3} if lifting is LIFTING else {},
+        runtime or Runtime(),
     )
 
 
@@ -53,14 +63,20 @@ def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
     for k in range(len(y)):
         np.testing.assert_allclose(running.filter(y[k, 0]), filtered[k, 0], atol=1e-9)
         running.step(y[k, 0], u[k, 0])
-    np.testing.assert_allclose(x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9)  # predicting from the filtered state is the prediction
+    np.testing.assert_allclose(
+        x[1:], filtered[:-1] @ F.T + u[:-1] @ G.T, atol=1e-9
+    )  # predicting from the filtered state is the prediction
 
 
 @pytest.mark.parametrize("delay", [0, 1, 4, 50])
 @pytest.mark.parametrize("lifting", [LIFTING, LATE], ids=["drive", "delays"])
 def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay):
     n, m = lifting.n_states, 2 if lifting is LIFTING else 1
-    limits = {"lower": np.full(n, -0.8), "upper": np.array([np.inf, 0.5, 0.7][:n]), "correction": np.full(lifting.n_lifted, 0.2)}
+    limits = {
+        "lower": np.full(n, -0.8),
+        "upper": np.array([np.inf, 0.5, 0.7][:n]),
+        "correction": np.full(lifting.n_lifted, 0.2),
+    }
     o = observer(lifting, Runtime(delay, **limits), m=m)
     y, u = recordings(m)
     y[[5, 6, 20]] = np.nan
@@ -95,7 +111,9 @@ def test_a_missing_measurement_corrects_nothing():
     silent = Observer.open_loop("s", LIFTING, o.A, o.B, (0,), ("a", "b"), DT)
     y[1:] = np.nan
     y[0] = 0.0
-    np.testing.assert_allclose(run_observer(o, y, u, {"phase": 0.3}), run_observer(silent, np.zeros_like(y), u, {"phase": 0.3}), atol=1e-12)
+    np.testing.assert_allclose(
+        run_observer(o, y, u, {"phase": 0.3}), run_observer(silent, np.zeros_like(y), u, {"phase": 0.3}), atol=1e-12
+    )
     assert np.isfinite(o.start([np.nan]).estimate).all()
 
 
@@ -119,7 +137,9 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
     x = np.zeros((3000, 4, 2))
     x[0, :, 1] = speeds
     for k in range(2999):
-        x[k + 1] = lifting.lift(x[k], {"phase": true}) @ A[:2].T + u[k] @ B[:2].T + 1e-3 * rng.normal(size=(4, 2)) * [0, 1]
+        x[k + 1] = (
+            lifting.lift(x[k], {"phase": true}) @ A[:2].T + u[k] @ B[:2].T + 1e-3 * rng.normal(size=(4, 2)) * [0, 1]
+        )
     K = kalman(A[:2, :2], np.eye(1, 2), np.diag([1e-12, 1e-6]), np.array([[1e-11]]), DT).controller
     o = Observer("o", lifting, A, B, (0,), ("u",), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)
     tracked = track_parameter(o, x[..., :1], u, {"phase": true + off}, settle_s=0.3)
@@ -130,7 +150,9 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
     sampled = [np.asarray(running.step(*sample)) for sample in zip(x[:300, 0, :1], u[:, 0], strict=False)]
     np.testing.assert_allclose(sampled[:-1], tracked.estimates[1:300, 0], rtol=1e-12)
     as_at_first = run_observer(o, x[..., :1], u, {"phase": true + off})
-    assert np.all(np.std((tracked.estimates - x)[2000:, :, 1], axis=0) < 0.7 * np.std((as_at_first - x)[2000:, :, 1], axis=0))
+    assert np.all(
+        np.std((tracked.estimates - x)[2000:, :, 1], axis=0) < 0.7 * np.std((as_at_first - x)[2000:, :, 1], axis=0)
+    )
 
 
 def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():

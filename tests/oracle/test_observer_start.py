@@ -44,7 +44,9 @@ def test_gains_are_those_of_a_kalman_filter_that_starts_anywhere():
         c, power = closed @ D @ C.T, float((C @ (D + P) @ C.T)[0, 0]) + R
         S = c / power
         S[0] = 0.0  # hidden states are corrected
-        spread = np.sqrt(np.diag(D) / power / 1500)  # standard errors of a regression on as many independent windows; there are 2000
+        spread = np.sqrt(
+            np.diag(D) / power / 1500
+        )  # standard errors of a regression on as many independent windows; there are 2000
         assert (np.abs(found.corrections[k] - S)[:, 0] < 4 * spread).all()
         D = closed @ D @ closed.T - S @ c.T - c @ S.T + power * S @ S.T
 
@@ -64,11 +66,14 @@ def test_files_and_units_of_measure_keep_the_start(kind, tmp_path):
     o, (y, u) = MACHINES[kind](), samples(60, faults=False)
     o.save(tmp_path / "o.json")
     np.testing.assert_array_equal(
-        run_observer(Observer.load(tmp_path / "o.json"), y[:, None], u[:, None]), run_observer(o, y[:, None], u[:, None])
+        run_observer(Observer.load(tmp_path / "o.json"), y[:, None], u[:, None]),
+        run_observer(o, y[:, None], u[:, None]),
     )
     other = in_sizes(o, {"position": 2.0, "velocity": 0.3, "target": 5.0})
     found = run_observer(other, y[:, None] / 2.0, u[:, None] / [5.0, 1.0])
-    np.testing.assert_allclose(found[..., :2] * [2.0, 0.3], run_observer(o, y[:, None], u[:, None])[..., :2], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(
+        found[..., :2] * [2.0, 0.3], run_observer(o, y[:, None], u[:, None])[..., :2], rtol=1e-9, atol=1e-12
+    )
 
 
 def test_a_sample_without_its_input_starts_from_rest():

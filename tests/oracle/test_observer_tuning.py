@@ -47,7 +47,9 @@ def test_rows_that_help_come_first_and_their_promise_is_kept():
     best = models[0]
     assert best.refitted == (0, 1)
     K = residual_h2(ResidualProblem(best.dynamics, np.eye(1, 2), best.spectra, noise, scale, DT), n_lifted=3).controller
-    estimate = run_observer(Observer("o", LIFTING, best.A, best.B, (0,), ("u",), K, Injection.STATE, DT), x[..., :1], u, phase)
+    estimate = run_observer(
+        Observer("o", LIFTING, best.A, best.B, (0,), ("u",), K, Injection.STATE, DT), x[..., :1], u, phase
+    )
     assert np.sqrt(np.mean((estimate - x)[50:, :, 1] ** 2)) == pytest.approx(best.promised[1], rel=0.1)
 
 
@@ -61,7 +63,15 @@ def test_tuning_finds_the_kalman_filter_of_a_linear_system():
     # The measurement is the recorded state: what is white in the measurement is in the state too, and the Kalman filter for R -> 0 is best.
     best = kalman(F, np.eye(1, 2), Q, 1e-12 * R, DT)
     rough = Observer(
-        "o", plain, F + np.array([[0, 0.02], [0.05, -0.1]]), 0.9 * G, (0,), ("u",), gain([[0.3], [0.0]], DT), Injection.STATE, DT
+        "o",
+        plain,
+        F + np.array([[0, 0.02], [0.05, -0.1]]),
+        0.9 * G,
+        (0,),
+        ("u",),
+        gain([[0.3], [0.0]], DT),
+        Injection.STATE,
+        DT,
     )
     tuned, criterion = tune_observer(rough, batch_of(x, u, DT))
     assert list(criterion) == sorted(criterion, reverse=True)

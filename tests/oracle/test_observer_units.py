@@ -57,7 +57,9 @@ def test_the_certificate_says_the_same_in_other_sizes():
     one, box = observer(), {"x": (-1.0, 2.0)}
     scales = ReliftScales(np.array([2.0, 3.0]), np.array([0.1, 0.2]), np.array([0.01]))
     found = relift_certificate(
-        in_sizes(one, {"x": 2.0, "v": 3.0}), {"x": (-0.5, 1.0)}, ReliftScales(np.ones(2), np.array([0.05, 0.2 / 3]), np.array([0.005]))
+        in_sizes(one, {"x": 2.0, "v": 3.0}),
+        {"x": (-0.5, 1.0)},
+        ReliftScales(np.ones(2), np.array([0.05, 0.2 / 3]), np.array([0.005])),
     )
     direct = relift_certificate(one, box, scales)
     told = found.in_sizes(in_sizes(one, {"x": 2.0, "v": 3.0}), {})

@@ -31,7 +31,10 @@ def test_without_coulomb_friction_small_voltages_give_the_linear_response():
     voltage = np.random.default_rng(0).uniform(-1, 1, (1, 60))
     found = truth.respond(voltage)
     for u in range(3):
-        R, L, k, J, b = (float(p[u]) for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous))
+        R, L, k, J, b = (
+            float(p[u])
+            for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous)
+        )
         A = np.array([[0, 1, 0, 0], [0, -b / J, k / J, 0], [0, -k / L, -R / L, 1 / L], [0, 0, 0, 0]])
         step, x = expm(A * SAMPLE_PERIOD_S), np.zeros(4)
         for n, v in enumerate(voltage[0]):
@@ -44,7 +47,15 @@ def test_with_friction_it_agrees_with_a_general_integrator():
     truth, voltage = motors(1), np.repeat([3.0, -3.0, 1.0], 40)[None]
     found, x = truth.respond(voltage)[:, 0, 0], np.zeros(3)
     R, L, k, J, b, c = (
-        float(p[0]) for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous, truth.coulomb)
+        float(p[0])
+        for p in (
+            truth.resistance,
+            truth.inductance,
+            truth.torque_constant,
+            truth.inertia,
+            truth.viscous,
+            truth.coulomb,
+        )
     )
     for n, v in enumerate(voltage[0]):
         assert np.all(np.abs(found[:, n] - x) < 1e-3 * np.abs(found).max(axis=1))

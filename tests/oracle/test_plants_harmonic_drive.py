@@ -23,7 +23,9 @@ SETTLE = 250  # samples
 
 @pytest.fixture(scope="module", params=["stiff", "soft"])
 def drives(request):
-    return HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=8.0, seed=21, loop=request.param, outlier=True).simulate()
+    return HarmonicDrivePopulation(
+        n_units=6, n_episodes=3, seconds=8.0, seed=21, loop=request.param, outlier=True
+    ).simulate()
 
 
 def settled_segments(episode):
@@ -43,7 +45,9 @@ def effect_by_direction(population, unit, condition):
         x = population.read(key)
         for direction, samples in settled_segments(x):
             theta, error = 100 * x[samples, 0], x[samples, 4] - x[samples, 1]
-            basis = np.stack([np.sin(theta), np.cos(theta), np.ones(len(theta)), np.linspace(-1, 1, len(theta))], axis=1)
+            basis = np.stack(
+                [np.sin(theta), np.cos(theta), np.ones(len(theta)), np.linspace(-1, 1, len(theta))], axis=1
+            )
             sine, cosine = np.linalg.lstsq(basis, error, rcond=None)[0][:2]
             found[direction].append(sine + 1j * cosine)
     return {direction: np.mean(values) for direction, values in found.items()}
@@ -100,7 +104,8 @@ def right_hand_side(p, moment, link, u):
         ripple = np.sum(p.ripple[0] * np.sin(100 * order * q + p.phase_rad[0]))
         sign = w / np.hypot(w, 0.02)
         friction = (
-            sign * (p.coulomb_torque[0] + p.breakaway_torque[0] / (1 + (w / p.stribeck_velocity[0]) ** 2)) + p.viscous_friction[0] * w
+            sign * (p.coulomb_torque[0] + p.breakaway_torque[0] / (1 + (w / p.stribeck_velocity[0]) ** 2))
+            + p.viscous_friction[0] * w
         )
         gear = p.stiffness[0] * s + p.damping[0] * (w - wl)
         dw = (p.torque_constant[0] * (i - ripple) - friction - gear) / p.motor_inertia[0]
@@ -171,6 +176,10 @@ def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):
         for key in drives.population.keys(unit, "load"):
             start = drives.population.read(key)[0]
             gravity = truth.parameters.load_moment[row] * np.sin(start[3]) / truth.parameters.torque_constant[row]
-            assert truth.load_torque(key)[0] == pytest.approx(gravity, abs=2e-3)  # the twist turns the load by less than 5 mrad
+            assert truth.load_torque(key)[0] == pytest.approx(
+                gravity, abs=2e-3
+            )  # the twist turns the load by less than 5 mrad
             held = drives.raw.read(key)[:1000, 2].mean()
-            assert held == pytest.approx(truth.load_torque(key)[0] + truth.parameters.take([row]).gearbox_current(start[3:4])[0], abs=2e-3)
+            assert held == pytest.approx(
+                truth.load_torque(key)[0] + truth.parameters.take([row]).gearbox_current(start[3:4])[0], abs=2e-3
+            )

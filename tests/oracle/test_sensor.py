@@ -83,7 +83,9 @@ def test_units_of_measure_change_nothing():
     batch, own = recorded(500), Sensor(noise=1e-3, resolution=1e-4, bias=0.1, jitter_samples=0.5, dropout=0.1)
     scaled = batch_of(batch.states / 4.0, batch.inputs, DT)
     y = as_shown(batch, {"position": own}, STATES).measurements((0,))
-    np.testing.assert_allclose(as_shown(scaled, {"position": own.in_unit(4.0)}, STATES).measurements((0,)) * 4, y, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        as_shown(scaled, {"position": own.in_unit(4.0)}, STATES).measurements((0,)) * 4, y, rtol=0, atol=1e-12
+    )
 
 
 def test_what_is_fitted_knows_neither_the_delay_nor_the_bias_that_candidates_are_ranked_with():
@@ -98,14 +100,23 @@ def test_what_is_fitted_knows_neither_the_delay_nor_the_bias_that_candidates_are
 def test_what_syntheses_assume_is_the_declared_noise_and_the_coarser_resolution():
     identified: Any = SimpleNamespace(facts=SimpleNamespace(resolution={"position": 1e-3, "force": 2e-3}))
     models: Any = SimpleNamespace(measured=(0, 1), lifting=Lifting(("position", "force", "velocity")))
-    told = {"position": Sensor(noise=1e-3, resolution=1e-2, delay_samples=1), "force": Sensor(resolution=1e-3, bias=9.0)}
-    np.testing.assert_allclose(measurement_noise(identified, models, told), [np.sqrt(1e-6 + 1e-4 / 12), 2e-3 / np.sqrt(12)], rtol=1e-12)
-    np.testing.assert_allclose(measurement_noise(identified, models, {}), np.array([1e-3, 2e-3]) / np.sqrt(12), rtol=1e-12)
+    told = {
+        "position": Sensor(noise=1e-3, resolution=1e-2, delay_samples=1),
+        "force": Sensor(resolution=1e-3, bias=9.0),
+    }
+    np.testing.assert_allclose(
+        measurement_noise(identified, models, told), [np.sqrt(1e-6 + 1e-4 / 12), 2e-3 / np.sqrt(12)], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        measurement_noise(identified, models, {}), np.array([1e-3, 2e-3]) / np.sqrt(12), rtol=1e-12
+    )
 
 
 def test_recordings_arrive_late_at_an_observer_that_was_told_so_and_nothing_is_added():
     batch = recorded(50)
-    y = as_arriving(batch, {"position": Sensor(noise=1.0, bias=3.0, delay_samples=2, dropout=0.5)}, STATES).measurements((0,))
+    y = as_arriving(
+        batch, {"position": Sensor(noise=1.0, bias=3.0, delay_samples=2, dropout=0.5)}, STATES
+    ).measurements((0,))
     np.testing.assert_array_equal(y[2:], batch.measurements((0,))[:-2])
     assert as_arriving(batch, {"position": Sensor(noise=1.0)}, STATES) is batch
 
@@ -141,7 +152,9 @@ def test_noise_of_the_synthesis_names_its_new_place(tmp_path):
 def observer(correction=0.2, delay=0):
     A, B = np.array([[1.0, DT], [0.0, 0.99]]), np.array([[0.0], [DT]])
     sensor, K = {"position": Sensor(noise=1e-3, delay_samples=delay)}, gain([[correction], [1.0]], DT)
-    return Observer("o", Lifting(STATES), A, B, (0,), ("u",), K, Injection.STATE, DT, runtime=Runtime(delay=delay), sensor=sensor)
+    return Observer(
+        "o", Lifting(STATES), A, B, (0,), ("u",), K, Injection.STATE, DT, runtime=Runtime(delay=delay), sensor=sensor
+    )
 
 
 def test_an_observer_keeps_what_it_was_told(tmp_path):

@@ -20,7 +20,9 @@ def random_system(rng, p, m, order, radius=0.9):
     """A stable system whose largest gain is one."""
     A = rng.standard_normal((order, order))
     A *= radius / max(np.abs(np.linalg.eigvals(A)).max(), 1e-9)
-    system = StateSpace(A, rng.standard_normal((order, m)), rng.standard_normal((p, order)), rng.standard_normal((p, m)), DT)
+    system = StateSpace(
+        A, rng.standard_normal((order, m)), rng.standard_normal((p, order)), rng.standard_normal((p, m)), DT
+    )
     size = hinf_norm(system) * (1 + 1e-6)
     return StateSpace(A, system.B, system.C / size, system.D / size, DT)
 
@@ -58,7 +60,10 @@ def problem(form, seed=0, structure="full", injection=Injection.STATE, remainder
     if structure == "full":
         parts |= {"W_u": random_system(rng, M, M, 2), "W_p": random_system(rng, 2, N, 2)}
     if remainder:
-        parts |= {"remainder_left": scaled_by(weight(rng, N, N, "full"), 0.2), "remainder_right": random_system(rng, M, M, 1)}
+        parts |= {
+            "remainder_left": scaled_by(weight(rng, N, N, "full"), 0.2),
+            "remainder_right": random_system(rng, M, M, 1),
+        }
     case = ObserverProblem(**{**parts, **changes})
     if case.N is None:
         return case
@@ -155,7 +160,9 @@ def worst_found(rng, T, N_, M_, norm="fro", noise=None, starts=15, steps=40):
                 U, s, Vh = np.linalg.svd(error)
                 error = s[0] * np.outer(U[:, 0], Vh[0])
             left = T @ (np.eye(b) + delta @ loop @ N_)
-            U, _, Vh = np.linalg.svd(left.conj().T @ error[:, : M_.shape[1]] @ (loop @ M_).conj().T, full_matrices=False)
+            U, _, Vh = np.linalg.svd(
+                left.conj().T @ error[:, : M_.shape[1]] @ (loop @ M_).conj().T, full_matrices=False
+            )
             delta = U @ Vh
     return best
 
@@ -177,7 +184,9 @@ def test_bound_against_the_worst_perturbation_found(form, structure, limit):
     bound = np.sqrt(density(case, loop, freqs) - np.sum(np.abs(noise_columns(case, response)) ** 2, axis=(-2, -1)))
     for k in range(len(freqs)):
         at = freqs[[k]]
-        loop_ = np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.N is None else case.N.frequency_response(at)[0]
+        loop_ = (
+            np.zeros((case.W_R.n_outputs, case.W_L.n_inputs)) if case.N is None else case.N.frequency_response(at)[0]
+        )
         T = response[k][:, case.uncertainty_input] @ case.W_L.frequency_response(at)[0]
         found = worst_found(rng, T, loop_, case.M.frequency_response(at)[0])
         assert found <= bound[k] * (1 + 1e-9)
@@ -195,7 +204,9 @@ def test_designs_of_every_form_are_certified(form):
 def test_performance_weight_with_states():
     """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is crossed."""
     base = problem(Form.INPUT_MULTIPLICATIVE, 6, "diagonal", remainder=False)
-    slow = block_diagonal([StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.2]]), np.array([[0.05]]), DT)] * N)
+    slow = block_diagonal(
+        [StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.2]]), np.array([[0.05]]), DT)] * N
+    )
     fields = {f: getattr(base, f) for f in base.__dataclass_fields__}
     dynamic = ObserverProblem(**fields | {"W_p": slow})
     found = worst_case_h2(dynamic, fit=Constant)
@@ -223,7 +234,9 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     freqs = np.linspace(0, 0.5 / DT, 400)
     E = residual(form, nominal.frequency_response(freqs), units.frequency_response(freqs))
     size = float(np.linalg.norm(E, 2, axis=(-2, -1)).max()) * 1.001
-    case = ObserverProblem(nominal, np.eye(2)[:1], gain(size * np.eye(2), DT), gain(np.eye(2), DT), [1, 1], [1, 1], [1e-3], form=form)
+    case = ObserverProblem(
+        nominal, np.eye(2)[:1], gain(size * np.eye(2), DT), gain(np.eye(2), DT), [1, 1], [1, 1], [1e-3], form=form
+    )
     K = worst_case_h2(case, fit=Constant).controller
     table = check_units(case, K, units, ["a", "b", "c", "d"])
     assert table.holds
@@ -233,5 +246,7 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     response = units[k].frequency_response(freqs) - nominal.frequency_response(freqs)
     S = case.error_system(K).frequency_response(freqs)[..., 2:4]
     assert unit_error(case, K, A_p[k], B_p[k]).frequency_response(freqs) == pytest.approx(S @ response, abs=1e-9)
-    small = ObserverProblem(nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form)
+    small = ObserverProblem(
+        nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form
+    )
     assert not check_units(small, K, units).holds  # the check can fail

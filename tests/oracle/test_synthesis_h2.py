@@ -34,8 +34,19 @@ def slicot_sb10ed():
         [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
         [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
     ]
-    B = np.array([[-1, -2, -2, 1, 0], [1, 0, 1, -2, 1], [-3, -4, 0, 2, -2], [1, -2, 1, 0, -1], [0, 1, -2, 0, 3], [1, 0, 3, -1, -2]])
-    C = np.array([[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]])
+    B = np.array(
+        [
+            [-1, -2, -2, 1, 0],
+            [1, 0, 1, -2, 1],
+            [-3, -4, 0, 2, -2],
+            [1, -2, 1, 0, -1],
+            [0, 1, -2, 0, 3],
+            [1, 0, 3, -1, -2],
+        ]
+    )
+    C = np.array(
+        [[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]]
+    )
     D = np.array([[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]])
     K = {
         "A": [
@@ -46,7 +57,14 @@ def slicot_sb10ed():
             [0.4900, 0.0895, 0.2634, -0.2354, 0.1623, -0.2663],
             [0.1672, -0.4163, 0.2871, -0.1983, 0.4944, -0.6967],
         ],
-        "B": [[-0.5985, -0.5464], [0.5285, 0.6087], [-0.7600, -0.4472], [-0.7288, -0.6090], [0.0532, 0.0658], [-0.0663, 0.0059]],
+        "B": [
+            [-0.5985, -0.5464],
+            [0.5285, 0.6087],
+            [-0.7600, -0.4472],
+            [-0.7288, -0.6090],
+            [0.0532, 0.0658],
+            [-0.0663, 0.0059],
+        ],
         "C": [[0.2500, -1.0200, -0.3371, -0.2733, 0.2747, -0.4444], [0.0654, 0.2095, 0.0632, 0.2089, -0.1895, 0.1834]],
         "D": [[-0.2181, -0.2070], [0.1094, 0.1159]],
     }
@@ -60,7 +78,9 @@ def test_slicot_example():
     for name in "ABCD":
         assert getattr(found, name) == pytest.approx(np.array(expected[name]), abs=6e-5)  # four decimals are printed
     # The feedthrough from w to z matters for a proper controller: without it the numbers are others.
-    strictly = GeneralizedPlant(plant.A, plant.B1, plant.B2, plant.C1, plant.C2, 0 * plant.D11, plant.D12, plant.D21, plant.D22, 1.0)
+    strictly = GeneralizedPlant(
+        plant.A, plant.B1, plant.B2, plant.C1, plant.C2, 0 * plant.D11, plant.D12, plant.D21, plant.D22, 1.0
+    )
     assert np.abs(h2(strictly).controller.A - np.array(expected["A"])).max() > 2e-4
 
 
@@ -68,7 +88,9 @@ def test_lqg_scalar_closed_form():
     # x+ = a x + w + u, z = (x, u), y = x + v: both Riccati equations are X = a^2 X / (1 + X) + 1.
     a = 0.9
     X = (a**2 + np.sqrt(a**4 + 4)) / 2
-    plant = GeneralizedPlant([[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 1.0)
+    plant = GeneralizedPlant(
+        [[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 1.0
+    )
     found = h2(plant)
     filtered = X / (1 + X)  # variance after the measurement
     # cost = tr(X W) + (F^2 R_b) * filtered variance, with W = 1, F = -a X / (1 + X), R_b = 1 + X
@@ -84,7 +106,10 @@ def test_an_impulse_response_of_forty_taps_reaches_the_same_optimum():
     z = np.exp(2j * np.pi * np.arange(400) / 400)
 
     def response(B, C, D):
-        return C @ np.linalg.solve(z[:, None, None] * np.eye(3) - A, np.broadcast_to(B, (400, *B.shape)).astype(complex)) + D
+        return (
+            C @ np.linalg.solve(z[:, None, None] * np.eye(3) - A, np.broadcast_to(B, (400, *B.shape)).astype(complex))
+            + D
+        )
 
     P11, P12, P21 = (
         response(plant.B1, plant.C1, plant.D11),

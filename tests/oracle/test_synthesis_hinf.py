@@ -12,7 +12,16 @@ from kros.synthesis import GeneralizedPlant, Status, h2, hinf
 def partition(A, B, C, D, n_y, n_u, dt):
     A, B, C, D = (np.array(x, dtype=float) for x in (A, B, C, D))
     return GeneralizedPlant(
-        A, B[:, :-n_u], B[:, -n_u:], C[:-n_y], C[-n_y:], D[:-n_y, :-n_u], D[:-n_y, -n_u:], D[-n_y:, :-n_u], D[-n_y:, -n_u:], dt
+        A,
+        B[:, :-n_u],
+        B[:, -n_u:],
+        C[:-n_y],
+        C[-n_y:],
+        D[:-n_y, :-n_u],
+        D[:-n_y, -n_u:],
+        D[-n_y:, :-n_u],
+        D[-n_y:, -n_u:],
+        dt,
     )
 
 
@@ -26,7 +35,14 @@ def slicot_sb10dd():
         [0.0, 0.3, 0.6, -0.9, 0.1, -0.4],
         [0.5, -0.8, 0.0, 0.0, 0.2, -0.9],
     ]
-    B = [[-1, -2, -2, 1, 0], [1, 0, 1, -2, 1], [-3, -4, 0, 2, -2], [1, -2, 1, 0, -1], [0, 1, -2, 0, 3], [1, 0, 3, -1, -2]]
+    B = [
+        [-1, -2, -2, 1, 0],
+        [1, 0, 1, -2, 1],
+        [-3, -4, 0, 2, -2],
+        [1, -2, 1, 0, -1],
+        [0, 1, -2, 0, 3],
+        [1, 0, 3, -1, -2],
+    ]
     C = [[1, -1, 2, -2, 0, -3], [-3, 0, 1, -1, 1, 0], [0, 2, 0, -4, 0, -2], [1, -3, 0, 0, 3, 1], [0, 1, -2, 1, 0, -2]]
     D = [[1, -1, -2, 0, 0], [0, 1, 0, 1, 0], [2, -1, -3, 0, 1], [0, 1, 0, 1, -1], [0, 0, 1, 2, 1]]
     return partition(A, B, C, D, 2, 2, 1.0)
@@ -40,8 +56,21 @@ CONTINUOUS_A = [
     [2, 5, 8, -9, 1, -4],
     [3, -5, 8, 0, 2, -6],
 ]
-CONTINUOUS_B = [[-3, -4, -2, 1, 0], [2, 0, 1, -5, 2], [-5, -7, 0, 7, -2], [4, -6, 1, 1, -2], [-3, 9, -8, 0, 5], [1, -2, 3, -6, -2]]
-CONTINUOUS_C = [[1, -1, 2, -4, 0, -3], [-3, 0, 5, -1, 1, 1], [-7, 5, 0, -8, 2, -2], [9, -3, 4, 0, 3, 7], [0, 1, -2, 1, -6, -2]]
+CONTINUOUS_B = [
+    [-3, -4, -2, 1, 0],
+    [2, 0, 1, -5, 2],
+    [-5, -7, 0, 7, -2],
+    [4, -6, 1, 1, -2],
+    [-3, 9, -8, 0, 5],
+    [1, -2, 3, -6, -2],
+]
+CONTINUOUS_C = [
+    [1, -1, 2, -4, 0, -3],
+    [-3, 0, 5, -1, 1, 1],
+    [-7, 5, 0, -8, 2, -2],
+    [9, -3, 4, 0, 3, 7],
+    [0, 1, -2, 1, -6, -2],
+]
 
 
 def slicot_sb10fd():
@@ -56,7 +85,14 @@ def slicot_sb10fd():
             [30.6789, -3.9026, -1.3868, 26.2357, -8.8267, 10.4860],
             [-5.7429, 0.0577, 10.8216, -11.2275, 1.5074, -10.7244],
         ],
-        [[-0.1581, -0.0793], [-0.9237, -0.5718], [0.7984, 0.6627], [0.1145, 0.1496], [-0.6743, -0.2376], [0.0196, -0.7598]],
+        [
+            [-0.1581, -0.0793],
+            [-0.9237, -0.5718],
+            [0.7984, 0.6627],
+            [0.1145, 0.1496],
+            [-0.6743, -0.2376],
+            [0.0196, -0.7598],
+        ],
         [[-0.2480, -0.1713, -0.0880, 0.1534, 0.5016, -0.0730], [2.8810, -0.3658, 1.3007, 0.3945, 1.2244, 2.5690]],
         [[0.0554, 0.1334], [-0.3195, 0.0333]],
         0.0,
@@ -76,7 +112,14 @@ def slicot_sb10hd():
             [-115.8900, 226.1843, 47.2549, -47.8435, -12.5004, 34.7474],
             [59.0362, -101.8471, -20.1052, 36.7834, -16.1063, -26.4309],
         ],
-        "B": [[3.7345, 3.4758], [-0.3020, 0.6530], [3.4735, 4.0499], [4.3198, 7.2755], [-3.9424, -10.5942], [2.1784, 2.5048]],
+        "B": [
+            [3.7345, 3.4758],
+            [-0.3020, 0.6530],
+            [3.4735, 4.0499],
+            [4.3198, 7.2755],
+            [-3.9424, -10.5942],
+            [2.1784, 2.5048],
+        ],
         "C": [[-2.3346, 3.2556, 0.7150, -0.9724, 0.6962, 0.4074], [7.6899, -8.4558, -2.9642, 7.0365, -4.2844, 0.1390]],
         "D": np.zeros((2, 2)),
     }
@@ -245,7 +288,9 @@ def test_interpolation_in_discrete_time(pole, zero):
 @pytest.mark.parametrize("a", [-1.0, 0.0, 2.0])
 def test_scalar_output_feedback_closed_form(a):
     # dx = a x + w1 + u, z = (x, u), y = x + w2: X = Y, and X = gamma in 2 a X + X^2 (1/gamma^2 - 1) + 1 = 0.
-    plant = GeneralizedPlant([[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 0.0)
+    plant = GeneralizedPlant(
+        [[a]], [[1.0, 0]], [[1.0]], [[1.0], [0]], [[1.0]], np.zeros((2, 2)), [[0], [1.0]], [[0, 1.0]], [[0]], 0.0
+    )
     assert hinf(plant).hinf_norm == pytest.approx(a + np.sqrt(a**2 + 2), rel=2e-5)
 
 
@@ -284,7 +329,16 @@ def test_slow_inequality_finds_the_same_optimum(dt):
 def test_static_optimum_is_parrotts():
     empty = np.zeros
     plant = GeneralizedPlant(
-        empty((0, 0)), empty((0, 2)), empty((0, 1)), empty((2, 0)), empty((1, 0)), [[1, 2], [3, 4]], [[0], [1]], [[0, 1]], [[0.5]], 1.0
+        empty((0, 0)),
+        empty((0, 2)),
+        empty((0, 1)),
+        empty((2, 0)),
+        empty((1, 0)),
+        [[1, 2], [3, 4]],
+        [[0], [1]],
+        [[0, 1]],
+        [[0.5]],
+        1.0,
     )
     found = hinf(plant)
     assert found.hinf_norm == pytest.approx(np.sqrt(10), rel=2e-5)  # the larger of the first row and the first column
@@ -294,9 +348,9 @@ def test_static_optimum_is_parrotts():
 
 def test_plants_without_controls_or_measurements():
     a, one, none = [[0.5]], [[1.0]], np.zeros
-    assert hinf(GeneralizedPlant(a, one, none((1, 0)), one, one, [[0.0]], none((1, 0)), one, none((1, 0)), 1.0)).hinf_norm == pytest.approx(
-        2.0
-    )
+    assert hinf(
+        GeneralizedPlant(a, one, none((1, 0)), one, one, [[0.0]], none((1, 0)), one, none((1, 0)), 1.0)
+    ).hinf_norm == pytest.approx(2.0)
     deaf = GeneralizedPlant(a, one, one, one, none((0, 1)), [[0.0]], one, none((0, 1)), none((0, 1)), 1.0)
     assert hinf(deaf, gamma=2.1).hinf_norm == pytest.approx(2.0)
     with pytest.raises(SynthesisError, match="without controls or measurements"):
@@ -324,12 +378,16 @@ def test_lightly_damped_open_loop_where_a_grid_fails(gap, angle):
     # The resonance is not measured, so the optimum is its peak, 1e6 and more, in a band of 1e-6 rad.
     A = (1 - gap) * np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
     B1, zero = np.array([[1.0, 0], [0, 0]]), np.zeros((2, 2))
-    plant = GeneralizedPlant(A, B1, [[1.0], [0]], [[1.0, 0], [0, 0]], [[0.0, 0]], zero, [[0], [1.0]], [[0, 1.0]], [[0]], 1.0)
+    plant = GeneralizedPlant(
+        A, B1, [[1.0], [0]], [[1.0, 0], [0, 0]], [[0.0, 0]], zero, [[0], [1.0]], [[0, 1.0]], [[0]], 1.0
+    )
     local = (angle + gap * np.linspace(-5, 5, 20001)) / (2 * np.pi)
     open_loop = StateSpace(A, B1[:, :1], [[1.0, 0]], [[0.0]], 1.0)
     truth = np.abs(open_loop.frequency_response(local)).max()
     assert hinf(plant).hinf_norm == pytest.approx(truth, rel=1e-5)
-    assert np.abs(open_loop.frequency_response(np.linspace(0, 0.5, 4001) + 0.0000625)).max() < 0.5 * truth, "a grid should fail"
+    assert np.abs(open_loop.frequency_response(np.linspace(0, 0.5, 4001) + 0.0000625)).max() < 0.5 * truth, (
+        "a grid should fail"
+    )
 
 
 def test_slycot_agrees_on_random_plants():
@@ -362,7 +420,9 @@ def test_slycot_h2_agrees_on_random_plants():
         n, n_w, n_u, n_z, n_y = plant.sizes
         s = plant.open_loop()
         A, B, C, *_ = slycot.sb10hd(n, n_w + n_u, n_z + n_y, n_u, n_y, s.A, s.B, s.C, s.D)
-        assert h2(plant).h2_norm == pytest.approx(h2_norm(plant.close(StateSpace(A, B, C, np.zeros((n_u, n_y)), 0.0))), rel=1e-6)
+        assert h2(plant).h2_norm == pytest.approx(
+            h2_norm(plant.close(StateSpace(A, B, C, np.zeros((n_u, n_y)), 0.0))), rel=1e-6
+        )
 
 
 @pytest.mark.parametrize("seed", [1, 2, 11])

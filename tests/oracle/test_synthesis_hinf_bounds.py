@@ -16,7 +16,9 @@ def small_noise(noise=1e-6, dt=0.0):
     A = np.array([[-0.5, -0.3], [1.1, 0.3]])
     A = A if dt == 0 else np.eye(2) + 0.3 * A
     C1, zero = [[1.1, -1.2], [0, 0]], np.zeros((2, 2))
-    return GeneralizedPlant(A, [[0.9, 0], [0.1, 0]], [[0.3], [0.6]], C1, [[0.2, 0]], zero, [[0], [0.1]], [[0, noise]], [[0]], dt)
+    return GeneralizedPlant(
+        A, [[0.9, 0], [0.1, 0]], [[0.3], [0.6]], C1, [[0.2, 0]], zero, [[0], [0.1]], [[0, noise]], [[0]], dt
+    )
 
 
 def drawn(rng, dt, noise, penalty):
@@ -25,7 +27,10 @@ def drawn(rng, dt, noise, penalty):
     A = rng.standard_normal((n, n))
     poles = np.linalg.eigvals(A)
     A = A * (0.9 / np.abs(poles).max()) if dt > 0 else A - (poles.real.max() + 0.1) * np.eye(n)
-    B1, C1 = np.hstack([rng.standard_normal((n, 1)), np.zeros((n, 1))]), np.vstack([rng.standard_normal((1, n)), np.zeros((1, n))])
+    B1, C1 = (
+        np.hstack([rng.standard_normal((n, 1)), np.zeros((n, 1))]),
+        np.vstack([rng.standard_normal((1, n)), np.zeros((1, n))]),
+    )
     B2, C2 = rng.standard_normal((n, 1)), rng.standard_normal((1, n))
     return GeneralizedPlant(A, B1, B2, C1, C2, np.zeros((2, 2)), [[0], [penalty]], [[0, noise]], [[0]], dt)
 
@@ -89,7 +94,9 @@ def test_modes_without_effect_do_not_loosen_the_bound(dt):
     B2, C2 = np.array([[1.0], [0.5], [1.0]]), np.array([[0.0, 1.0, 1.0]])
     plant = GeneralizedPlant(A, B1, B2, C1, C2, zero, [[0], [0.1]], [[0, 0.1]], [[0]], dt)
     t = np.array([1e3, 1.0, 1e-3])
-    other = replace(plant, A=A * t[:, None] / t, B1=plant.B1 * t[:, None], B2=B2 * t[:, None], C1=plant.C1 / t, C2=C2 / t)
+    other = replace(
+        plant, A=A * t[:, None] / t, B1=plant.B1 * t[:, None], B2=B2 * t[:, None], C1=plant.C1 / t, C2=C2 / t
+    )
     for p in (plant, other):
         assert hinf(p).status is Status.OPTIMAL
     assert hinf(other).lower_bound == pytest.approx(hinf(plant).lower_bound, rel=1e-6)

@@ -128,7 +128,9 @@ def test_the_least_ratio_is_found_and_proven():
     found = least_ratio(ratio, np.linspace(0, np.pi, 5), rtol=1e-3)
     assert np.all(found <= 1)
     assert np.all(found >= 1 - 1e-3)
-    assert np.all(least_ratio(ratio, np.linspace(0, np.pi, 5), rtol=1e-3, max_arcs=1) == 0), "nothing is proven without work"
+    assert np.all(least_ratio(ratio, np.linspace(0, np.pi, 5), rtol=1e-3, max_arcs=1) == 0), (
+        "nothing is proven without work"
+    )
 
 
 # --- the inequality of the optimal filter
@@ -234,7 +236,9 @@ def test_no_correction_is_kept_where_nothing_is_better():
     found = worst_case_h2(case, refinements=0, max_order=2)
     nothing = certify(case, gain(np.zeros((2, 1)), DT))[0]
     assert found.worst_case_h2 <= nothing
-    bare = Synthesis("worst_case_h2", gain(np.zeros((2, 1)), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=nothing)
+    bare = Synthesis(
+        "worst_case_h2", gain(np.zeros((2, 1)), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=nothing
+    )
     assert reduce_controller(case, bare) is bare
 
 
@@ -250,13 +254,19 @@ def looped(**changes):
 @pytest.mark.parametrize("form", ["inverse_additive", "additive"])
 def test_a_perturbation_that_is_held_keeps_what_is_proven(form):
     """The element of a contraction in the middle of an arc, the same perturbation at other frequencies of the arc."""
-    changes = {} if form == "inverse_additive" else {"W_L": gain(np.eye(2), DT), "W_R": resonance(0.97, 0.8, 1.0, 0.3), "form": form}
+    changes = (
+        {}
+        if form == "inverse_additive"
+        else {"W_L": gain(np.eye(2), DT), "W_R": resonance(0.97, 0.8, 1.0, 0.3), "form": form}
+    )
     case = looped(**changes)
     channels = Channels(case, design_grid(case), apart=True)
     proofs, rng = Everywhere(channels), np.random.default_rng(0)
     theta, half = rng.uniform(0.05, 3.0, 60), 10.0 ** rng.uniform(-4, -2, 60)
     b, a = case.W_L.n_inputs, case.W_R.n_outputs
-    contractions = rng.standard_normal((len(channels.freqs_hz), b, a)) + 1j * rng.standard_normal((len(channels.freqs_hz), b, a))
+    contractions = rng.standard_normal((len(channels.freqs_hz), b, a)) + 1j * rng.standard_normal(
+        (len(channels.freqs_hz), b, a)
+    )
     contractions /= np.linalg.norm(contractions, 2, axis=(-2, -1))[:, None, None]
     spectrum = channels.average().mixed_with(0.0, contractions, 1.0)
     proven, seen = proofs.disturbance(spectrum, theta, half)
@@ -364,7 +374,11 @@ def test_a_state_that_grows_but_is_seen_has_a_bound(pole):
     b = r * (1 - pole**2) - q
     error = (-b + np.sqrt(b**2 + 4 * q * r)) / 2  # p = pole^2 p r / (p + r) + q
     found = predictor_bound(
-        np.array([[pole]]), np.array([[np.sqrt(q), 0.0]]), np.ones((1, 1)), np.array([[0.0, np.sqrt(r)]]), np.array([[1.0]])
+        np.array([[pole]]),
+        np.array([[np.sqrt(q), 0.0]]),
+        np.ones((1, 1)),
+        np.array([[0.0, np.sqrt(r)]]),
+        np.array([[1.0]]),
     )
     assert found is not None
     assert found <= error * (1 + 1e-12)

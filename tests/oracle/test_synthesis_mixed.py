@@ -161,7 +161,9 @@ def test_feedthrough_is_absorbed():
     assert found.hinf_norm < gamma
 
 
-@pytest.mark.parametrize(("seed", "order", "injection"), [(3, 5, Injection.INPUT), (3, 3, Injection.INPUT), (5, 1, Injection.STATE)])
+@pytest.mark.parametrize(
+    ("seed", "order", "injection"), [(3, 5, Injection.INPUT), (3, 3, Injection.INPUT), (5, 1, Injection.STATE)]
+)
 def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
     case = drive_problem(seed, injection, order)
     found = mixed(case)
@@ -184,7 +186,9 @@ def test_the_published_plant_itself():
     plant = paper_plant(nominal, C, gain(W_p, DT), gain(np.eye(2), DT), case.W_L)
     assert plant.sizes[0] == 18
     found = mixed(plant)
-    assert found.h2_norm < 1e-4 * h2_norm(part(plant, replace(plant, C2=0 * plant.C2).close(gain(np.zeros((2, 1)), DT)), 2))
+    assert found.h2_norm < 1e-4 * h2_norm(
+        part(plant, replace(plant, C2=0 * plant.C2).close(gain(np.zeros((2, 1)), DT)), 2)
+    )
     assert found.hinf_norm == pytest.approx(hinf_norm(case.W_L), rel=1e-6)
     assert plant.close(found.controller).is_stable()
     assert any("small ones were added for the search" in note for note in found.notes)
@@ -203,7 +207,9 @@ def test_splitting_the_weight_differently_changes_nothing():
 def test_mixed_plant_with_dynamic_weights_on_both_sides():
     base = drive_problem(2, Injection.INPUT, 1)
     lagged = block_diagonal([StateSpace([[0.5]], [[1.0]], [[0.2]], [[0.3]], DT)] * 2)
-    case = ObserverProblem(base.nominal, base.C, base.W_L, lagged, base.input_scale, base.output_scale, base.noise, 3, W_u=lagged)
+    case = ObserverProblem(
+        base.nominal, base.C, base.W_L, lagged, base.input_scale, base.output_scale, base.noise, 3, W_u=lagged
+    )
     plant = mixed_plant(case)
     A, B, _, W_p = case.scaled
     freqs = np.geomspace(0.01, 500, 20)
@@ -239,12 +245,16 @@ def fixed_at(c, share):
     B1[0, 0] = C1[0, 0] = 1.0
     C1[2, 1] = -share * b * (b - 1 / b)
     D12, D21 = [[0.0], [0.3], [-share * b]], [[0.0, 0.3, 1.0]]
-    return GeneralizedPlant(A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], 1.0, 2, 2)
+    return GeneralizedPlant(
+        A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], 1.0, 2, 2
+    )
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-6, 1e-2, 1.0])
 def test_a_constraint_out_of_reach_is_refused_with_what_is_within(share):
-    with pytest.raises(SynthesisError, match=r"gamma = 0\.5 is infeasible, no controller has \|\|T22\|\| below 0\.(8|79999)"):
+    with pytest.raises(
+        SynthesisError, match=r"gamma = 0\.5 is infeasible, no controller has \|\|T22\|\| below 0\.(8|79999)"
+    ):
         mixed(fixed_at(0.8, share), gamma=0.5, time_limit_s=1e4)
     assert mixed(fixed_at(0.8, share), gamma=0.9).hinf_norm < 0.9
 

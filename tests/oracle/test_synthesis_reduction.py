@@ -59,7 +59,9 @@ def test_root_of_the_gramian_keeps_its_digits_near_the_circle(distance):
     a, b = 1 - distance, np.array([[1.0, 0.5]])
     R = gramian_root(np.array([[a]]), b, 1.0)
     exact = 1.25 / ((1 - a) * (1 + a))
-    assert float(R[0] @ R[0]) == pytest.approx(exact, rel=1e-12 + 2e-16 / distance), "as many digits as rounding a to a double leaves"
+    assert float(R[0] @ R[0]) == pytest.approx(exact, rel=1e-12 + 2e-16 / distance), (
+        "as many digits as rounding a to a double leaves"
+    )
 
 
 def test_truncation_error_is_within_twice_the_tail_and_residualisation_keeps_the_static_gain():
@@ -67,16 +69,29 @@ def test_truncation_error_is_within_twice_the_tail_and_residualisation_keeps_the
     for _ in range(5):
         A = rng.standard_normal((6, 6))
         system = StateSpace(
-            0.95 * A / np.abs(np.linalg.eigvals(A)).max(), rng.standard_normal((6, 2)), rng.standard_normal((2, 6)), np.zeros((2, 2)), 1.0
+            0.95 * A / np.abs(np.linalg.eigvals(A)).max(),
+            rng.standard_normal((6, 2)),
+            rng.standard_normal((2, 6)),
+            np.zeros((2, 2)),
+            1.0,
         )
         balancing = Balancing.of(gramian_root(system.A, system.B, 1.0), gramian_root(system.A.T, system.C.T, 1.0))
-        P, Q = solve_discrete_lyapunov(system.A, system.B @ system.B.T), solve_discrete_lyapunov(system.A.T, system.C.T @ system.C)
+        P, Q = (
+            solve_discrete_lyapunov(system.A, system.B @ system.B.T),
+            solve_discrete_lyapunov(system.A.T, system.C.T @ system.C),
+        )
         hankel = np.sqrt(np.sort(np.linalg.eigvals(P @ Q).real)[::-1])
         assert balancing.values == pytest.approx(hankel, rel=1e-7)
         for k in range(6):
             for reduced in (balancing.truncated(system, k), balancing.residualised(system, k)):
                 error = block_diagonal([system, reduced])
-                both = StateSpace(error.A, np.vstack([system.B, reduced.B]), np.hstack([system.C, -reduced.C]), system.D - reduced.D, 1.0)
+                both = StateSpace(
+                    error.A,
+                    np.vstack([system.B, reduced.B]),
+                    np.hstack([system.C, -reduced.C]),
+                    system.D - reduced.D,
+                    1.0,
+                )
                 assert hinf_norm(both) <= 2 * hankel[k:].sum() * (1 + 1e-6)
             static = balancing.residualised(system, k).frequency_response([0.0])
             assert static == pytest.approx(system.frequency_response([0.0]), rel=1e-8, abs=1e-10)
@@ -86,7 +101,10 @@ def test_balancing_in_the_loop_is_enns_weighting():
     plant = random_plant(np.random.default_rng(1))
     K = h2(plant).controller
     closed, n = plant.close(K), plant.sizes[0]
-    P, Q = solve_discrete_lyapunov(closed.A, closed.B @ closed.B.T), solve_discrete_lyapunov(closed.A.T, closed.C.T @ closed.C)
+    P, Q = (
+        solve_discrete_lyapunov(closed.A, closed.B @ closed.B.T),
+        solve_discrete_lyapunov(closed.A.T, closed.C.T @ closed.C),
+    )
     values = np.sqrt(np.sort(np.linalg.eigvals(P[n:, n:] @ Q[n:, n:]).real)[::-1])
     found = _balanced(plant, K)
     assert found.values == pytest.approx(values[: len(found.values)], rel=1e-7)

@@ -46,7 +46,9 @@ def test_lyapunov_inequality_has_the_gramian_as_its_optimum():
 
 def test_quadratic_objective_and_several_blocks():
     # Projection of (2, 1) on the unit disc cut by x >= 0.5 and y >= 0.6.
-    disc = Block(np.eye(3)[None], np.array([[[[0, 1, 0], [1, 0, 0], [0, 0, 0.0]]], [[[0, 0, 1], [0, 0, 0], [1, 0, 0.0]]]]))
+    disc = Block(
+        np.eye(3)[None], np.array([[[[0, 1, 0], [1, 0, 0], [0, 0, 0.0]]], [[[0, 0, 1], [0, 0, 0], [1, 0, 0.0]]]])
+    )
     sides = Block(np.array([[[-0.5]], [[-0.6]]]), np.array([[[[1.0]], [[0.0]]], [[[0.0]], [[1.0]]]]))
     found = minimise(np.array([-2.0, -1.0]), [disc, sides], np.zeros(2), Q=np.eye(2), rtol=1e-8)
     assert found.x == pytest.approx([0.8, 0.6], abs=1e-4)
@@ -82,7 +84,9 @@ def test_mixed_within_a_tiny_time_limit_ends_with_a_reason():
     start = time.process_time()
     with pytest.raises(SynthesisError, match="time limit"):
         mixed(plant(), gamma=0.12, time_limit_s=1e-6)
-    assert time.process_time() - start < 10, "the limit is for the search; this is a guard against hanging, not a measurement"
+    assert time.process_time() - start < 10, (
+        "the limit is for the search; this is a guard against hanging, not a measurement"
+    )
 
 
 def test_a_plant_that_cannot_be_stabilised_is_named():
@@ -94,7 +98,14 @@ def test_a_plant_that_cannot_be_stabilised_is_named():
 def test_ill_conditioned_units_are_solved_alike():
     T = np.diag([1e7, 1e-7])
     p = plant()
-    other = replace(p, A=T @ p.A @ np.linalg.inv(T), B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ np.linalg.inv(T), C2=p.C2 @ np.linalg.inv(T))
+    other = replace(
+        p,
+        A=T @ p.A @ np.linalg.inv(T),
+        B1=T @ p.B1,
+        B2=T @ p.B2,
+        C1=p.C1 @ np.linalg.inv(T),
+        C2=p.C2 @ np.linalg.inv(T),
+    )
     assert mixed(other, gamma=0.13).h2_norm == pytest.approx(mixed(p, gamma=0.13).h2_norm, rel=1e-2)
 
 

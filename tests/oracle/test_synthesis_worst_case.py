@@ -29,7 +29,9 @@ def log_fit(freqs_hz, magnitude, dt, order=None, max_order=4, tolerance_db=1.0, 
 
     def response(p):
         square = tau[:, None] ** 2
-        return p[0] + 0.5 * np.sum(np.log(square + np.exp(2 * p[1 : 1 + k])) - np.log(square + np.exp(2 * p[1 + k :])), axis=1)
+        return p[0] + 0.5 * np.sum(
+            np.log(square + np.exp(2 * p[1 : 1 + k])) - np.log(square + np.exp(2 * p[1 + k :])), axis=1
+        )
 
     low, high = np.log(tau[0]), np.log(min(tau[-2], 1e3))
     knots = np.linspace(low, high, 2 * k + 2)[1:-1]
@@ -67,7 +69,10 @@ def problem(seed=0, injection=Injection.STATE, **changes):
         "nominal": nominal,
         "C": np.eye(4)[:1],
         "W_L": block_diagonal(
-            [lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2)) for _ in range(2)]
+            [
+                lag(10 ** rng.uniform(-2.5, -1.5), 10 ** rng.uniform(-0.9, -0.3), 10 ** rng.uniform(0.5, 2))
+                for _ in range(2)
+            ]
         ),
         "W_R": gain(np.diag([1.0, rng.uniform(0.3, 1)]), DT),
         "input_scale": np.array([3.0, 3.0]),
@@ -104,7 +109,10 @@ def test_the_set_is_a_matrix_ball_of_any_shape(shape):
         free = rng.standard_normal((b, a)) + 1j * rng.standard_normal((b, a))
         delta = free / np.linalg.norm(free, 2)
         X = delta @ np.linalg.inv(np.eye(a) - N @ delta)
-        assert np.linalg.norm(np.linalg.solve(ball.left[0], X - ball.center[0]) @ np.linalg.inv(ball.right[0]), 2) <= 1 + 1e-9
+        assert (
+            np.linalg.norm(np.linalg.solve(ball.left[0], X - ball.center[0]) @ np.linalg.inv(ball.right[0]), 2)
+            <= 1 + 1e-9
+        )
         X = ball.center[0] + ball.left[0] @ delta @ ball.right[0]
         assert np.linalg.norm(X @ np.linalg.inv(np.eye(a) + N @ X), 2) <= 1 + 1e-9
 
@@ -155,10 +163,14 @@ def test_average_and_worst_spectra_are_attained():
     worst = max(np.linalg.norm(T[0] @ (ball.center[0] + ball.left[0] @ t @ ball.right[0])) for t in thetas[:3000])
     assert worst <= ball.bound(T)[0]
     spectrum = ball.spectrum(ball.worst(T))[0]
-    assert np.all(spectrum <= (np.linalg.norm(ball.center[0], axis=-1) + np.linalg.norm(ball.left[0], axis=-1) * 2.5) ** 2)
+    assert np.all(
+        spectrum <= (np.linalg.norm(ball.center[0], axis=-1) + np.linalg.norm(ball.left[0], axis=-1) * 2.5) ** 2
+    )
 
 
-@pytest.mark.parametrize("pole", [0.5, 0.999, 0.9999999, 0.999 * np.exp(0.3j), 0.9999999 * np.exp(1e-3j), 0.999999 * np.exp(3.0j)])
+@pytest.mark.parametrize(
+    "pole", [0.5, 0.999, 0.9999999, 0.999 * np.exp(0.3j), 0.9999999 * np.exp(1e-3j), 0.999999 * np.exp(3.0j)]
+)
 def test_quadrature_over_many_decades(pole):
     # |1 / (z - p)|^2 and its mirror image have mean 1 / (1 - |p|^2).
     def power(theta):
@@ -183,7 +195,9 @@ def test_error_system_is_the_formula():
             R = np.linalg.inv(z * np.eye(4) - A)
             k = case.to_scaled(K).frequency_response(freqs[[f]])[0]
             S = np.linalg.inv(np.eye(4) + R @ J @ k @ C)
-            assert loop[f][:, :7] == pytest.approx(W_p @ S @ np.hstack([R @ B, np.eye(4), -R @ J @ k]), rel=1e-6, abs=1e-9)
+            assert loop[f][:, :7] == pytest.approx(
+                W_p @ S @ np.hstack([R @ B, np.eye(4), -R @ J @ k]), rel=1e-6, abs=1e-9
+            )
 
 
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
@@ -237,7 +251,13 @@ def test_design_beats_neighbours_and_other_observers():
     rng = np.random.default_rng(0)
     K = found.controller
     for _ in range(10):
-        other = StateSpace(K.A, K.B * (1 + 0.1 * rng.standard_normal(K.B.shape)), K.C, K.D * (1 + 0.1 * rng.standard_normal(K.D.shape)), DT)
+        other = StateSpace(
+            K.A,
+            K.B * (1 + 0.1 * rng.standard_normal(K.B.shape)),
+            K.C,
+            K.D * (1 + 0.1 * rng.standard_normal(K.D.shape)),
+            DT,
+        )
         if case.error_system(other).is_stable():
             assert certify(case, other)[0] >= found.lower_bound
             assert certify(case, other)[0] >= 0.98 * found.worst_case_h2
@@ -277,7 +297,13 @@ def test_process_noise_enters_design_and_certificate():
 def test_a_design_alone_that_does_not_settle_is_refused(monkeypatch, radius, refused):
     """Nothing certifies it, so the radius of its loop is all that stands between it and its user; on the circle it does not settle either."""
     case = ObserverProblem(
-        StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT), [[1.0]], gain([[0.1]], DT), gain([[0.1]], DT), [1.0], [1.0], [1.0]
+        StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT),
+        [[1.0]],
+        gain([[0.1]], DT),
+        gain([[0.1]], DT),
+        [1.0],
+        [1.0],
+        [1.0],
     )
     module = import_module("kros.synthesis.worst_case.worst_case_h2")
     monkeypatch.setattr(module, "design", lambda *_: gain([[0.5 - radius]], DT))

@@ -28,8 +28,12 @@ def test_energies_are_the_integrals_of_the_spectrum() -> None:
             x, w = np.polynomial.legendre.leggauss(80)
             theta, w = (high - low) / 2 * x + (high + low) / 2, (high - low) / 2 * w
             R = np.exp(-1j * theta[:, None] * np.arange(length)) @ r[:length, i]
-            np.testing.assert_allclose(found[i, b], np.einsum("t,ta,tb->ab", w, R, R.conj()) / np.pi / length, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(found[i].sum(axis=0).real, r[:length, i].T @ r[:length, i] / length, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(
+                found[i, b], np.einsum("t,ta,tb->ab", w, R, R.conj()) / np.pi / length, rtol=1e-9, atol=1e-9
+            )
+        np.testing.assert_allclose(
+            found[i].sum(axis=0).real, r[:length, i].T @ r[:length, i] / length, rtol=1e-9, atol=1e-9
+        )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -39,9 +43,9 @@ def test_a_cover_is_above_all_and_touches(seed: int) -> None:
     E = G @ np.diag([1.0, 1e-2, 1e-8]) @ G.conj().swapaxes(-1, -2)
     M = cover(E)
     size = np.sqrt(np.einsum("bii->bi", M).real)
-    ratio = np.linalg.eigvals(np.linalg.solve(M / size[:, :, None] / size[:, None, :], E / size[:, :, None] / size[:, None, :])).real.max(
-        axis=-1
-    )
+    ratio = np.linalg.eigvals(
+        np.linalg.solve(M / size[:, :, None] / size[:, None, :], E / size[:, :, None] / size[:, None, :])
+    ).real.max(axis=-1)
     assert ratio.max() <= 1 + 1e-6
     assert ratio.max(axis=0).min() > 0.999
     units = np.array([1e3, 1.0, 1e-4])
@@ -72,7 +76,12 @@ def test_bound_over_bands_holds_with_start_and_tail_and_is_close_for_fine_bands(
         T = system.frequency_response(inside.ravel() / 2 / np.pi).reshape(bands, 40, 2)
         squares = np.einsum("bti,btj->tbij", T.conj(), T)
         best, some = (
-            np.array([np.einsum("bij,bji->", cover(squares, w), phi).real for w, phi in zip(weights, energies.energy, strict=True)])
+            np.array(
+                [
+                    np.einsum("bij,bji->", cover(squares, w), phi).real
+                    for w, phi in zip(weights, energies.energy, strict=True)
+                ]
+            )
             for weights in (energies.energy, [None] * 3)
         )
         assert (best >= actual / 1.001).all()

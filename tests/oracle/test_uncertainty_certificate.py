@@ -29,7 +29,13 @@ def population(seed: int, units: int, p: int, m: int, n: int = 3) -> tuple[State
 @pytest.mark.parametrize("shape", [(2, 2), (3, 2), (2, 3)])
 @pytest.mark.parametrize(
     "form",
-    ["additive", "input_multiplicative", "output_multiplicative", "inverse_input_multiplicative", "inverse_output_multiplicative"],
+    [
+        "additive",
+        "input_multiplicative",
+        "output_multiplicative",
+        "inverse_input_multiplicative",
+        "inverse_output_multiplicative",
+    ],
 )
 def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tuple[int, int]) -> None:
     nominal, units = population(3, 2, *shape)
@@ -43,7 +49,8 @@ def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tupl
 
 
 @pytest.mark.parametrize(
-    "form", ["input_multiplicative", "inverse_input_multiplicative", "output_multiplicative", "inverse_output_multiplicative"]
+    "form",
+    ["input_multiplicative", "inverse_input_multiplicative", "output_multiplicative", "inverse_output_multiplicative"],
 )
 @pytest.mark.parametrize("states", [1, 2, 3])
 def test_realisations_of_remainders_are_what_the_form_leaves(form: str, states: int) -> None:
@@ -56,7 +63,9 @@ def test_realisations_of_remainders_are_what_the_form_leaves(form: str, states: 
     factor = np.linalg.inv(np.linalg.pinv(every) @ G) if form.startswith("inverse") else np.linalg.pinv(G) @ every
     left_over = every - G @ factor
     pencils = ratio_systems(
-        ResidualSystems(form, nominal, units, part=Part.REMAINDER), gain(np.eye(nominal.n_outputs), DT), gain(np.eye(nominal.n_inputs), DT)
+        ResidualSystems(form, nominal, units, part=Part.REMAINDER),
+        gain(np.eye(nominal.n_outputs), DT),
+        gain(np.eye(nominal.n_inputs), DT),
     )
     assert len(pencils) == 2
     for pencil, expected in zip(pencils, left_over, strict=True):
@@ -98,7 +107,9 @@ def test_weights_hold_between_grid_points(form: str, structure: str) -> None:
     assert 0 <= weight.remaining_margin < 1e-3
     freqs = np.linspace(0.0, 500.0, 20001)
     used = weight.magnitudes(freqs)
-    assert cover_ratio(residuals(freqs), used.left, used.right).max() <= 1 + (1e-6 if form == "inverse_additive" else 0.0)
+    assert cover_ratio(residuals(freqs), used.left, used.right).max() <= 1 + (
+        1e-6 if form == "inverse_additive" else 0.0
+    )
 
 
 def test_what_no_fit_goes_below_is_below_every_fit_and_met_by_good_ones() -> None:

@@ -78,7 +78,9 @@ def test_a_filter_scaled_into_energies_is_inside_by_quadrature() -> None:
     r, units = residuals()
     signals = SignalSet.of(r, [399] * 3, units, edges=np.linspace(0, np.pi, 21))
     mean = signals.energies.energy.mean(axis=0)
-    G = scaled_into(shaping_filter(signals.spectrum(513, np.full(3, 1 / 3)), Basis(4, (0.9,)), DT), signals.energies.edges, mean)
+    G = scaled_into(
+        shaping_filter(signals.spectrum(513, np.full(3, 1 / 3)), Basis(4, (0.9,)), DT), signals.energies.edges, mean
+    )
     theta = np.linspace(signals.energies.edges[:-1], signals.energies.edges[1:], 41, axis=-1)
     response = G.frequency_response(theta.ravel() / (2 * np.pi * DT)).reshape(20, 41, 2, -1)
     density = np.einsum("btik,btjk->btij", response, response.conj())

@@ -15,7 +15,9 @@ def residuals(seed: int, units: int, freqs: int, p: int, m: int) -> np.ndarray:
 
 def sound(E: np.ndarray, left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """The condition of design section 7, one matrix at a time."""
-    return np.array([[np.linalg.norm(E[k, f] / left[f][:, None] / right[f], 2) for f in range(E.shape[1])] for k in range(len(E))])
+    return np.array(
+        [[np.linalg.norm(E[k, f] / left[f][:, None] / right[f], 2) for f in range(E.shape[1])] for k in range(len(E))]
+    )
 
 
 def exhaustive_cost_db(E: np.ndarray) -> float:
@@ -86,7 +88,9 @@ def test_larger_covers_are_optimal(shape: tuple[int, int]) -> None:
 
     x = np.zeros(sum(shape))
     for _ in range(6):
-        x = minimize(cost, x, method="Nelder-Mead", options={"maxiter": 4000, "xatol": 1e-7, "fatol": 1e-9, "adaptive": True}).x
+        x = minimize(
+            cost, x, method="Nelder-Mead", options={"maxiter": 4000, "xatol": 1e-7, "fatol": 1e-9, "adaptive": True}
+        ).x
     gap = optimal_cover(E).cost_db()[0] - 20 * np.log10(np.e) * cost(x)
     assert gap < 0.1
 

@@ -22,7 +22,9 @@ W = 1j * np.tan(np.pi * np.minimum(FREQS, 499.999) * DT)
 def some_sections() -> Sections:
     rng = np.random.default_rng(0)
     pair = np.array([1, 1, 1, 1, 0, 0], bool)
-    return Sections(rng.normal(size=2), np.array([0, 0, 1, 1, 1, 1]), np.tile([1.0, -1.0], 3), pair, *rng.normal(size=(2, 6)))
+    return Sections(
+        rng.normal(size=2), np.array([0, 0, 1, 1, 1, 1]), np.tile([1.0, -1.0], 3), pair, *rng.normal(size=(2, 6))
+    )
 
 
 def differences(function, size: int) -> np.ndarray:
@@ -33,7 +35,9 @@ def test_slopes_and_curvature_are_those_of_finite_differences() -> None:
     sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
     weights, owner = np.random.default_rng(1).normal(size=(2, 40)), sections.owner
     far = (-50.0, 50.0)
-    slope = differences(lambda x: sections.moved(x, far).logs(tau)[owner].ravel(), len(owner)).reshape(len(owner), len(owner), 40)
+    slope = differences(lambda x: sections.moved(x, far).logs(tau)[owner].ravel(), len(owner)).reshape(
+        len(owner), len(owner), 40
+    )
     np.testing.assert_allclose(np.einsum("iif->if", slope), sections.slopes(tau), atol=1e-8)
     hessian = differences(lambda x: (weights[owner] * sections.moved(x, far).slopes(tau)).sum(axis=1), len(owner))
     found = sections.curvature(tau, weights)
@@ -87,7 +91,9 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
 
     def peaks(at: np.ndarray) -> np.ndarray:
         w = 1j * np.tan(np.pi * np.minimum(at, 499.999) * DT)
-        return np.prod([(w**2 + 2 * a * w + a**2) / (w**2 + 0.5 * a * w + a**2) for a in (2e-3, 3e-2, 0.4)], axis=0)[None, :, None, None]
+        return np.prod([(w**2 + 2 * a * w + a**2) / (w**2 + 0.5 * a * w + a**2) for a in (2e-3, 3e-2, 0.4)], axis=0)[
+            None, :, None, None
+        ]
 
     four, _ = fit_weight(peaks, freqs, DT)
     six, _ = fit_weight(peaks, freqs, DT, max_order=6)

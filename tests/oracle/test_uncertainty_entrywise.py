@@ -48,7 +48,9 @@ def scattered(seed: int, p: int, m: int, units: int = 3) -> StateSpace:
 def test_every_entry_is_bounded_and_the_dyads_rebuild_the_residual(shape: tuple[int, int]) -> None:
     p, m = shape
     systems, residuals = additive(scattered(1, p, m))
-    weight, cover = fit_weight(residuals, GRID, DT, structure="entrywise", systems=systems, max_order=2, tolerance_db=3.0)
+    weight, cover = fit_weight(
+        residuals, GRID, DT, structure="entrywise", systems=systems, max_order=2, tolerance_db=3.0
+    )
     assert isinstance(weight, EntrywiseWeight)
     assert weight.structure is Structure.ENTRYWISE
     assert weight.method is Method.LEVEL_SETS
@@ -113,7 +115,9 @@ def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) ->
     assert isinstance(loaded, EntrywiseWeight)
     assert isinstance(model.weight, EntrywiseWeight)
     assert loaded.unstructured_excess == pytest.approx(model.weight.unstructured_excess)
-    np.testing.assert_array_equal(loaded.matrix().frequency_response(GRID), model.weight.matrix().frequency_response(GRID))
+    np.testing.assert_array_equal(
+        loaded.matrix().frequency_response(GRID), model.weight.matrix().frequency_response(GRID)
+    )
     problem, reason = usable_problem(SimpleNamespace(name="models"), model, np.zeros(1), SynthesisSettings())  # type: ignore[arg-type]
     assert problem is None
     assert "entrywise" in reason
@@ -123,8 +127,12 @@ def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) ->
 def test_continuous_models() -> None:
     poles = np.array([-1.0, -1.3, -0.8])[:, None, None] * np.eye(2)
     coupled = np.array([[1.0, 0.4], [-0.2, 1.0]])
-    units = StateSpace(poles, np.broadcast_to(coupled, (3, 2, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)), np.zeros((3, 2, 2)), 0.0)
-    model = quantify_systems(units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0)
+    units = StateSpace(
+        poles, np.broadcast_to(coupled, (3, 2, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)), np.zeros((3, 2, 2)), 0.0
+    )
+    model = quantify_systems(
+        units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0
+    )
     freqs = np.geomspace(0.01, 10, 500)
     E = residual("additive", units[model.nominal].frequency_response(freqs), units.frequency_response(freqs))
     assert isinstance(model.weight, EntrywiseWeight)

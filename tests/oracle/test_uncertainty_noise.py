@@ -24,7 +24,9 @@ def static(variation: float, noise: float, units: int = 200, draws: int = 50, se
     B = truth + noise * rng.normal(size=truth.shape)
     samples = B[:, None] + noise * rng.normal(size=(units, draws, 2, 2))
     A = np.zeros((units, 2, 2))
-    return ModelSamples(tuple(str(k) for k in range(units)), KoopmanMatrices(A, B), KoopmanMatrices(np.zeros_like(samples), samples))
+    return ModelSamples(
+        tuple(str(k) for k in range(units)), KoopmanMatrices(A, B), KoopmanMatrices(np.zeros_like(samples), samples)
+    )
 
 
 @pytest.mark.parametrize("form", list(Form))
@@ -54,7 +56,9 @@ def test_band_is_the_quantile_of_the_draws() -> None:
     rng = np.random.default_rng(1)
     B = np.array([[[2.0]], [[3.0]]])
     samples = B[:, None] + 0.1 * rng.normal(size=(2, 20000, 1, 1))
-    models = ModelSamples(("a", "b"), KoopmanMatrices(np.zeros_like(B), B), KoopmanMatrices(np.zeros_like(samples), samples))
+    models = ModelSamples(
+        ("a", "b"), KoopmanMatrices(np.zeros_like(B), B), KoopmanMatrices(np.zeros_like(samples), samples)
+    )
     found = variation_and_noise(models, FREQS, DT, nominal=1)
     np.testing.assert_allclose(found.band, 0.196, rtol=0.03)
     np.testing.assert_allclose(found.residual, np.array([[1.0], [0.0]]) * np.ones(len(FREQS)), atol=1e-12)
@@ -94,7 +98,9 @@ def test_shares_do_not_depend_on_units_of_measure_or_the_nominal(tmp_path: Path)
         return KoopmanMatrices(m.A, m.B * out[:, None] / into)
 
     scaled = ModelSamples(models.unit_ids, changed(models.estimate), changed(models.samples))
-    other = variation_and_noise(scaled, FREQS, DT, nominal=7, output_scale=out * [1.0, 2.0], input_scale=into * [1.0, 4.0])
+    other = variation_and_noise(
+        scaled, FREQS, DT, nominal=7, output_scale=out * [1.0, 2.0], input_scale=into * [1.0, 4.0]
+    )
     np.testing.assert_allclose(other.ratio, plain.ratio, rtol=1e-10)
     np.testing.assert_allclose(other.band, plain.band, rtol=1e-10)
     other.save(tmp_path)
@@ -111,7 +117,9 @@ def test_bad_input_is_refused() -> None:
     broken = models.samples.B.copy()
     broken[1, 2] = np.nan
     with pytest.raises(DataError, match=r"unit 1 .* not finite"):
-        variation_and_noise(ModelSamples(models.unit_ids, models.estimate, KoopmanMatrices(models.samples.A, broken)), FREQS, DT)
+        variation_and_noise(
+            ModelSamples(models.unit_ids, models.estimate, KoopmanMatrices(models.samples.A, broken)), FREQS, DT
+        )
     with pytest.raises(ConfigError, match="nominal"):
         variation_and_noise(models, FREQS, DT, nominal=3)
     with pytest.raises(DimensionError, match="positive"):

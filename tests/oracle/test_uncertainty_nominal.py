@@ -29,7 +29,9 @@ def lags(n_units: int, n_freqs: int, seed: int) -> tuple[np.ndarray, np.ndarray]
     A = mixing @ (poles.swapaxes(1, 2) * np.eye(4)) @ np.linalg.inv(mixing)
     B = (np.eye(4) - A) @ (rng.normal(size=(4, 2)) * (1 + 0.05 * rng.normal(size=(n_units, 4, 2))))
     freqs = np.geomspace(0.1, 500.0, n_freqs)
-    return StateSpace(A, B, np.broadcast_to(np.eye(4), A.shape), np.zeros(B.shape), 1e-3).frequency_response(freqs), freqs
+    return StateSpace(A, B, np.broadcast_to(np.eye(4), A.shape), np.zeros(B.shape), 1e-3).frequency_response(
+        freqs
+    ), freqs
 
 
 def slow_bounds(form: Form, candidates: np.ndarray, units: np.ndarray) -> np.ndarray:
@@ -43,7 +45,9 @@ def slow_bounds(form: Form, candidates: np.ndarray, units: np.ndarray) -> np.nda
         Form.INVERSE_INPUT_MULTIPLICATIVE: lambda g, h: pinv(h) @ (h - g),
         Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda g, h: (h - g) @ pinv(h),
     }[form]
-    return np.array([np.max([np.linalg.norm(define(g, h), 2, axis=(-2, -1)) for h in units], axis=0) for g in candidates])
+    return np.array(
+        [np.max([np.linalg.norm(define(g, h), 2, axis=(-2, -1)) for h in units], axis=0) for g in candidates]
+    )
 
 
 @pytest.mark.parametrize("form", FORMS)

@@ -24,7 +24,8 @@ def test_prediction_bound_is_exceeded_at_its_rate(count: int, rate: float) -> No
 
 
 @pytest.mark.parametrize(
-    "draw", [np.random.Generator.standard_normal, np.random.Generator.random, lambda g, s: np.sqrt(g.exponential(size=s))]
+    "draw",
+    [np.random.Generator.standard_normal, np.random.Generator.random, lambda g, s: np.sqrt(g.exponential(size=s))],
 )
 def test_lighter_tails_exceed_the_bound_less_often(draw) -> None:
     draws = draw(np.random.default_rng(3), (100_000, 12))
@@ -73,7 +74,9 @@ def resonant(deviations: np.ndarray) -> np.ndarray:
     """A lag and a resonance of which five parameters deviate, shape (unit, frequency, 2, 1)."""
     k, tau, z, w, g = np.exp(0.08 * deviations)[:, :, None]
     s = 2j * np.pi * np.geomspace(0.01, 50, 60)
-    return np.stack([k / (1 + 0.3 * tau * s), g * (6 * w) ** 2 / (s**2 + 1.8 * z * w * s + (6 * w) ** 2)], axis=-1)[..., None]
+    return np.stack([k / (1 + 0.3 * tau * s), g * (6 * w) ** 2 / (s**2 + 1.8 * z * w * s + (6 * w) ** 2)], axis=-1)[
+        ..., None
+    ]
 
 
 @pytest.mark.parametrize("kind", list(SPREADS))
@@ -94,7 +97,9 @@ def test_fewer_than_eight_units_decide_nothing(count: int) -> None:
     model = score_outliers(G, np.geomspace(0.01, 50, 60))
     assert {s.status for s in model.scores} == {Status.CANNOT_TELL}
     assert model.score("new", 10 * G[1]).status is Status.CANNOT_TELL
-    more = score_outliers(np.concatenate([G, resonant(np.random.default_rng(2).normal(size=(5, 5)))]), np.geomspace(0.01, 50, 60))
+    more = score_outliers(
+        np.concatenate([G, resonant(np.random.default_rng(2).normal(size=(5, 5)))]), np.geomspace(0.01, 50, 60)
+    )
     assert [s.outlier for s in more.scores][:2] == [True, False]
 
 
@@ -125,7 +130,9 @@ def test_units_that_differ_in_nothing_but_gain_are_flagged_at_the_rate() -> None
     rng, flagged, found = np.random.default_rng(21), 0, 0
     for _ in range(100):
         gains = np.append(1 + 0.02 * rng.normal(size=20), 1.5)
-        outliers = [s.outlier for s in score_outliers((gains[:, None] / (1 + 1j * FREQS / 5))[:, :, None, None], FREQS).scores]
+        outliers = [
+            s.outlier for s in score_outliers((gains[:, None] / (1 + 1j * FREQS / 5))[:, :, None, None], FREQS).scores
+        ]
         flagged, found = flagged + sum(outliers[:-1]), found + outliers[-1]
     assert found == 100
     assert flagged <= stats.binom.ppf(0.999, 2000, 0.003)

@@ -25,7 +25,9 @@ def plants(rng: np.random.Generator, count: int, spread: float = SPREAD) -> np.n
 def errors(rng: np.random.Generator, size: float, *count: int) -> np.ndarray:
     """Estimation errors that change over frequency as responses of resampled models do: sums of a few lags."""
     lags = 1 / (1 + 1j * FREQS[:, None, None] / np.array([0.5, 5.0, 50.0])[:, None, None, None])
-    return np.asarray(size * np.einsum("...kpm,kfpm->...fpm", rng.normal(size=(*count, 3, 2, 1)), np.broadcast_to(lags, (3, *SHAPE))))
+    return np.asarray(
+        size * np.einsum("...kpm,kfpm->...fpm", rng.normal(size=(*count, 3, 2, 1)), np.broadcast_to(lags, (3, *SHAPE)))
+    )
 
 
 def batch(rng: np.random.Generator, count: int = 12) -> OutlierModel:

@@ -26,7 +26,9 @@ def test_values_are_those_of_highs_from_nothing_and_from_the_program_before(n: i
     active = None
     for A, g in programs(n, n, 60, 5):
         c = np.eye(n)[-1]
-        known = linprog(c, A_ub=A, b_ub=np.zeros(len(A)), A_eq=g[None], b_eq=[1.0], bounds=[(None, None)] * n, method="highs")
+        known = linprog(
+            c, A_ub=A, b_ub=np.zeros(len(A)), A_eq=g[None], b_eq=[1.0], bounds=[(None, None)] * n, method="highs"
+        )
         for start in (None, active):
             found = solve(A, g, start)
             assert found is not None
@@ -40,7 +42,9 @@ def test_values_are_those_of_highs_from_nothing_and_from_the_program_before(n: i
 def test_programs_without_a_bound_or_without_a_solution_have_none() -> None:
     g = np.array([1.0, 0.0, 0.0])
     assert solve(np.array([[1.0, 1.0, 0.0], [0.0, -1.0, 0.0]]), g) is None  # t falls forever
-    assert solve(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, -1.0]]), g) is None  # the first unknown is one, and negative
+    assert (
+        solve(np.array([[1.0, 0.0, 0.0], [0.0, 1.0, -1.0], [0.0, -1.0, -1.0]]), g) is None
+    )  # the first unknown is one, and negative
 
 
 def test_rows_that_do_not_make_a_vertex_are_no_start() -> None:

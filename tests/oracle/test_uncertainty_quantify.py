@@ -23,7 +23,9 @@ def drives(n_units: int, seed: int) -> StateSpace:
     rng = np.random.default_rng(seed)
     A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
     for k in range(n_units):
-        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4))
+        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(
+            np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4)
+        )
         a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])
         b = np.array([[0.5, 0], [0, 0], [14.4 / lag, 1.3 / lag]])
         step = expm(np.block([[a, b], [np.zeros((2, 5))]]) * DT)
@@ -53,7 +55,11 @@ def slow_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> f
     for f in freqs:
         z = np.exp(2j * np.pi * f * DT)
         scale = lambda g: g / model.output_scale[:, None] * model.input_scale  # noqa: E731
-        left, right, g = response(model.weight.left, z), response(model.weight.right, z), scale(response(model.nominal_system, z))
+        left, right, g = (
+            response(model.weight.left, z),
+            response(model.weight.right, z),
+            scale(response(model.nominal_system, z)),
+        )
         for k in range(units.batch_shape[0]):
             gp = scale(response(units[k], z))
             E = {
@@ -79,7 +85,9 @@ def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
     assert max(*model.weight.left_orders, *model.weight.right_orders) <= 4
     for system in (model.weight.left, model.weight.right):
         assert system.is_stable()
-        assert StateSpace(system.A - system.B @ np.linalg.solve(system.D, system.C), system.B, system.C, system.D, DT).is_stable()
+        assert StateSpace(
+            system.A - system.B @ np.linalg.solve(system.D, system.C), system.B, system.C, system.D, DT
+        ).is_stable()
 
 
 @pytest.mark.parametrize("form", list(Form))
@@ -97,7 +105,11 @@ def test_remainder_covers_what_the_form_leaves_out() -> None:
     assert model.remainder is not None
     for f in np.linspace(2.0, 490.0, 23):
         z = np.exp(2j * np.pi * f * DT)
-        g, left, right = response(model.nominal_system, z), response(model.remainder.left, z), response(model.remainder.right, z)
+        g, left, right = (
+            response(model.nominal_system, z),
+            response(model.remainder.left, z),
+            response(model.remainder.right, z),
+        )
         for k in range(4):
             gp = response(units[k], z)
             rest = gp - g @ np.linalg.inv(np.eye(2) - np.linalg.pinv(gp) @ (gp - g))

@@ -54,7 +54,9 @@ def test_thousand_random_plants(kind: str, form: Form) -> None:
     exact = np.full(COUNT, form in GENERIC[kind])
     E, rest = completion(form, G, Gp)
     size = np.linalg.norm(Gp, 2, axis=(-2, -1))
-    error = np.linalg.norm(np.array([apply(form, g, e) for g, e in zip(G, E, strict=True)]) - Gp, 2, axis=(-2, -1)) / size
+    error = (
+        np.linalg.norm(np.array([apply(form, g, e) for g, e in zip(G, E, strict=True)]) - Gp, 2, axis=(-2, -1)) / size
+    )
     with_rest = np.array([apply(form, g, e) for g, e in zip(G, E, strict=True)]) + rest
     assert (error[exact] < 1e-9).all()
     assert (error[~exact] > 1e-9).all()  # the table is not only sufficient

@@ -49,7 +49,9 @@ def test_peaks_that_no_grid_point_meets_are_covered() -> None:
     A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0, -(tops**2), -0.004 * tops
     C = np.stack([tops[:, None] ** 2, np.zeros((3, 1))], axis=-1)
     units = StateSpace(A, np.tile([[0.0], [1.0]], (3, 1, 1)), C, np.linspace(0.01, 0.02, 3).reshape(-1, 1, 1), 0.0)
-    model = quantify_systems(units, "additive", np.geomspace(1e-2, 1e2, 100) / (2 * np.pi), nominal=0, max_order=2, tolerance_db=60.0)
+    model = quantify_systems(
+        units, "additive", np.geomspace(1e-2, 1e2, 100) / (2 * np.pi), nominal=0, max_order=2, tolerance_db=60.0
+    )
     freqs = np.geomspace(1e-2, 1e2, 20000) / (2 * np.pi)
     response = units.frequency_response(freqs)[:, :, 0, 0]
     allowed = np.abs(model.weight.left.frequency_response(freqs)[:, 0, 0])

@@ -14,7 +14,9 @@ from kros.uncertainty.weights.cover import Structure
 
 DT = 1e-2
 FREQS = np.geomspace(0.01, 50.0, 30)
-DELTAS = np.array([[[0.0, 0.0], [0.0, 0.0]], [[0.3, 0.0], [0.0, 0.1]], [[0.0, 0.2], [0.2, 0.0]], [[0.9, 0.0], [0.0, 0.9]]])
+DELTAS = np.array(
+    [[[0.0, 0.0], [0.0, 0.0]], [[0.3, 0.0], [0.0, 0.1]], [[0.0, 0.2], [0.2, 0.0]], [[0.9, 0.0], [0.0, 0.9]]]
+)
 NAMES = ("nominal", "a", "b", "out")
 
 
@@ -22,14 +24,18 @@ def static() -> UnitResiduals:
     """Additive residuals are the deltas at every frequency; the last unit is not covered."""
     responses = np.eye(2) + np.broadcast_to(DELTAS[:, None], (4, len(FREQS), 2, 2)) + 0j
     cover = Cover(np.full((len(FREQS), 2), 0.3), np.ones((len(FREQS), 2)))
-    return unit_residuals(Form.ADDITIVE, responses[0], responses, cover, FREQS, DT, unit_ids=NAMES, nominal_id="nominal", outside=["out"])
+    return unit_residuals(
+        Form.ADDITIVE, responses[0], responses, cover, FREQS, DT, unit_ids=NAMES, nominal_id="nominal", outside=["out"]
+    )
 
 
 def test_static_residuals() -> None:
     found = static()
     assert found.entries == pytest.approx(np.abs(DELTAS)[:, None] * np.ones((1, len(FREQS), 1, 1)))
     assert found.ratio[:, 0] == pytest.approx([0.0, 1.0, 2 / 3, 3.0])
-    assert found.largest[0] == pytest.approx(np.array([[0.3, 0.2], [0.2, 0.1]]))  # without the unit that need not be covered
+    assert found.largest[0] == pytest.approx(
+        np.array([[0.3, 0.2], [0.2, 0.1]])
+    )  # without the unit that need not be covered
     assert found.entry_weights == pytest.approx(found.largest, rel=1e-6)
     assert np.all(found.entry_weights >= found.largest)
     assert not found.entry_orders.any()

@@ -64,7 +64,9 @@ def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_
     assert found.weight.within_tolerance == (loose.max() <= 1.0)
 
 
-@pytest.mark.parametrize(("angles", "radius", "order"), [((0.3, 0.309, 0.288), 0.999, 5), ((2.0, 2.01, 1.99), 0.9995, 4)])
+@pytest.mark.parametrize(
+    ("angles", "radius", "order"), [((0.3, 0.309, 0.288), 0.999, 5), ((2.0, 2.01, 1.99), 0.9995, 4)]
+)
 def test_lightly_damped_units_of_any_order_get_a_weight(angles: tuple[float, ...], radius: float, order: int) -> None:
     units = [single(radius, angle, 1 + 0.1 * k) for k, angle in enumerate(angles)]
     found = quantify_systems(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
@@ -99,7 +101,10 @@ def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they
 
 
 def test_responses_that_do_not_resolve_a_peak_are_told_so(caplog: pytest.LogCaptureFixture) -> None:
-    coarse, fine = np.geomspace(1e-3, 0.4, 60), np.unique(np.concatenate([np.geomspace(1e-3, 0.4, 60), np.linspace(0.028, 0.032, 81)]))
+    coarse, fine = (
+        np.geomspace(1e-3, 0.4, 60),
+        np.unique(np.concatenate([np.geomspace(1e-3, 0.4, 60), np.linspace(0.028, 0.032, 81)])),
+    )
     found = quantify_responses(resonances(coarse), coarse, "additive", sample_period_s=1.0, max_order=1)
     assert found.unresolved_hz.size
     assert np.all(np.abs(found.unresolved_hz - 0.03) < 0.003)
@@ -155,7 +160,9 @@ def test_one_entry_has_the_weight_of_the_structure_asked_for() -> None:
 
 
 def test_automatic_weights_are_scalar_where_diagonal_ones_come_close_to_an_ill_posed_set() -> None:
-    found = quantify_systems([tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 3.0)], "inverse_input_multiplicative", GRID, max_order=1)
+    found = quantify_systems(
+        [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 3.0)], "inverse_input_multiplicative", GRID, max_order=1
+    )
     assert found.weight.structure is Structure.SCALAR
     with pytest.raises(ConfigError, match="is unknown"):
         quantify_systems(LIGHT, "additive", GRID, structure="full")
@@ -189,5 +196,7 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
         return np.array([response(u, freqs) - response(units[0], freqs) for u in units])
 
     weight, best = fit_weight(residuals, GRID, 1.0, max_order=1, tolerance_db=0.1)
-    assert weight.overbound_db_max == pytest.approx((weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6)
+    assert weight.overbound_db_max == pytest.approx(
+        (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
+    )
     assert not weight.within_tolerance

@@ -48,7 +48,9 @@ class Attack:
 def attack(certificate: ReliftCertificate, observer: Observer, *, steps: int = 100_000, seed: int = 0) -> Attack:
     """Search for disturbances and slopes that exceed a certificate; no measurement is dropped."""
     if certificate.gain is None:
-        raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
+        raise DimensionError(
+            f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first."
+        )
     system = certificate.system(observer)
     rng = np.random.default_rng(seed)
     radius = float(np.abs(np.linalg.eigvals(system.A)).max(initial=0.0))
@@ -66,7 +68,9 @@ def attack(certificate: ReliftCertificate, observer: Observer, *, steps: int = 1
 class _Search:
     """A batch of sequences; the second half starts with an error instead of at rest."""
 
-    def __init__(self, system: ErrorSystem, certificate: ReliftCertificate, rng: np.random.Generator, horizon: int) -> None:
+    def __init__(
+        self, system: ErrorSystem, certificate: ReliftCertificate, rng: np.random.Generator, horizon: int
+    ) -> None:
         assert certificate.gain is not None
         self.system, self.rng, self.gain, self.steps = system, rng, certificate.gain, 0
         self.R = certificate.roots[0]
@@ -92,7 +96,9 @@ class _Search:
         before = self.ratios()
         adjoint = self._adjoint()
         old_w, old_first = self.w.copy(), self.first.copy()
-        self.w = np.einsum("kbi,ij->kbj", adjoint[1:], self.system.B) + np.einsum("kbp,pj->kbj", self._push(adjoint), self.system.D)
+        self.w = np.einsum("kbi,ij->kbj", adjoint[1:], self.system.B) + np.einsum(
+            "kbp,pj->kbj", self._push(adjoint), self.system.D
+        )
         self.first = np.where(np.any(self.first, axis=1)[:, None], self.gain * adjoint[0] @ self.inverse, 0.0)
         self._normalise()
         self.xi = self._run()
@@ -193,7 +199,9 @@ def attack_running(
     `disturbance` is as `attack` leaves it, `start` is (batch, n), `inputs` (at least n_samples + 1, batch, m); amplitudes are RMS.
     """
     if certificate.gain is None:
-        raise DimensionError(f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
+        raise DimensionError(
+            f"Attack on observer {observer.name}: it has no certificate ({certificate.reason}); certify it first."
+        )
     observer = replace(observer, seen=None)  # the disturbances are to arrive
     rng, lifting, scales = np.random.default_rng(seed), observer.lifting, certificate.scales
     n, steps, batch = lifting.n_states, len(disturbance), len(start)
@@ -209,7 +217,9 @@ def attack_running(
     for k in range(steps):
         window = np.concatenate([x[k], earlier], axis=-1)
         x[k + 1] = (
-            lifting.lift(window, values) @ observer.A[:n].T + lifting.lift_inputs(inputs[k], window, values) @ observer.B[:n].T + omega[k]
+            lifting.lift(window, values) @ observer.A[:n].T
+            + lifting.lift_inputs(inputs[k], window, values) @ observer.B[:n].T
+            + omega[k]
         )
         earlier = lifting.window.advance(window, inputs[k])
     late = observer.runtime.delay

@@ -12,4 +12,6 @@ def batch_of(states, inputs, dt, parameters=None, lengths=None, units=None):
     names = [str(i) for i in range(count)] if units is None else units
     keys = tuple(EpisodeKey(unit, "", str(i)) for i, unit in enumerate(names))
     lengths = np.full(count, len(states)) if lengths is None else np.asarray(lengths)
-    return EpisodeBatch(keys, lengths, states, inputs, dt, {name: np.broadcast_to(v, count) for name, v in (parameters or {}).items()})
+    return EpisodeBatch(
+        keys, lengths, states, inputs, dt, {name: np.broadcast_to(v, count) for name, v in (parameters or {}).items()}
+    )

@@ -13,7 +13,14 @@ from typing import Any
 import pytest
 
 _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome-headless-shell")
-_OPTIONS = ("--headless", "--no-sandbox", "--disable-gpu", "--hide-scrollbars", "--virtual-time-budget=20000", "--enable-logging=stderr")
+_OPTIONS = (
+    "--headless",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--hide-scrollbars",
+    "--virtual-time-budget=20000",
+    "--enable-logging=stderr",
+)
 _FRAME = """<!DOCTYPE html><meta charset="utf-8"><body><pre id="found"></pre><script>
 const page = {page}, probe = new Function("frame", "page", "width", {probe}), found = {{}}, widths = {widths};
 const next = () => {{
@@ -42,7 +49,14 @@ def probe(page: str, script: str, widths: list[int], folder: Path) -> tuple[dict
     texts = {"page": json.dumps(page).replace("</", "<\\/"), "probe": json.dumps(script), "widths": json.dumps(widths)}
     place = folder / "frame.html"
     place.write_text(_FRAME.format(**texts), encoding="utf-8")
-    command = [chromium(), *_OPTIONS, f"--user-data-dir={folder / 'profile'}", "--window-size=1600,1000", "--dump-dom", place.as_uri()]
+    command = [
+        chromium(),
+        *_OPTIONS,
+        f"--user-data-dir={folder / 'profile'}",
+        "--window-size=1600,1000",
+        "--dump-dom",
+        place.as_uri(),
+    ]
     run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
     found = re.search(r'<pre id="found">(.*?)</pre>', run.stdout, re.DOTALL)
     assert found, run.stderr[-2000:]
@@ -53,6 +67,12 @@ def printed_pages(page: str, folder: Path) -> int:
     """Return how many pages of paper a page takes."""
     source, target = folder / "print.html", folder / "print.pdf"
     source.write_text(page, encoding="utf-8")
-    command = [chromium(), *_OPTIONS[:3], f"--user-data-dir={folder / 'profile'}", f"--print-to-pdf={target}", source.as_uri()]
+    command = [
+        chromium(),
+        *_OPTIONS[:3],
+        f"--user-data-dir={folder / 'profile'}",
+        f"--print-to-pdf={target}",
+        source.as_uri(),
+    ]
     subprocess.run(command, capture_output=True, check=True, timeout=120)
     return len(re.findall(rb"/Type\s*/Page\b(?!s)", target.read_bytes()))

@@ -60,7 +60,9 @@ def disturbance_observer(
     gains = gain(np.vstack([L, np.zeros((functions, len(observer.measured)))]), observer.sample_period_s)
     widened = replace(lifting, states=(*lifting.states, LOAD))
     own = {**observer.parameters, **(parameters or {})}
-    return Observer(name, widened, A, B, observer.measured, observer.inputs, gains, Injection.STATE, observer.sample_period_s, own)
+    return Observer(
+        name, widened, A, B, observer.measured, observer.inputs, gains, Injection.STATE, observer.sample_period_s, own
+    )
 
 
 def ripple_power(
@@ -74,6 +76,8 @@ def ripple_power(
 ) -> Array:
     """Power of what turns with the gear, shape (batch,), from signals (n_samples, batch); ripples a turn in `ratio`."""
     x, theta = np.asarray(signal, dtype=float), np.asarray(position, dtype=float)
-    real, imaginary = (low_passed(part, width_hz, sample_period_s) for part in (x * np.cos(ratio * theta), -x * np.sin(ratio * theta)))
+    real, imaginary = (
+        low_passed(part, width_hz, sample_period_s) for part in (x * np.cos(ratio * theta), -x * np.sin(ratio * theta))
+    )
     fast = ratio * np.abs(np.asarray(speed, dtype=float)) / (2 * np.pi) > least_hz
     return np.asarray(2 * np.sum(real**2 + imaginary**2, axis=0, where=fast) / fast.sum(axis=0))

@@ -40,7 +40,9 @@ def drive(functions=GEAR, order=2, inputs=(), gamma=(), injection=Injection.STAT
     )
     parameters = {"phase": 0.3} if lifting.parameters else {}
     seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
-    return Observer("drive", lifting, A, B, (0,), ("target", "rate"), K, injection, DT, parameters, Runtime(**runtime), seen)
+    return Observer(
+        "drive", lifting, A, B, (0,), ("target", "rate"), K, injection, DT, parameters, Runtime(**runtime), seen
+    )
 
 
 LIMITS = {"lower": [-np.inf, -2, -0.3], "upper": [np.inf, 2, 0.3]}
@@ -56,7 +58,9 @@ MACHINES = {
     "through the input": lambda: drive(injection=Injection.INPUT, correction=np.full(2, 0.01)),
     "every function": lambda: drive(SMOOTH),
     "earlier values": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate")),
-    "earlier values and delay": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3),
+    "earlier values and delay": lambda: drive(
+        ("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3
+    ),
     "input functions": lambda: drive(inputs=("target", "rate"), gamma=("rate*velocity",)),
     "replaced": lambda: replaced(),
     "start in motion": lambda: moving(drive()),
@@ -79,7 +83,19 @@ def replaced():
     gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((7, 0)), A[:, :1], DT)
     seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
     return Observer(
-        "r", lifting, A, B, (0,), ("target", "rate"), gain, Injection.STATE, DT, {"phase": 0.3}, seen=seen, replaces=True, internal=2
+        "r",
+        lifting,
+        A,
+        B,
+        (0,),
+        ("target", "rate"),
+        gain,
+        Injection.STATE,
+        DT,
+        {"phase": 0.3},
+        seen=seen,
+        replaces=True,
+        internal=2,
     )
 
 
@@ -87,9 +103,9 @@ def moving(observer):
     """With a start that differs from rest wherever the command is not the position."""
     rng, n = np.random.default_rng(7), observer.lifting.n_states
     hidden = (np.arange(n) > 0)[:, None]
-    gain = 0.3 * rng.normal(size=(n, 1)) * hidden * np.array([1.0, -1.0, 0.0]) + 0.05 * rng.normal(size=(n, 1)) * hidden * np.array(
-        [0, 0, 1.0]
-    )
+    gain = 0.3 * rng.normal(size=(n, 1)) * hidden * np.array([1.0, -1.0, 0.0]) + 0.05 * rng.normal(
+        size=(n, 1)
+    ) * hidden * np.array([0, 0, 1.0])
     rest = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]) / 0.02
     return replace(observer, start_in_motion=Start(gain, 0.5 * rng.normal(size=(5, n, 1)) * hidden, rest))
 
@@ -98,7 +114,9 @@ def watched(observer, bound=1.0):
     """With a monitor that is exceeded now and then by what `samples` does."""
     filters, weights = octaves(), np.array([[4, 3, 3, 0, 3, 3]])
     limits = bound * np.full(weights.shape, 0.02)
-    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0}, first=0.1)
+    monitor = Monitor(
+        filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0}, first=0.1
+    )
     return replace(observer, monitor=monitor)
 
 
@@ -123,4 +141,6 @@ def in_python(observer, y, u, track=None, condition=None):
 
 
 def apart(found, wanted):
-    return (np.sqrt(np.mean((found - wanted) ** 2, axis=0)) / np.sqrt(np.mean((wanted - wanted.mean(axis=0)) ** 2, axis=0))).max()
+    return (
+        np.sqrt(np.mean((found - wanted) ** 2, axis=0)) / np.sqrt(np.mean((wanted - wanted.mean(axis=0)) ** 2, axis=0))
+    ).max()

@@ -28,7 +28,9 @@ from kros.synthesis.generalized_plant import GeneralizedPlant
 Array = npt.NDArray[Any]
 
 
-def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
+def paper_plant(
+    nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace
+) -> GeneralizedPlant:
     """(37)-(39) with all states (x, x_hat, x_p, x_u, x_D); W_p is (p, n), W_u and W_D are (m, m)."""
     A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
     n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
@@ -45,7 +47,13 @@ def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: Sta
             ]
         ),
         np.block(
-            [[B @ W_u.D, B @ W_D.D], [B @ W_u.D, zero((n, m))], [zero((k_p, 2 * m))], [W_u.B, zero((k_u, m))], [zero((k_d, m)), W_D.B]]
+            [
+                [B @ W_u.D, B @ W_D.D],
+                [B @ W_u.D, zero((n, m))],
+                [zero((k_p, 2 * m))],
+                [W_u.B, zero((k_u, m))],
+                [zero((k_d, m)), W_D.B],
+            ]
         ),
         np.vstack([zero((n, m)), B, zero((k_p + k_u + k_d, m))]),
         np.block([[W_p.D, -W_p.D, W_p.C, zero((p, k_u + k_d))], [zero((m, 2 * n + k_p)), W_u.C, W_D.C]]),
@@ -60,7 +68,9 @@ def paper_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: Sta
     )
 
 
-def reduced_plant(nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace) -> GeneralizedPlant:
+def reduced_plant(
+    nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace
+) -> GeneralizedPlant:
     """The same transfer matrices in the error, states (e, x_p, x_u, x_D): `e+ = A e + B (C^D x_D + D^D w2) - B u`."""
     A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
     n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]

@@ -31,7 +31,10 @@ from kros.core.files import read_bytes, read_toml
 @pytest.fixture
 def artifact(tmp_path: Path) -> Path:
     save_artifact(
-        tmp_path / "x", "model", {"name": "a", "rows": [1.5, None], "deep": {"k": 1}}, {"A": np.eye(2), "n": np.array(["u", "v"])}
+        tmp_path / "x",
+        "model",
+        {"name": "a", "rows": [1.5, None], "deep": {"k": 1}},
+        {"A": np.eye(2), "n": np.array(["u", "v"])},
     )
     return tmp_path / "x"
 
@@ -84,7 +87,11 @@ def test_no_flipped_bit_is_believed(tmp_path_factory: pytest.TempPathFactory, da
 
 def test_a_missing_key_names_file_and_key(artifact: Path, tmp_path: Path) -> None:
     content, arrays = load_artifact(artifact, "model")
-    for ask, word in ((lambda: content["unit_ids"], "unit_ids"), (lambda: content["deep"]["no"], "no"), (lambda: arrays["B"], "B")):
+    for ask, word in (
+        (lambda: content["unit_ids"], "unit_ids"),
+        (lambda: content["deep"]["no"], "no"),
+        (lambda: arrays["B"], "B"),
+    ):
         with pytest.raises(DataError, match=f"key '{word}' is missing"):
             ask()
     assert content.get("unit_ids") is None
@@ -94,7 +101,8 @@ def test_a_missing_key_names_file_and_key(artifact: Path, tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    "text", ["", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', '{"a": -Infinity}', '{"a": ' + "9" * 5000 + "}", "\ufeff{}"]
+    "text",
+    ["", "{", "[" * 100_000, '{"a": NaN}', '{"a": 1e999}', '{"a": -Infinity}', '{"a": ' + "9" * 5000 + "}", "\ufeff{}"],
 )
 def test_json_that_cannot_be_used(tmp_path: Path, text: str) -> None:
     (tmp_path / "x.json").write_text(text)
@@ -107,7 +115,11 @@ def test_archives_that_would_unpack_to_anything(tmp_path: Path) -> None:
     np.savez_compressed(path, A=np.zeros(10**6))
     with pytest.raises(DataError, match="compressed"):
         read_arrays(path)
-    header = b"\x93NUMPY\x01\x00v\x00" + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117) + b"\n"
+    header = (
+        b"\x93NUMPY\x01\x00v\x00"
+        + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
+        + b"\n"
+    )
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", header + bytes(8))
     with pytest.raises(DataError, match="holds 8 bytes"):
@@ -187,7 +199,15 @@ def test_json_is_laid_out_as_the_library_does_it() -> None:
     content = {
         "numbers": [1, 2.5, 1e-300, float("nan"), np.float64(3), np.arange(3.0), np.int64(4), 10**30, -0.0],
         "empty": [(), {}, [], {"inside": {}}],
-        "others": [None, True, np.bool_(False), Path("a/b"), date(2026, 11, 23), np.str_("text"), 'quote " line \n ü \u2028'],
+        "others": [
+            None,
+            True,
+            np.bool_(False),
+            Path("a/b"),
+            date(2026, 11, 23),
+            np.str_("text"),
+            'quote " line \n ü \u2028',
+        ],
         1: {2.5: "number", None: "nothing", True: "truth"},
     }
     wanted = json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n"

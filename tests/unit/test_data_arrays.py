@@ -49,12 +49,20 @@ NAMES: dict[str, Any] = {"states": ["x", "v"], "inputs": ["u"], "measured": ["x"
 
 
 def test_names_in_place_of_channels() -> None:
-    by_name = dict(zip(("u", "v", "x", "temperature"), (values(0)[:, 2], values(0)[:, 1], values(0)[:, 0], values(1)[:, 0]), strict=True))
+    by_name = dict(
+        zip(
+            ("u", "v", "x", "temperature"),
+            (values(0)[:, 2], values(0)[:, 1], values(0)[:, 0], values(1)[:, 0]),
+            strict=True,
+        )
+    )
     for data in ({"a": [by_name]}, {"a": {"0": by_name}}, {"a": {"default": [by_name]}}, {"a": [values(0)]}):
         population = kros.from_arrays(data, **NAMES)
         assert (population.states, population.inputs, population.measured) == (("x", "v"), ("u",), ("x",))
         np.testing.assert_array_equal(population.read(EpisodeKey("a", "default", "0")), values(0))
-    assert repr(population) == "Population(1 unit, 1 condition, 1 episode every 0.1 s; states x (measured), v; inputs u)"
+    assert (
+        repr(population) == "Population(1 unit, 1 condition, 1 episode every 0.1 s; states x (measured), v; inputs u)"
+    )
 
 
 @pytest.mark.parametrize(
@@ -101,7 +109,9 @@ def frame(**changes: Any) -> Any:
     rows = []
     for i, (unit, condition, episode) in enumerate([("a", "hot", 2), ("a", "hot", 10), ("b", "hot", 2)]):
         rows.append(
-            pd.DataFrame(values(i), columns=["x", "v", "u"]).assign(unit=unit, condition=condition, episode=episode, t=np.arange(12) * 0.1)
+            pd.DataFrame(values(i), columns=["x", "v", "u"]).assign(
+                unit=unit, condition=condition, episode=episode, t=np.arange(12) * 0.1
+            )
         )
     return pd.concat(rows, ignore_index=True).assign(**changes)
 

@@ -20,7 +20,9 @@ def values(seed: int = 0, n: int = 20) -> np.ndarray:
 
 
 def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population:
-    return from_arrays(episodes or {"a": [values(0), values(1)], "b": [values(2), values(3)]}, CHANNELS, 0.1, units=units)
+    return from_arrays(
+        episodes or {"a": [values(0), values(1)], "b": [values(2), values(3)]}, CHANNELS, 0.1, units=units
+    )
 
 
 @pytest.mark.parametrize(
@@ -109,7 +111,8 @@ def test_scan_refuses_an_input_that_never_moves() -> None:
 def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
     stuck = [np.tile([0.0, 2.5, 1.0], (20, 1)), np.tile([1.0, later, 1.0], (30, 1))]
     with pytest.raises(
-        DataError, match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor"
+        DataError,
+        match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor",
     ):
         scan_digests(population({"a": stuck}))
 
@@ -124,7 +127,10 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         kept = scan_digests(bad, on_nan="drop_episode")
     assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0")]
-    assert [r.message.split(":")[1] for r in caplog.records] == [" Episode 1 of unit a (default)", " Episode 0 of unit b (default)"]
+    assert [r.message.split(":")[1] for r in caplog.records] == [
+        " Episode 1 of unit a (default)",
+        " Episode 0 of unit b (default)",
+    ]
 
 
 @pytest.mark.parametrize("value", [-1e308, 1e51])

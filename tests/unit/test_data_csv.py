@@ -16,7 +16,11 @@ CHANNEL: list[dict[str, Any]] = [
     {"name": "u", "column": "volt", "role": "input", "unit": "V"},
     {"name": "x", "column": "pos", "role": "state", "measured": True, "unit": "m", "scale": 1e-3},
 ]
-MAPPING: dict[str, Any] = {"files": r"(?P<unit>[^/]+)/(?P<condition>\w+)_(?P<episode>\d+)\.csv", "time": "t", "channel": CHANNEL}
+MAPPING: dict[str, Any] = {
+    "files": r"(?P<unit>[^/]+)/(?P<condition>\w+)_(?P<episode>\d+)\.csv",
+    "time": "t",
+    "channel": CHANNEL,
+}
 
 
 def samples(seed: int) -> np.ndarray:
@@ -25,9 +29,13 @@ def samples(seed: int) -> np.ndarray:
     return np.column_stack([np.arange(N) * 0.01, rng.standard_normal((N, 2))])
 
 
-def write(path: Path, values: np.ndarray, header: str | None = "t,pos,volt", delimiter: str = ",", end: str = "\n") -> None:
+def write(
+    path: Path, values: np.ndarray, header: str | None = "t,pos,volt", delimiter: str = ",", end: str = "\n"
+) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    text = end.join(([header] if header else []) + [delimiter.join(repr(float(v)) for v in row) for row in values]) + end
+    text = (
+        end.join(([header] if header else []) + [delimiter.join(repr(float(v)) for v in row) for row in values]) + end
+    )
     path.write_bytes(gzip.compress(text.encode()) if path.suffix == ".gz" else text.encode())
 
 
@@ -37,7 +45,9 @@ def mapping(**changes: Any) -> dict[str, Any]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    for seed, name in enumerate(["a/cold_1.csv", "a/cold_2.csv", "b/cold_1.csv", "b/cold_10.csv", "b/cold_2.csv", "b/warm_1.csv"]):
+    for seed, name in enumerate(
+        ["a/cold_1.csv", "a/cold_2.csv", "b/cold_1.csv", "b/cold_10.csv", "b/cold_2.csv", "b/warm_1.csv"]
+    ):
         write(tmp_path / name, samples(seed))
     (tmp_path / "notes.csv.bak").write_text("nothing")
     return tmp_path
@@ -70,7 +80,9 @@ def test_exclude_and_group(folder: Path) -> None:
     population = read_csv_folder(folder, mapping(exclude="_10|warm"))
     assert [(k.unit, k.episode) for k in population.episodes] == [("a", "1"), ("a", "2"), ("b", "1"), ("b", "2")]
     write(folder / "outliers" / "c_1.csv", samples(9))
-    grouped = read_csv_folder(folder, mapping(files=r"(?P<group>outliers)?/?(?P<unit>[abc])[/_]\w*?(?P<episode>\d+)\.csv", exclude="warm"))
+    grouped = read_csv_folder(
+        folder, mapping(files=r"(?P<group>outliers)?/?(?P<unit>[abc])[/_]\w*?(?P<episode>\d+)\.csv", exclude="warm")
+    )
     assert [(u.id, u.group) for u in grouped.units] == [("a", ""), ("b", ""), ("c", "outliers")]
 
 
@@ -88,7 +100,9 @@ def test_decimal_comma_skipped_lines_and_quoted_names(tmp_path: Path) -> None:
     text = '\ufeffBench 4\n;;\n"t";"pos; raw";"volt"\n0,00;1,5;-2e0\n0,01;2,5;3\n0,02;4,5;3\n'
     (tmp_path / "a_1.csv").write_text(text, encoding="utf-8")
     channel = [CHANNEL[0], {**CHANNEL[1], "column": "pos; raw"}]
-    population = read_csv_folder(tmp_path, mapping(files="a_1", channel=channel, delimiter=";", decimal=",", skip_rows=2))
+    population = read_csv_folder(
+        tmp_path, mapping(files="a_1", channel=channel, delimiter=";", decimal=",", skip_rows=2)
+    )
     np.testing.assert_allclose(population.read(population.episodes[0]), [[1.5e-3, -2], [2.5e-3, 3], [4.5e-3, 3]])
 
 
@@ -97,7 +111,9 @@ def test_tab_separated_without_header(tmp_path: Path) -> None:
     values[:, 0] *= 1000
     write(tmp_path / "a_1.tsv", values, None, "\t", "\r\n")
     channel = [{**CHANNEL[0], "column": 3}, {**CHANNEL[1], "column": 2}]
-    table = mapping(files=r"(?P<unit>a)_(?P<episode>\d)", channel=channel, time=1, time_scale=1e-3, header=False, delimiter="\t")
+    table = mapping(
+        files=r"(?P<unit>a)_(?P<episode>\d)", channel=channel, time=1, time_scale=1e-3, header=False, delimiter="\t"
+    )
     population = read_csv_folder(tmp_path, table)
     assert population.sample_period_s == 0.01
     np.testing.assert_allclose(population.read(population.episodes[0]), values[:, 1:] * [1e-3, 1], rtol=1e-15)
@@ -163,7 +179,9 @@ def test_duplicates_and_no_match(folder: Path) -> None:
 
 def test_another_rate(folder: Path) -> None:
     write(folder / "b" / "cold_1.csv", samples(0) * [2, 1, 1])
-    with pytest.raises(DataError, match=r"0\.01 s in episode 1 of unit a \(cold\) and 0\.02 s in episode 1 of unit b \(cold\)"):
+    with pytest.raises(
+        DataError, match=r"0\.01 s in episode 1 of unit a \(cold\) and 0\.02 s in episode 1 of unit b \(cold\)"
+    ):
         read_first(folder, "b")
 
 
@@ -171,7 +189,10 @@ def test_another_rate(folder: Path) -> None:
     ("changes", "message"),
     [
         ({"file": "x"}, r"unknown key 'file'; did you mean 'files'\? known keys are files, channel, time"),
-        ({"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]}, r"channel\[0\]: unknown key 'measurd'"),
+        (
+            {"channel": [{"name": "x", "role": "state", "column": "pos", "measurd": True}]},
+            r"channel\[0\]: unknown key 'measurd'",
+        ),
         (
             {"channel": [{"name": "x", "role": "output", "column": "pos"}]},
             r"role: should be one of \['state', 'input', 'truth'\], found 'output'",
@@ -186,7 +207,10 @@ def test_another_rate(folder: Path) -> None:
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
         ({"skip_rows": -1}, "skip_rows should be at least 0, found -1"),
-        ({"unit": [{"suffix": "1", "columns": {"z": "pos"}}]}, r"gives a column for 'z'; the channels are \['u', 'x'\]"),
+        (
+            {"unit": [{"suffix": "1", "columns": {"z": "pos"}}]},
+            r"gives a column for 'z'; the channels are \['u', 'x'\]",
+        ),
         ({"prepare": [{"step": "trim", "begin": 1}]}, "unknown key 'begin'"),
     ],
 )
@@ -230,7 +254,9 @@ def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:
     whole = read_csv_folder(tmp_path, mapping(files="(?P<unit>a)"))
     parts = read_csv_folder(tmp_path, mapping(files="(?P<unit>a)", pieces=3))
     assert [k.episode for k in parts.episodes] == ["0.1", "0.2", "0.3"]
-    np.testing.assert_array_equal(np.concatenate([parts.read(k) for k in parts.episodes]), whole.read(whole.episodes[0]))
+    np.testing.assert_array_equal(
+        np.concatenate([parts.read(k) for k in parts.episodes]), whole.read(whole.episodes[0])
+    )
     write(tmp_path / "a.csv", samples(1))
     np.testing.assert_allclose(parts.read(parts.episodes[0])[:, 1], samples(1)[:16, 2])
 
@@ -239,7 +265,10 @@ def test_pieces_are_the_recording_in_parts(tmp_path: Path) -> None:
 def test_timestamps_over_the_turn_of_a_year(tmp_path: Path, text: str) -> None:
     order = {"3": "dmy", "2": "ymd", "1": "mdy"}[text[0]]
     turned = {"dmy": "01.01.2024 00:00:00,", "ymd": "2024-01-01T00:00:00.", "mdy": "01/01/2024 00:00:00."}[order]
-    rows = [f"{text};1;2", *(f"{turned}{'0' if k == 0 else '5'}{'Z' if order == 'ymd' else ''};{k};{k * k}" for k in range(2))]
+    rows = [
+        f"{text};1;2",
+        *(f"{turned}{'0' if k == 0 else '5'}{'Z' if order == 'ymd' else ''};{k};{k * k}" for k in range(2)),
+    ]
     (tmp_path / "a.csv").write_text("\n".join(["t;pos;volt", *rows]))
     population = read_csv_folder(tmp_path, mapping(files="a", delimiter=";", timestamp=order))
     assert population.sample_period_s == 0.5

@@ -15,7 +15,18 @@ from pyarrow import parquet
 
 from kros.core import limits
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, prepare, read, steps, write_parquet
+from kros.data import (
+    Channel,
+    EpisodeKey,
+    Role,
+    from_arrays,
+    from_frame,
+    from_pykoop,
+    prepare,
+    read,
+    steps,
+    write_parquet,
+)
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
 from kros.data.readers.parquet import read_parquet
@@ -26,7 +37,9 @@ MAPPING: dict[str, Any] = {
     "time": "t",
     "channel": [{"name": c.name, "column": c.name, "role": c.role.value, "measured": c.measured} for c in CHANNELS],
 }
-GOOD = b"t,x,v,u\n" + b"".join(b"%.2f,%.4f,%.4f,%.4f\n" % (k / 100, np.sin(k), np.cos(k), np.sin(3 * k)) for k in range(50))
+GOOD = b"t,x,v,u\n" + b"".join(
+    b"%.2f,%.4f,%.4f,%.4f\n" % (k / 100, np.sin(k), np.cos(k), np.sin(3 * k)) for k in range(50)
+)
 
 
 def samples(seed: int, n: int = 80) -> np.ndarray:
@@ -177,7 +190,8 @@ def test_names_that_are_none(name: str) -> None:
 
 # --------------------------------------------------------------------------------------------------------------------------- in memory
 @pytest.mark.parametrize(
-    "values", [samples(0).astype(complex), samples(0).astype(str), samples(0).astype("datetime64[s]"), [[1, "2", 3]] * 9]
+    "values",
+    [samples(0).astype(complex), samples(0).astype(str), samples(0).astype("datetime64[s]"), [[1, "2", 3]] * 9],
 )
 def test_arrays_that_hold_no_numbers(values: Any) -> None:
     with pytest.raises(DataError, match=r"Episode 0 of unit a .* needs numbers"):
@@ -199,7 +213,9 @@ def test_frames_that_hold_no_numbers() -> None:
 # ------------------------------------------------------------------------------------------------------------------------------- Parquet
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
-    write_parquet(from_arrays({u: [samples(i), samples(10 + i)] for i, u in enumerate("ab")}, CHANNELS, 0.01), tmp_path / "p")
+    write_parquet(
+        from_arrays({u: [samples(i), samples(10 + i)] for i, u in enumerate("ab")}, CHANNELS, 0.01), tmp_path / "p"
+    )
     return tmp_path / "p"
 
 
@@ -235,7 +251,9 @@ def test_labels_that_disagree_with_the_index(stored: Path, label: str) -> None:
 
 
 @given(st.data())
-def test_no_flipped_bit_of_recordings_is_believed(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+def test_no_flipped_bit_of_recordings_is_believed(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
     folder = tmp_path_factory.mktemp("bits") / "p"
     write_parquet(from_arrays({"a": [samples(1)]}, CHANNELS, 0.01), folder)
     path = folder / "a@default.parquet"

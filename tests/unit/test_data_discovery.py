@@ -19,7 +19,12 @@ UNITS, EPISODES = range(1, 4), range(1, 4)
 def names(template: str, **other: object) -> list[str]:
     """Paths of three units and episodes, in conditions where the template has one."""
     conditions = ("load", "noload") if "{c" in template else ("",)
-    return [template.format(u=u, c=c, e=e, letter="ABC"[u - 1], **other) for u in UNITS for c in conditions for e in EPISODES]
+    return [
+        template.format(u=u, c=c, e=e, letter="ABC"[u - 1], **other)
+        for u in UNITS
+        for c in conditions
+        for e in EPISODES
+    ]
 
 
 @pytest.mark.parametrize(
@@ -46,7 +51,10 @@ def test_names_of_files(template, first, sure):
 
 def test_conditions_groups_and_single_machines():
     assert "(?P<condition>" in infer_names([f"rig{u}_{p}bar.csv" for u in UNITS for p in (3, 5)]).pattern
-    assert "(?P<group>" in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES]).pattern
+    assert (
+        "(?P<group>"
+        in infer_names([f"{'outliers' if u == 3 else 'good'}/m{u}_{e}.csv" for u in UNITS for e in EPISODES]).pattern
+    )
     batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
     assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
     single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
@@ -57,9 +65,24 @@ def test_conditions_groups_and_single_machines():
 @pytest.mark.parametrize(
     ("paths", "first", "units", "ambiguous"),
     [
-        ([f"{'good' if u < 3 else 'faulty'}/act{u}_run{e}.csv" for u in UNITS for e in EPISODES], ("good", "act1", None, "run1"), 3, False),
-        ([f"{'berlin' if u < 3 else 'paris'}/{u}_{e}.csv" for u in UNITS for e in EPISODES], ("berlin", "1", None, "1"), 3, False),
-        ([f"{'ok' if u < 3 else 'nok'}/SN{7 * u}_{c}.csv" for u in UNITS for c in ("hot", "cold")], ("ok", "SN7", "hot", None), 3, False),
+        (
+            [f"{'good' if u < 3 else 'faulty'}/act{u}_run{e}.csv" for u in UNITS for e in EPISODES],
+            ("good", "act1", None, "run1"),
+            3,
+            False,
+        ),
+        (
+            [f"{'berlin' if u < 3 else 'paris'}/{u}_{e}.csv" for u in UNITS for e in EPISODES],
+            ("berlin", "1", None, "1"),
+            3,
+            False,
+        ),
+        (
+            [f"{'ok' if u < 3 else 'nok'}/SN{7 * u}_{c}.csv" for u in UNITS for c in ("hot", "cold")],
+            ("ok", "SN7", "hot", None),
+            3,
+            False,
+        ),
         ([f"motor00_{e:02d}.csv" for e in range(3)], (None, "motor00", None, "00"), 1, False),
         ([f"bench3/pump7_{e}.csv.gz" for e in range(5)], (None, "pump7", None, "0"), 1, False),
         (names("2024-05-1{e}_motor{u}_{c}.csv"), (None, "motor1", "load", "11"), 3, False),
@@ -131,7 +154,12 @@ def test_lines_before_the_numbers(tmp_path: Path):
     head = look_at(path)
     assert head.fields == ("time", "speed")
     assert head.units == ("[s]", "[rpm]")
-    assert (head.dialect.delimiter, head.dialect.decimal, head.dialect.skip_rows, head.dialect.unit_rows) == (";", ",", 2, 2)
+    assert (head.dialect.delimiter, head.dialect.decimal, head.dialect.skip_rows, head.dialect.unit_rows) == (
+        ";",
+        ",",
+        2,
+        2,
+    )
     path.write_text("1;2\n3;4\n5;6\n")
     assert not look_at(path).dialect.header
     path.write_text("once upon a time\nthere was; a table\n")

@@ -29,7 +29,8 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
         channels = step.channels_after(channels)
     write_raw(from_arrays(drives, channels, 1e-3), root / "motor-drive-raw")
     write_parquet(
-        from_arrays({u: [rng.standard_normal((9, 1))] for u in "ab"}, (Channel("x", Role.STATE, measured=True),), 0.1), root / "parquet"
+        from_arrays({u: [rng.standard_normal((9, 1))] for u in "ab"}, (Channel("x", Role.STATE, measured=True),), 0.1),
+        root / "parquet",
     )
     (root / "csv").mkdir()
     for unit in "ab":

@@ -46,7 +46,9 @@ def test_keys_select_and_groups_agree() -> None:
         part.read(EpisodeKey("b", "hot", "0"))
 
 
-@pytest.mark.parametrize(("n", "test"), [(20, ["18", "19"]), (10, ["9"]), (2, ["1"]), (19, ["18"]), (30, ["27", "28", "29"])])
+@pytest.mark.parametrize(
+    ("n", "test"), [(20, ["18", "19"]), (10, ["9"]), (2, ["1"]), (19, ["18"]), (30, ["27", "28", "29"])]
+)
 def test_split_by_default(n: int, test: list[str]) -> None:
     split = split_episodes(population({("a", "hot"): n}))["a", "hot"]
     assert [k.episode for k in split.test] == test
@@ -76,7 +78,9 @@ class Counter:
 
 def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
-    episodes = {EpisodeKey(u, c, str(e)): rng.standard_normal((9, 2)) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 10)}
+    episodes = {
+        EpisodeKey(u, c, str(e)): rng.standard_normal((9, 2)) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 10)
+    }
     shuffled = [list(episodes.items())[i] for i in rng.permutation(len(episodes))]
     for name, given_ in (("one", episodes), ("two", dict(shuffled))):
         write_parquet(from_arrays(given_, CHANNELS, 0.1), tmp_path / name)

@@ -42,7 +42,9 @@ def write_file(path: Path, samples: np.ndarray, header: str = HEADER) -> Path:
     return path
 
 
-def folder(root: Path, serial: str, load: str = "noload", group: str = "population", stamp: str = "20220915T122400") -> Path:
+def folder(
+    root: Path, serial: str, load: str = "noload", group: str = "population", stamp: str = "20220915T122400"
+) -> Path:
     return root / "batch_b" / group / f"{stamp}_{serial}_{load}"
 
 
@@ -59,7 +61,11 @@ def raw(tmp_path: Path) -> Path:
 def test_reads_values_units_and_facts(raw: Path) -> None:
     population = read_motor_drive_raw(raw)
     assert population.sample_period_s == 0.001
-    assert [(u.id, u.group) for u in population.units] == [("000000", "outliers"), ("000002", "population"), ("001011", "population")]
+    assert [(u.id, u.group) for u in population.units] == [
+        ("000000", "outliers"),
+        ("000002", "population"),
+        ("001011", "population"),
+    ]
     assert population.conditions == ("load", "noload")
     assert population.states == ("position", "velocity", "current")
     assert population.inputs == ("target_position", "target_velocity")
@@ -69,7 +75,13 @@ def test_reads_values_units_and_facts(raw: Path) -> None:
 
     samples = truth(1)[:-1]  # the last target is not recorded
     offset = np.mean(samples[500:1000, 4] - samples[500:1000, 1])
-    expected = [(samples[:, 1] + offset) * DEG, samples[:, 2] * DEG, samples[:, 3] / 100, samples[:, 4] * DEG, samples[:, 5] * DEG]
+    expected = [
+        (samples[:, 1] + offset) * DEG,
+        samples[:, 2] * DEG,
+        samples[:, 3] / 100,
+        samples[:, 4] * DEG,
+        samples[:, 5] * DEG,
+    ]
     values = population.read(EpisodeKey("001011", "noload", "1"))
     np.testing.assert_allclose(values, np.column_stack(expected)[1000:], rtol=1e-13, atol=1e-15)
 
@@ -189,7 +201,9 @@ def test_write_raw_is_the_inverse_of_the_reader(tmp_path: Path) -> None:
         assert np.all(worst <= np.array([1.1e-6, 0.51e-5, 0, 0.51e-6, 0.51e-5]) * DEG + [0, 0, 0.51e-6, 0, 0])
 
 
-@pytest.mark.parametrize("key", [EpisodeKey("7", "load", "0"), EpisodeKey("000007", "hot", "0"), EpisodeKey("000007", "load", "a")])
+@pytest.mark.parametrize(
+    "key", [EpisodeKey("7", "load", "0"), EpisodeKey("000007", "hot", "0"), EpisodeKey("000007", "load", "a")]
+)
 def test_write_raw_refuses_other_names(tmp_path: Path, key: EpisodeKey) -> None:
     population = from_arrays({key: simulated()}, prepared_channels(), 1e-3)
     with pytest.raises(DataError, match="needs a unit of six digits"):
@@ -198,7 +212,9 @@ def test_write_raw_refuses_other_names(tmp_path: Path, key: EpisodeKey) -> None:
 
 
 def test_write_raw_refuses_other_channels(tmp_path: Path) -> None:
-    population = from_arrays({EpisodeKey("000007", c, "0"): simulated() for c in ("load", "noload")}, prepared_channels(), 1e-3)
+    population = from_arrays(
+        {EpisodeKey("000007", c, "0"): simulated() for c in ("load", "noload")}, prepared_channels(), 1e-3
+    )
     write_raw(population, tmp_path / "raw")
     with pytest.raises(DataError, match="needs the channels"):
         write_raw(from_arrays({"000007": [np.ones((9, 1))]}, prepared_channels()[:1], 1e-3), tmp_path / "other")

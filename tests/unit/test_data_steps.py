@@ -90,7 +90,9 @@ def test_resampling_keeps_slow_and_removes_what_would_alias() -> None:
     slow, fast = np.sin(2 * np.pi * 3 * time), np.sin(2 * np.pi * 97 * time)  # 97 Hz aliases to 3 Hz at 50 Hz
     result = resample_even(time, np.column_stack([slow, fast]), 0.001, 0.02)
     middle = slice(50, -50)
-    np.testing.assert_allclose(result[middle, 0], np.sin(2 * np.pi * 3 * 0.02 * np.arange(len(result)))[middle], atol=5e-3)
+    np.testing.assert_allclose(
+        result[middle, 0], np.sin(2 * np.pi * 3 * 0.02 * np.arange(len(result)))[middle], atol=5e-3
+    )
     assert np.abs(result[middle, 1]).max() < 5e-3
     assert np.abs(fast[::20]).max() > 0.9  # thinning alone would have kept it
 
@@ -106,7 +108,9 @@ def test_lowpass_gain_against_theory() -> None:
 def frame_population(time: np.ndarray) -> Population:
     pd = pytest.importorskip("pandas")
     rng = np.random.default_rng(0)
-    frame = pd.DataFrame({"unit": "a", "t": time, "x": np.sin(time), "y": np.cos(time), "u": rng.standard_normal(len(time))})
+    frame = pd.DataFrame(
+        {"unit": "a", "t": time, "x": np.sin(time), "y": np.cos(time), "u": rng.standard_normal(len(time))}
+    )
     return from_frame(frame, CHANNELS, time="t")
 
 

@@ -34,7 +34,9 @@ def episodes(amplitudes: float = 0.0) -> dict[str, list[np.ndarray]]:
     k = np.arange(SAMPLES)[:, None]
 
     def episode(size: float) -> np.ndarray:
-        return (1 + 0.05 * rng.normal(size=3)) * size * np.sin(0.1 * k + rng.uniform(0, 6, 3)) + 1e-3 * size * rng.normal(size=(SAMPLES, 3))
+        return (1 + 0.05 * rng.normal(size=3)) * size * np.sin(
+            0.1 * k + rng.uniform(0, 6, 3)
+        ) + 1e-3 * size * rng.normal(size=(SAMPLES, 3))
 
     return {f"u{u}": [episode(size) for size in shape] for u in range(UNITS)}
 
@@ -73,7 +75,9 @@ def test_good_recordings_give_no_alert_of_scales(amplitudes: float) -> None:
 def test_wild_samples_are_refused_with_their_place(value: float, sample: int) -> None:
     data = episodes()
     data["u4"][1][sample, 1] = value
-    with pytest.raises(DataError, match=rf"Episode 1 of unit u4 \(default\): channel 'speed' (is|has) .* at sample {sample}[,;]"):
+    with pytest.raises(
+        DataError, match=rf"Episode 1 of unit u4 \(default\): channel 'speed' (is|has) .* at sample {sample}[,;]"
+    ):
         survey(population(data))
 
 
@@ -90,13 +94,17 @@ def test_pulses_and_channels_at_rest_are_no_wild_samples() -> None:
 def test_short_episodes_are_named() -> None:
     data = episodes()
     data["u1"][3] = data["u1"][3][:50]
-    with pytest.raises(DataError, match=r"at least 64 samples after preparation; Episode 3 of unit u1 \(default\) has 50"):
+    with pytest.raises(
+        DataError, match=r"at least 64 samples after preparation; Episode 3 of unit u1 \(default\) has 50"
+    ):
         survey(population(data), fewest=64)
 
 
 def written(folder: Path, name: str, time: np.ndarray, values: np.ndarray) -> None:
     folder.mkdir(exist_ok=True)
-    np.savetxt(folder / name, np.column_stack([time, values]), delimiter=",", header="t,angle,speed,torque", comments="")
+    np.savetxt(
+        folder / name, np.column_stack([time, values]), delimiter=",", header="t,angle,speed,torque", comments=""
+    )
 
 
 def test_a_repeated_last_stamp_drops_the_sample_and_uneven_time_names_the_file(tmp_path: Path, caplog) -> None:

@@ -9,7 +9,18 @@ import pytest
 
 from kros.core.artifacts import read_json
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeBatch, Population, Role, TrueChannel, from_arrays, prepare, read, steps, write_parquet
+from kros.data import (
+    Channel,
+    EpisodeBatch,
+    Population,
+    Role,
+    TrueChannel,
+    from_arrays,
+    prepare,
+    read,
+    steps,
+    write_parquet,
+)
 from kros.data.readers.parquet import read_parquet
 from kros.data.scaled import scale_population
 from kros.data.survey import survey
@@ -23,7 +34,9 @@ def recorded(channels: tuple[Channel, ...] = (TRUTH, *CHANNELS), seed: int = 3) 
     """Two units with two episodes; the truth is the first column of the arrays."""
     rng = np.random.default_rng(seed)
     data = {unit: [rng.standard_normal((40 + e, 4)) for e in range(2)] for unit in "ab"}
-    return from_arrays({u: [e[:, 4 - len(channels) :] for e in episodes] for u, episodes in data.items()}, channels, 0.1)
+    return from_arrays(
+        {u: [e[:, 4 - len(channels) :] for e in episodes] for u, episodes in data.items()}, channels, 0.1
+    )
 
 
 def test_a_truth_is_no_channel() -> None:
@@ -63,7 +76,9 @@ def test_a_csv_mapping_declares_a_truth(tmp_path: Path) -> None:
     rng, rows = np.random.default_rng(1), {}
     for unit in "ab":
         rows[unit] = rng.standard_normal((20, 3))
-        (tmp_path / f"{unit}.csv").write_text("\n".join(["x,w,u", *(",".join(map(repr, map(float, row))) for row in rows[unit])]))
+        (tmp_path / f"{unit}.csv").write_text(
+            "\n".join(["x,w,u", *(",".join(map(repr, map(float, row))) for row in rows[unit])])
+        )
     channel = [
         {"name": "x_true", "role": "truth", "of": "x", "column": "w"},
         {"name": "u", "role": "input", "column": "u"},
@@ -72,8 +87,14 @@ def test_a_csv_mapping_declares_a_truth(tmp_path: Path) -> None:
     found = read(tmp_path, "csv", {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": channel})
     assert (found.states, found.inputs, found.true_states) == (("x",), ("u",), (0,))
     np.testing.assert_array_equal(found.read_with_truths(found.episodes[0])[1], rows["a"][:, [1]])
-    hidden = [*channel, {"name": "v", "role": "state", "column": "gone"}, {"name": "v_true", "role": "truth", "of": "v", "column": "w"}]
-    in_the_field = read(tmp_path, "csv", {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": hidden}, optional=["v"])
+    hidden = [
+        *channel,
+        {"name": "v", "role": "state", "column": "gone"},
+        {"name": "v_true", "role": "truth", "of": "v", "column": "w"},
+    ]
+    in_the_field = read(
+        tmp_path, "csv", {"files": r"(?P<unit>\w)\.csv", "sample_period_s": 0.1, "channel": hidden}, optional=["v"]
+    )
     assert [c.name for c in in_the_field.columns] == ["x", "u", "x_true"]
 
 
@@ -96,7 +117,13 @@ def test_a_truth_is_that_of_one_state(wrong: tuple[Channel, ...]) -> None:
 def test_a_simulated_velocity_is_the_slope_of_the_position(plant: str) -> None:
     """Its integral never leaves the measured position by more than a count and what the trapezium leaves out."""
     population = PLANTS[plant](n_units=1, n_episodes=1, seconds=4.0, seed=5).simulate().population
-    states, true = (a[0] for a in (population.read_parts(population.episodes[0]), population.read_with_truths(population.episodes[0])[1:]))
+    states, true = (
+        a[0]
+        for a in (
+            population.read_parts(population.episodes[0]),
+            population.read_with_truths(population.episodes[0])[1:],
+        )
+    )
     position, velocity = states[:, 0], true[:, 0]
     travelled = np.concatenate([[0.0], np.cumsum(velocity[1:] + velocity[:-1])]) * population.sample_period_s / 2
     assert np.abs(position - position[0] - travelled).max() < 1e-3 * np.ptp(position)

@@ -34,7 +34,9 @@ def population(units: tuple[str, ...] = ("a", "b"), **changes: Any) -> Populatio
         for e in range(3)
     }
     facts = [Unit(units[0], "outliers", {"built": "2022-09-15", "mass": 1.5})]
-    return from_arrays({**episodes, **changes}, CHANNELS, 0.01, units=facts, metadata={"plant": "test", "gear_ratio": 100})
+    return from_arrays(
+        {**episodes, **changes}, CHANNELS, 0.01, units=facts, metadata={"plant": "test", "gear_ratio": 100}
+    )
 
 
 def assert_same(found: Population, expected: Population) -> None:

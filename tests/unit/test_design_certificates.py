@@ -105,7 +105,9 @@ def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -
     made = [r.name for r in running]
     assert choose_deployed(None, made, running) == "koopman/kalman_tuned"
     assert choose_deployed(None, made, running[2:3]) == "koopman/residual_h2"
-    unbounded = replace(running[1], signals=signal_bound(refused, bad, batch_of(np.zeros((50, 1, 1)), np.zeros((50, 1, 1)), 1.0)))
+    unbounded = replace(
+        running[1], signals=signal_bound(refused, bad, batch_of(np.zeros((50, 1, 1)), np.zeros((50, 1, 1)), 1.0))
+    )
     assert choose_deployed(None, made, [running[0], unbounded]) == "koopman/open_loop"
     assert choose_deployed(None, made, [unbounded]) == "koopman/kalman_tuned"
     assert choose_deployed("koopman/open_loop", made, running) == "koopman/open_loop"

@@ -20,7 +20,10 @@ MOTIONS = RNG.normal(size=(2, N, 1))
 def recorded(episodes: dict[str, list[int]], noise: float = 0.0) -> tuple[Population, dict[str, list[np.ndarray]]]:
     """Units with episodes of motion 0 or 1, states of their own."""
     data = {
-        unit: [np.concatenate([RNG.normal(size=(N, 2)), MOTIONS[m] + noise * RNG.normal(size=(N, 1))], axis=1) for m in motions]
+        unit: [
+            np.concatenate([RNG.normal(size=(N, 2)), MOTIONS[m] + noise * RNG.normal(size=(N, 1))], axis=1)
+            for m in motions
+        ]
         for unit, motions in episodes.items()
     }
     names = {"states": ("x", "v"), "inputs": ("u",), "measured": ["x"]}
@@ -61,7 +64,8 @@ def test_inputs_that_differ_are_another_motion() -> None:
     population, _ = recorded({"a": [0, 0, 1], "b": [0, 0, 1], "c": [0, 0, 1]})
     train, test = training(population, 2)
     with pytest.raises(
-        DataError, match=r"held-out episode .* is no motion that training episodes of two units repeat; the nearest inputs differ by \d"
+        DataError,
+        match=r"held-out episode .* is no motion that training episodes of two units repeat; the nearest inputs differ by \d",
     ):
         make_mean_profile(train, (0,), population, test)
     nearly, _ = recorded({"a": [0, 0], "b": [0, 0]}, noise=1e-3)

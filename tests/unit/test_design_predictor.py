@@ -25,7 +25,9 @@ def tuning():
     made = PLANTS["harmonic-drive"](n_units=3, n_episodes=3, seconds=3.0, seed=1).simulate()
     truth = made.truth.as_dict()["units"]
     keys = tuple(k for k in made.population.episodes if k.condition == "noload")
-    return TrainingSet(made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids})
+    return TrainingSet(
+        made.population, keys, {u: {"phase": truth[u]["phase_rad"][0]} for u in made.population.unit_ids}
+    )
 
 
 def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="memory", **settings):
@@ -42,7 +44,10 @@ def task(tuning, lifting=DRIVE, measured=(0,), name="koopman/memory", method="me
         B=np.zeros((1, lifting.n_lifted, 2)),
         index=lambda unit: 0,
     )
-    options = {"settings": SynthesisSettings(**settings), "predictor": PredictorSettings(effort="quick", states=4, steps=2)}
+    options = {
+        "settings": SynthesisSettings(**settings),
+        "predictor": PredictorSettings(effort="quick", states=4, steps=2),
+    }
     return DesignTask(name, method, models, "001001", None, "there is no set", np.array([1e-5]), tuning, **options)
 
 

@@ -29,7 +29,9 @@ def task():
     systems = population()
     nominal = StateSpace(systems.A[1], systems.B[1], np.eye(2), np.zeros((2, 2)), DT)
     wide = gain(0.3 * np.eye(2), DT)
-    problem = ObserverProblem(nominal, np.eye(2)[[0]], wide, gain(np.eye(2), DT), np.ones(2), np.ones(2), np.array([1e-3]))
+    problem = ObserverProblem(
+        nominal, np.eye(2)[[0]], wide, gain(np.eye(2), DT), np.ones(2), np.ones(2), np.array([1e-3])
+    )
     models = SimpleNamespace(systems=lambda ids: systems, output_scale=np.ones(2), input_scale=np.ones(2))
     settings = SimpleNamespace(time_limit_s=20.0)
     return SimpleNamespace(

@@ -41,7 +41,9 @@ def ordinary(monkeypatch) -> Any:
     return quantified
 
 
-@pytest.mark.parametrize(("form", "outputs"), [("inverse_input_multiplicative", 2), ("additive", 2), ("output_multiplicative", 1)])
+@pytest.mark.parametrize(
+    ("form", "outputs"), [("inverse_input_multiplicative", 2), ("additive", 2), ("output_multiplicative", 1)]
+)
 def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(ordinary, form, outputs):
     units, freqs = fleet(outputs=outputs), np.geomspace(0.05, 49, 50)
     options = {"max_order": 2}
@@ -54,7 +56,9 @@ def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(
     assert (own - theirs).max() <= 0.5  # dB; diagonal fits of few units have other ends, here lower ones
     dense = np.geomspace(1e-3, 49.9, 1500)
     G, Gp = found.nominal_system.frequency_response(dense), units.frequency_response(dense)
-    pairs = [(residual(form, G, Gp), found.weight)] + ([(completion(form, G, Gp)[1], found.remainder)] if found.remainder else [])
+    pairs = [(residual(form, G, Gp), found.weight)] + (
+        [(completion(form, G, Gp)[1], found.remainder)] if found.remainder else []
+    )
     assert (found.remainder is None) == (expected.remainder is None)
     for E, weight in pairs:
         used = weight.magnitudes(dense)

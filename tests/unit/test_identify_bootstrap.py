@@ -22,7 +22,9 @@ def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSampl
     rng = np.random.default_rng(1)
     A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
     whole = KoopmanMatrices(np.tile(A, (units, 1, 1)), np.tile(B, (units, 1, 1)))
-    drawn = KoopmanMatrices(A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2)))
+    drawn = KoopmanMatrices(
+        A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2))
+    )
     return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
 
 
@@ -60,7 +62,9 @@ def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
     padded = np.concatenate([R, np.zeros((1, 2, 5, 5))], axis=1)
     weights = episode_weights([3], 6, 0)
     wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
-    np.testing.assert_allclose(bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9)
+    np.testing.assert_allclose(
+        bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("linear", [False, True])
@@ -74,13 +78,20 @@ def test_responses_of_samples_are_those_of_their_models_or_first_order(linear: b
             Phi = np.linalg.inv(z * np.eye(2) - A)
             for draw, (As, Bs) in enumerate(zip(made.samples.A[unit], made.samples.B[unit], strict=True)):
                 full = np.linalg.inv(z * np.eye(2) - As) @ Bs
-                np.testing.assert_allclose(found[draw, k], Phi @ B + Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full, rtol=1e-7)
+                np.testing.assert_allclose(
+                    found[draw, k], Phi @ B + Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full, rtol=1e-7
+                )
 
 
 @pytest.mark.parametrize("lengths", [[50, 50, 50, 50], [50, 50], [50]])
 def test_segments_are_told_apart_by_episode_as_they_were_drawn(lengths: list[int]) -> None:
-    data = {EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0] for e, n in enumerate(lengths)}
-    made = Population((Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__)
+    data = {
+        EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0]
+        for e, n in enumerate(lengths)
+    }
+    made = Population(
+        (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__
+    )
     keys = {"u": tuple(data)}
     drawn = read_segments(made, keys, horizon=10, count=9, seed=0)
     np.testing.assert_array_equal(segment_owners(keys, 9)[0], drawn.states[0, 0, 0] // 1000)

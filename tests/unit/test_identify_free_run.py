@@ -14,7 +14,11 @@ LIFTING = Lifting(("position", "velocity"), ("sin(5*position + phase)",), ("phas
 def models(n_units=3, seed=0):
     rng = np.random.default_rng(seed)
     A = 0.5 * rng.normal(size=(n_units, 3, 3)) / 3
-    channels = (Channel("position", Role.STATE, "rad", True), Channel("velocity", Role.STATE, "rad/s"), Channel("u", Role.INPUT))
+    channels = (
+        Channel("position", Role.STATE, "rad", True),
+        Channel("velocity", Role.STATE, "rad/s"),
+        Channel("u", Role.INPUT),
+    )
     return ModelSet(
         name="koopman_edmd",
         condition="noload",

@@ -14,7 +14,9 @@ from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
 
-@pytest.mark.parametrize("wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}])
+@pytest.mark.parametrize(
+    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}]
+)
 def test_options_out_of_range_are_refused(wrong: dict) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         RefineOptions(**wrong)
@@ -22,8 +24,13 @@ def test_options_out_of_range_are_refused(wrong: dict) -> None:
 
 def population(lengths: list[int]) -> tuple[Population, dict]:
     """One unit whose episode e counts up from 1000 e."""
-    data = {EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0] for e, n in enumerate(lengths)}
-    made = Population((Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__)
+    data = {
+        EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0]
+        for e, n in enumerate(lengths)
+    }
+    made = Population(
+        (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__
+    )
     return made, {"u": tuple(data)}
 
 

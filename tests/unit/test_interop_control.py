@@ -22,7 +22,9 @@ FREQS_HZ = np.array([0.1, 3.0, 40.0])
 def random_batch(*batch: int) -> StateSpace:
     rng = np.random.default_rng(1)
     A = 0.3 * rng.normal(size=(*batch, 3, 3))
-    return StateSpace(A, rng.normal(size=(*batch, 3, 2)), rng.normal(size=(*batch, 4, 3)), rng.normal(size=(*batch, 4, 2)), DT)
+    return StateSpace(
+        A, rng.normal(size=(*batch, 3, 2)), rng.normal(size=(*batch, 4, 3)), rng.normal(size=(*batch, 4, 2)), DT
+    )
 
 
 def models(n_units: int = 3) -> ModelSet:
@@ -33,7 +35,11 @@ def models(n_units: int = 3) -> ModelSet:
         name="koopman",
         condition="default",
         lifting=lifting,
-        channels=(Channel("position", Role.STATE, measured=True), Channel("velocity", Role.STATE), Channel("target", Role.INPUT)),
+        channels=(
+            Channel("position", Role.STATE, measured=True),
+            Channel("velocity", Role.STATE),
+            Channel("target", Role.INPUT),
+        ),
         sample_period_s=DT,
         unit_ids=tuple(f"unit.{i}" for i in range(n_units)),
         A=A,
@@ -51,7 +57,11 @@ def test_a_system_keeps_its_response_both_ways() -> None:
     response = there.frequency_response(2 * np.pi * FREQS_HZ).frdata
     assert np.allclose(np.moveaxis(response, -1, 0), system.frequency_response(FREQS_HZ), rtol=1e-12, atol=0)
     assert (there.name, there.dt) == ("drive", DT)
-    assert (there.state_labels, there.input_labels, there.output_labels) == (["a", "b", "c"], ["u", "v"], ["p", "q", "r", "s"])
+    assert (there.state_labels, there.input_labels, there.output_labels) == (
+        ["a", "b", "c"],
+        ["u", "v"],
+        ["p", "q", "r", "s"],
+    )
     back = from_control(there)
     assert all(np.array_equal(getattr(back, name), getattr(system, name)) for name in "ABCD")
     assert back.dt == DT
@@ -81,7 +91,9 @@ def test_an_unknown_sampling_period_is_refused(dt: bool | None) -> None:
 def test_a_transfer_function_is_realised_and_responses_are_refused() -> None:
     system = from_control(control.tf([1.0], [1.0, -0.5], DT))
     assert system.frequency_response([0.0]).item() == pytest.approx(2.0)
-    with pytest.raises(DimensionError, match=r"needs a control\.StateSpace or control\.TransferFunction, found FrequencyResponseData"):
+    with pytest.raises(
+        DimensionError, match=r"needs a control\.StateSpace or control\.TransferFunction, found FrequencyResponseData"
+    ):
         from_control(control.frd(control.tf([1.0], [1.0, -0.5], DT), [1.0]))
 
 
@@ -96,7 +108,10 @@ def test_models_carry_the_names_of_their_signals() -> None:
     systems = models_to_control(population)
     assert list(systems) == ["unit.0", "unit.1", "unit.2"]
     labels = ["position", "velocity", "sin(0·5*position + phase)"]
-    assert all(s.state_labels == labels and s.output_labels == labels and s.input_labels == ["target"] for s in systems.values())
+    assert all(
+        s.state_labels == labels and s.output_labels == labels and s.input_labels == ["target"]
+        for s in systems.values()
+    )
     assert systems["unit.1"].name == "unit·1"
     assert np.array_equal(systems["unit.1"].A, population.A[1])
     assert list(models_to_control(population, ["unit.2"])) == ["unit.2"]

@@ -37,7 +37,10 @@ def recording(lengths: tuple[int, ...] = (60, 40, 50)) -> np.ndarray:
 
 
 def frame(ids: tuple[Any, ...] = ("a", "b", "c"), lengths: tuple[int, ...] = (60, 40, 50)) -> pd.DataFrame:
-    parts = [pd.DataFrame(episode(n, i), columns=NAMES).assign(episode=e) for i, (e, n) in enumerate(zip(ids, lengths, strict=True))]
+    parts = [
+        pd.DataFrame(episode(n, i), columns=NAMES).assign(episode=e)
+        for i, (e, n) in enumerate(zip(ids, lengths, strict=True))
+    ]
     return pd.concat(parts, ignore_index=True)
 
 
@@ -49,7 +52,9 @@ def pairs() -> tuple[np.ndarray, np.ndarray]:
 
 
 def regressor(**options: Any) -> KoopmanRegressor:
-    return KoopmanRegressor(**{"functions": FUNCTIONS, "states": NAMES[:2], "n_inputs": 1, "episode_feature": True, **options})
+    return KoopmanRegressor(
+        **{"functions": FUNCTIONS, "states": NAMES[:2], "n_inputs": 1, "episode_feature": True, **options}
+    )
 
 
 def is_exact(model: KoopmanRegressor) -> bool:

@@ -231,7 +231,9 @@ def test_what_recordings_do_not_show_is_named(caplog):
     still = u * [1.0, 0.0] + [0.0, 2.0]
     lifting = Lifting(STATES, ("position**2", "3*position**2 + current"))
     factor = Factor.stack([reduce_episode(x, u, lifting), reduce_episode(x, still, lifting)])
-    with pytest.raises(IdentificationError, match=r"unit b \(load\): input 'target' is constant \(2\) .* use alpha > 0"):
+    with pytest.raises(
+        IdentificationError, match=r"unit b \(load\): input 'target' is constant \(2\) .* use alpha > 0"
+    ):
         require_excitation(factor, INPUTS, ("a", "b"), "load")
     require_excitation(factor, INPUTS, ("a", "b"), "load", alpha=1.0)
     assert "unit b (load): input 'target' is constant (2)" in caplog.text
@@ -242,4 +244,6 @@ def test_what_recordings_do_not_show_is_named(caplog):
     with pytest.raises(IdentificationError, match=r"unit a \(load\): '3\*position\*\*2 \+ current' follows from"):
         require_independent(lifted, lifting.names + INPUTS, ("a", "b"), "load")
     good = Lifting(STATES, ("position**2",))
-    require_independent(lifted_factor(Factor.stack([reduce_episode(x, u, good)]), good, {}, good), good.names + INPUTS, ("a",), "load")
+    require_independent(
+        lifted_factor(Factor.stack([reduce_episode(x, u, good)]), good, {}, good), good.names + INPUTS, ("a",), "load"
+    )

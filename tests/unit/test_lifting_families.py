@@ -20,7 +20,9 @@ def values(functions, parameters=None):
     return lifting.lift(X, parameters)[:, 3:]
 
 
-@pytest.mark.parametrize("value", [0.1, 1 / 3, -2.5e-300, 1e22, 123456789.0, 5e-324, -0.0, np.pi, 1e15, np.nextafter(1, 2)])
+@pytest.mark.parametrize(
+    "value", [0.1, 1 / 3, -2.5e-300, 1e22, 123456789.0, 5e-324, -0.0, np.pi, 1e15, np.nextafter(1, 2)]
+)
 def test_numbers_survive_their_text(value):
     found = float(Lifting(("x",), (f"x*({number(value)})",)).lift([[1.0]])[0, 1]) if value else float(number(value))
     assert found == value
@@ -80,7 +82,9 @@ def test_fourier_features_approximate_the_gaussian_kernel():
     n, length = 40_000, np.array([0.8, 2.0])
     x = np.random.default_rng(6).normal(size=(15, 2))
     texts = fourier_features(["a", "b"], n, length, 7)
-    numbers = np.array([re.findall(r"-?[\d.]+(?:e[-+]?\d+)?", text) for text in texts], dtype=float)  # size, w_a, w_b, b
+    numbers = np.array(
+        [re.findall(r"-?[\d.]+(?:e[-+]?\d+)?", text) for text in texts], dtype=float
+    )  # size, w_a, w_b, b
     features = numbers[:, 0] * np.cos(x @ numbers[:, 1:3].T + numbers[:, 3])
     offset = (x[:, None] - x) / length
     expected = np.exp(-(offset**2).sum(-1) / 2)
@@ -118,9 +122,14 @@ def test_delays():
         (lambda: concatenate(polynomials(["a"], 2), ("a**2",)), r"'a\*\*2' appears more than once"),
         (lambda: family({"kind": "wavelets"}), "known are harmonics"),
         (lambda: family({"kind": "delays", "names": ["a"], "depths": 2}), "unknown key 'depths', 'depth' is missing"),
-        (lambda: family({"kind": "radial", "names": ["a"], "centres": {"kind": "spiral"}, "length": 1}), "known are kmeans"),
         (
-            lambda: family({"kind": "radial", "names": ["a"], "centres": {"kind": "kmeans", "n": 3, "seed": 0}, "length": 1}),
+            lambda: family({"kind": "radial", "names": ["a"], "centres": {"kind": "spiral"}, "length": 1}),
+            "known are kmeans",
+        ),
+        (
+            lambda: family(
+                {"kind": "radial", "names": ["a"], "centres": {"kind": "kmeans", "n": 3, "seed": 0}, "length": 1}
+            ),
             "'data' is missing",
         ),
         (lambda: family({"kind": "radial", "names": ["a"], "centres": "here", "length": 1}), "could not convert"),

@@ -68,7 +68,9 @@ def test_error_names_what_is_known():
 
 def test_separation_rebuilds_the_lifting_for_any_phase():
     lifting = Lifting(
-        ("position", "velocity"), ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"), ("phase",)
+        ("position", "velocity"),
+        ("sin(100*position + phase)", "2*cos(position - 3*phase)*velocity", "velocity**2"),
+        ("phase",),
     )
     x = np.random.default_rng(2).normal(size=(30, 2))
     phase = np.random.default_rng(3).uniform(0, 2 * np.pi, 30)

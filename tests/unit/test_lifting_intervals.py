@@ -91,9 +91,9 @@ LEAVES = st.sampled_from(["x", "y", "q", "0.5", "2", "-1.25", "3"])
 
 def grow(inner):
     return st.one_of(
-        st.tuples(st.sampled_from(["sin", "cos", "tanh", "atan", "abs", "exp", "sign", "sqrt", "log", "tan"]), inner).map(
-            "{0[0]}({0[1]})".format
-        ),
+        st.tuples(
+            st.sampled_from(["sin", "cos", "tanh", "atan", "abs", "exp", "sign", "sqrt", "log", "tan"]), inner
+        ).map("{0[0]}({0[1]})".format),
         st.tuples(inner, st.sampled_from(["+", "-", "*", "/"]), inner).map("({0[0]} {0[1]} {0[2]})".format),
         st.tuples(inner, st.sampled_from(["2", "3", "-1", "-2", "0.5"])).map("({0[0]})**{0[1]}".format),
     )
@@ -127,19 +127,24 @@ def test_no_sample_escapes(text, middle, half):
             found = np.asarray(evaluator(values), dtype=float)
         lower, upper = bounds_of([expression], box)
         found = found[~np.isnan(found)]
-        slack = 1e-9 * np.maximum(1, np.abs(np.where(np.isfinite(found), found, 1)))  # log(0) is where it should be, too
+        slack = 1e-9 * np.maximum(
+            1, np.abs(np.where(np.isfinite(found), found, 1))
+        )  # log(0) is where it should be, too
         assert np.all((found >= lower - slack) & (found <= upper + slack)), (text, expression)
 
 
 @settings(max_examples=100, deadline=None, derandomize=True)
 @given(
-    text=st.recursive(LEAVES, grow, max_leaves=4), middle=st.tuples(*[st.floats(-3, 3)] * 3), half=st.sampled_from([0.0, 1e-12, 1e-6, 1e-2])
+    text=st.recursive(LEAVES, grow, max_leaves=4),
+    middle=st.tuples(*[st.floats(-3, 3)] * 3),
+    half=st.sampled_from([0.0, 1e-12, 1e-6, 1e-2]),
 )
 def test_bounds_hold_in_exact_arithmetic(text, middle, half):
     """Values in 60 digits lie between the bounds, without any slack, where large terms cancel too."""
     try:
         formulas = [
-            Formula(cancelling, ("x", "y", "q")) for cancelling in (text, f"1e15*(sin({text}) - ({text}))", f"1e18*tanh(40*({text}))")
+            Formula(cancelling, ("x", "y", "q"))
+            for cancelling in (text, f"1e15*(sin({text}) - ({text}))", f"1e18*tanh(40*({text}))")
         ]
         trees = [tree for formula in formulas for tree in (formula.expression, formula.derivative("x"))]
     except ConfigError:
@@ -153,13 +158,16 @@ def test_bounds_hold_in_exact_arithmetic(text, middle, half):
         except ConfigError:
             continue
         for corner in itertools.product(*box.values()):
-            exact = tree.subs({s: sp.Rational(dict(zip("xyq", corner, strict=True))[s.name]) for s in tree.free_symbols}).evalf(60)
+            exact = tree.subs(
+                {s: sp.Rational(dict(zip("xyq", corner, strict=True))[s.name]) for s in tree.free_symbols}
+            ).evalf(60)
             if exact.is_real and exact.is_finite:
                 assert sp.Float(lower[0], 60) <= exact <= sp.Float(upper[0], 60), (text, tree, corner)
 
 
 @pytest.mark.parametrize(
-    ("text", "box", "secant"), [("1e18*tanh(40*x)", (0.5, 1.0), 16.9933), ("1e15*(sin(x) - x)", (-1e-8, 1e-8), -0.0166667)]
+    ("text", "box", "secant"),
+    [("1e18*tanh(40*x)", (0.5, 1.0), 16.9933), ("1e15*(sin(x) - x)", (-1e-8, 1e-8), -0.0166667)],
 )
 def test_slopes_hold_where_everything_cancels(text, box, secant):
     """Secants computed in 60 digits."""

@@ -75,7 +75,9 @@ def test_multiplying_out_has_an_end():
         lambda: polynomials(["x", "y", "z"], 10**6),
         lambda: polynomials(["x"], 10**400),
         lambda: fourier_features(["x"], 10**12, 1.0, 0),
-        lambda: check_family({"kind": "radial", "names": ["x"], "length": 1, "centres": {"kind": "kmeans", "n": 10**12, "seed": 0}}),
+        lambda: check_family(
+            {"kind": "radial", "names": ["x"], "length": 1, "centres": {"kind": "kmeans", "n": 10**12, "seed": 0}}
+        ),
         lambda: check_family({"kind": "harmonics", "angle": 5}),
         lambda: check_family({"kind": "harmonics", "angle": "x", "ratio": 10**400}),
         lambda: check_family({"kind": "harmonics", "angle": "x", "orders": 3}),
@@ -125,7 +127,16 @@ def test_slopes_between_any_two_points_are_within_the_bounds(seed):
     """Difference quotients over the whole box, across what may be a jump."""
     rng = np.random.default_rng(seed)
     away = {"x": (0.5, 1.2), "y": (-1, 1)}
-    for text in [*JUMPS, "abs(x)", "x/(1 + abs(x))", "atan(tan(x/4))", "1/(2 + cos(x))", "x*abs(y)", "sqrt(1 + x**2)", "tan(sin(x))"]:
+    for text in [
+        *JUMPS,
+        "abs(x)",
+        "x/(1 + abs(x))",
+        "atan(tan(x/4))",
+        "1/(2 + cos(x))",
+        "x*abs(y)",
+        "sqrt(1 + x**2)",
+        "tan(sin(x))",
+    ]:
         for box in (away, {"x": (-2, 2), "y": (-1, 1)}):
             lifting = Lifting(("x", "y"), (text,))
             (lower,), (upper,) = lifting.slope_bounds(box)

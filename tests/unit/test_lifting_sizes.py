@@ -33,7 +33,9 @@ def test_values_and_slopes_are_those_of_the_formulas_over_their_sizes():
     out, into = scaled.sizes_of(FULL.names), scaled.sizes_of(("voltage", "voltage*velocity"))
     values, u_recorded = {"phase": 0.4}, u * SIZES["voltage"]
     np.testing.assert_allclose(scaled.lift(window, values) * out, FULL.lift(window * by, values), rtol=1e-9)
-    np.testing.assert_allclose(scaled.lift_inputs(u, window, values) * into, FULL.lift_inputs(u_recorded, window * by, values), rtol=1e-12)
+    np.testing.assert_allclose(
+        scaled.lift_inputs(u, window, values) * into, FULL.lift_inputs(u_recorded, window * by, values), rtol=1e-12
+    )
     recorded = FULL.slopes(window * by, values) * by
     np.testing.assert_allclose(scaled.slopes(window, values) * out[2:, None], recorded, rtol=1e-6)
 
@@ -41,12 +43,19 @@ def test_values_and_slopes_are_those_of_the_formulas_over_their_sizes():
 def test_boxes_are_in_the_same_sizes():
     plain = Lifting(("x",), ("x**2",))
     np.testing.assert_allclose(plain.slope_bounds({"x": (-1.0, 3.0)})[1], 6.0)
-    np.testing.assert_allclose(plain.in_sizes({"x": 100.0, "x**2": 50.0}).slope_bounds({"x": (-0.01, 0.03)})[1], 6.0 * 100 / 50)
+    np.testing.assert_allclose(
+        plain.in_sizes({"x": 100.0, "x**2": 50.0}).slope_bounds({"x": (-0.01, 0.03)})[1], 6.0 * 100 / 50
+    )
 
 
 def test_sizes_travel_between_processes_and_into_files():
     scaled = FULL.in_sizes(SIZES)
     assert pickle.loads(pickle.dumps(scaled)) == scaled
-    content = {"states": scaled.states, "lifting": scaled.functions, "parameters": scaled.parameters, **scaled.extension()}
+    content = {
+        "states": scaled.states,
+        "lifting": scaled.functions,
+        "parameters": scaled.parameters,
+        **scaled.extension(),
+    }
     assert Lifting.from_content(content) == scaled
     assert "sizes" not in FULL.extension()

@@ -59,7 +59,9 @@ def test_open_loop_equals_a_free_run_from_the_first_measurement():
     y, u = rng.normal(size=(30, 4, 1)), rng.normal(size=(30, 4, 2))
     x0 = np.concatenate([y[0], np.zeros((4, 2))], axis=1)
     free = free_run(o.A, o.B, LIFTING, {"phase": 0.7}, x0, np.swapaxes(u, 0, 1))
-    np.testing.assert_allclose(np.swapaxes(run_observer(silent, y, u, {"phase": np.full(4, 0.7)}), 0, 1), free, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        np.swapaxes(run_observer(silent, y, u, {"phase": np.full(4, 0.7)}), 0, 1), free, rtol=1e-12, atol=1e-12
+    )
 
 
 def test_episodes_of_different_length_are_held_at_their_end():

@@ -20,9 +20,22 @@ def observer(**changes: Any) -> Observer:
     lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))
     K = StateSpace(np.eye(2) / 2, np.ones((2, 1)), np.ones((3, 2)), np.ones((3, 1)), 0.01)
     runtime = Runtime(delay=1, lower=np.array([-1.0, -np.inf]))
-    parts: dict[str, Any] = {"A": np.diag([0.9, 0.8, 0.1]), "B": np.ones((3, 1)), "measured": (0,), "parameters": {"phase": 0.3}, **changes}
+    parts: dict[str, Any] = {
+        "A": np.diag([0.9, 0.8, 0.1]),
+        "B": np.ones((3, 1)),
+        "measured": (0,),
+        "parameters": {"phase": 0.3},
+        **changes,
+    }
     return Observer(
-        "o", lifting, inputs=("torque",), controller=K, injection=Injection.STATE, sample_period_s=0.01, runtime=runtime, **parts
+        "o",
+        lifting,
+        inputs=("torque",),
+        controller=K,
+        injection=Injection.STATE,
+        sample_period_s=0.01,
+        runtime=runtime,
+        **parts,
     )
 
 
@@ -57,17 +70,25 @@ DEL = object()
 
 def test_what_was_saved_is_what_runs(tmp_path: Path) -> None:
     observer().save(str(tmp_path / "o.json"))
-    again, y, u = Observer.load(str(tmp_path / "o.json")), np.random.default_rng(0).normal(size=(50, 1, 1)), np.ones((50, 1, 1))
+    again, y, u = (
+        Observer.load(str(tmp_path / "o.json")),
+        np.random.default_rng(0).normal(size=(50, 1, 1)),
+        np.ones((50, 1, 1)),
+    )
     np.testing.assert_array_equal(again.run(y, u), observer().run(y, u))
 
 
-def test_a_file_without_checksum_is_validated_and_said_to_have_none(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_file_without_checksum_is_validated_and_said_to_have_none(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     with caplog.at_level(logging.WARNING):
         Observer.load(changed(tmp_path / "o.json", put("model", "A", 0, 0, 0.5)))
     assert "no checksum" in caplog.text
 
 
-@pytest.mark.parametrize("change", [put("model", "A", 0, 0, 0.5), put("name", "p"), put("sample_period_s", 0.02), put("runtime", DEL)])
+@pytest.mark.parametrize(
+    "change", [put("model", "A", 0, 0, 0.5), put("name", "p"), put("sample_period_s", 0.02), put("runtime", DEL)]
+)
 def test_a_changed_file_does_not_fit_its_checksum(tmp_path: Path, change: Callable[[Any], None]) -> None:
     with pytest.raises(DataError, match=r"o\.json: the content does not fit its checksum"):
         Observer.load(changed(tmp_path / "o.json", change, checksum=True))
@@ -118,9 +139,14 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 
 def predictor(**changes: Any) -> Observer:
     """Measurements replace the estimate of the position; the last state is the observer's own."""
-    lifting, A = Lifting(("position", "memory_1"), ("sin(position)",)), np.array([[0.9, 0.1, 0.0], [0.2, 0.5, 0.3], [0.0, 0.0, 0.0]])
+    lifting, A = (
+        Lifting(("position", "memory_1"), ("sin(position)",)),
+        np.array([[0.9, 0.1, 0.0], [0.2, 0.5, 0.3], [0.0, 0.0, 0.0]]),
+    )
     kinds = {"replaces": True, "internal": 1} | changes
-    return Observer("p", lifting, A, np.ones((3, 1)), (0,), ("torque",), gain(A[:, :1], 0.01), Injection.STATE, 0.01, **kinds)
+    return Observer(
+        "p", lifting, A, np.ones((3, 1)), (0,), ("torque",), gain(A[:, :1], 0.01), Injection.STATE, 0.01, **kinds
+    )
 
 
 def test_a_kind_that_the_matrices_do_not_have_is_refused() -> None:

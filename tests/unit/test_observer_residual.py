@@ -80,4 +80,6 @@ def test_banks_that_make_no_sense(options):
 
 def test_unobservable_plants_are_refused():
     with pytest.raises(SynthesisError, match="not detectable"):
-        residual_h2(ResidualProblem(np.diag([0.5, 1.2]), C, np.broadcast_to(np.eye(2) + 0j, (1, 65, 2, 2)), NOISE, SCALE, DT))
+        residual_h2(
+            ResidualProblem(np.diag([0.5, 1.2]), C, np.broadcast_to(np.eye(2) + 0j, (1, 65, 2, 2)), NOISE, SCALE, DT)
+        )

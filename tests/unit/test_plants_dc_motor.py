@@ -40,7 +40,10 @@ def test_parameters_spread_log_normally_around_the_nominal_ones():
     deviation = np.log(truth.viscous / 1e-4)
     assert abs(deviation.mean()) < 4 * 0.15 / 20  # four standard errors
     assert deviation.std() == pytest.approx(0.15, rel=0.15)
-    assert json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))["units"]["001"]["resistance"] == 1.0
+    assert (
+        json.loads(json.dumps(replace(SMALL, spread=0.0).simulate().truth.as_dict()))["units"]["001"]["resistance"]
+        == 1.0
+    )
 
 
 def test_the_command_writes_motors_with_their_truth(tmp_path):

@@ -10,7 +10,13 @@ import pytest
 from kros.core.errors import ConfigError, DataError
 from kros.data import EpisodeKey
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.parameters import NOMINAL, OUTLIER_LOG_FACTORS, RIPPLE_DEVIATION, draw_outlier, draw_parameters
+from kros.plants.harmonic_drive.parameters import (
+    NOMINAL,
+    OUTLIER_LOG_FACTORS,
+    RIPPLE_DEVIATION,
+    draw_outlier,
+    draw_parameters,
+)
 
 SMALL = HarmonicDrivePopulation(n_units=3, n_episodes=2, seconds=3.0, seed=4, outlier=True)
 LOADED = EpisodeKey("001002", "load", "1")
@@ -55,7 +61,9 @@ def test_a_unit_is_the_same_whatever_else_is_simulated(small):
     alone = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=4, conditions=("load",)).simulate()
     np.testing.assert_allclose(alone.population.read(LOADED), small.population.read(LOADED), atol=1e-9)
     for field in fields(alone.truth.parameters):
-        np.testing.assert_array_equal(getattr(alone.truth.parameters, field.name), getattr(small.truth.parameters, field.name)[1:3])
+        np.testing.assert_array_equal(
+            getattr(alone.truth.parameters, field.name), getattr(small.truth.parameters, field.name)[1:3]
+        )
 
 
 @pytest.mark.parametrize("spread", [0.5, 1.0, 2.0])

@@ -18,7 +18,11 @@ KEY = EpisodeKey("002", "default", "1")
 
 def test_population_has_two_states_and_an_input():
     population = SMALL.simulate().population
-    assert (population.states, population.inputs, population.measured) == (("position", "velocity"), ("torque",), ("position",))
+    assert (population.states, population.inputs, population.measured) == (
+        ("position", "velocity"),
+        ("torque",),
+        ("position",),
+    )
     assert population.unit_ids == ("000", "001", "002", "003")
     assert population.unit("000").group == "outliers"
     assert len(population.episodes) == 8
@@ -33,7 +37,9 @@ def test_truth_is_plain_json_and_the_outlier_is_stiff_jointed():
     assert bad["damping"] > 2 * good["damping"]
 
 
-@pytest.mark.parametrize("settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}])
+@pytest.mark.parametrize(
+    "settings", [{"n_units": 0}, {"n_episodes": 0}, {"seconds": 0.5}, {"spread": -1.0}, {"seed": -1}]
+)
 def test_settings_out_of_range_are_refused(settings):
     with pytest.raises(ConfigError, match=next(iter(settings))):
         PendulumPopulation(**settings)

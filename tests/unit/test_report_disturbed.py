@@ -21,7 +21,9 @@ def test_noise_doubles_an_error_where_its_own_share_is_root_three():
 
 def test_growth_beyond_what_was_tried_and_divergence():
     assert severity_of_growth([0, 1, 2], [1.0, 1.5, 1.9]) == np.inf
-    assert severity_of_growth([0, 1, 2], [1.0, 1.5, np.nan]) == 2  # lost somewhere between: not before the last one that is known
+    assert (
+        severity_of_growth([0, 1, 2], [1.0, 1.5, np.nan]) == 2
+    )  # lost somewhere between: not before the last one that is known
     assert severity_of_growth([0, 1, 2], [np.inf, np.inf, np.inf]) == 0
     with pytest.raises(DimensionError, match="zero"):
         severity_of_growth([1, 2], [1.0, 2.0])
@@ -29,11 +31,23 @@ def test_growth_beyond_what_was_tried_and_divergence():
 
 def row(observer, kind, severity, mean, condition="noload"):
     error = {"mean": mean, "worst": None if mean is None else 2 * mean}
-    return {"observer": observer, "disturbance": kind, "severity": severity, "condition": condition, "channel": "v", "error_percent": error}
+    return {
+        "observer": observer,
+        "disturbance": kind,
+        "severity": severity,
+        "condition": condition,
+        "channel": "v",
+        "error_percent": error,
+    }
 
 
 def test_curves_begin_without_disturbance_and_take_one_condition():
-    rows = [row("a", "none", 0.0, 1.0), row("a", "bias", 0.1, 2.0), row("a", "bias", 0.2, None), row("a", "none", 0.0, 9.0, "load")]
+    rows = [
+        row("a", "none", 0.0, 1.0),
+        row("a", "bias", 0.1, 2.0),
+        row("a", "bias", 0.2, None),
+        row("a", "none", 0.0, 9.0, "load"),
+    ]
     curve = curves(rows, "noload")["a"][Kind.BIAS]["v"]
     np.testing.assert_array_equal(curve.severities, [0, 0.1, 0.2])
     np.testing.assert_array_equal(curve.errors, [1, 2, np.inf])

@@ -68,7 +68,9 @@ Array = npt.NDArray[np.float64]
 def models(name: str, condition: str, seed: int) -> ModelSet:
     """Stable models of five units that differ by a few percent; the first differs by more."""
     rng = np.random.default_rng(seed)
-    lifting = Lifting(STATES, ("sin(100*position + phase)",), ("phase",)) if name.startswith("koopman") else Lifting(STATES)
+    lifting = (
+        Lifting(STATES, ("sin(100*position + phase)",), ("phase",)) if name.startswith("koopman") else Lifting(STATES)
+    )
     n, m = lifting.n_lifted, 2
     base = 0.9 * np.eye(n) + 0.02 * rng.standard_normal((n, n))
     spread = np.array([0.2, 0.01, 0.02, 0.03, 0.02])[:, None, None]
@@ -77,7 +79,20 @@ def models(name: str, condition: str, seed: int) -> ModelSet:
     parameters = {"phase": np.linspace(0.1, 5.0, 5)} if lifting.parameters else {}
     covariance = np.broadcast_to(np.eye(n), (5, n, n))
     return ModelSet(
-        name, condition, lifting, CHANNELS, DT, UNITS, A, B, parameters, covariance, np.full(n, 2.0), np.full(m, 3.0), 90.0, ("ok",) * 5
+        name,
+        condition,
+        lifting,
+        CHANNELS,
+        DT,
+        UNITS,
+        A,
+        B,
+        parameters,
+        covariance,
+        np.full(n, 2.0),
+        np.full(m, 3.0),
+        90.0,
+        ("ok",) * 5,
     )
 
 
@@ -85,14 +100,21 @@ def models(name: str, condition: str, seed: int) -> ModelSet:
 def uncertain() -> dict[str, UncertainModel]:
     found = {}
     for name in ("koopman_edmd", "linear_edmd"):
-        found[name] = quantify_systems(models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2)
+        found[name] = quantify_systems(
+            models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2
+        )
     return found
 
 
 def synthesis(n: int, method: str) -> Synthesis:
     bound = 0.8 if method == "worst_case_h2" else None
     return Synthesis(
-        method, gain(np.full((n, 1), 0.25), DT), Status.CERTIFIED, Injection.STATE, worst_case_h2=1.0 if bound else None, lower_bound=bound
+        method,
+        gain(np.full((n, 1), 0.25), DT),
+        Status.CERTIFIED,
+        Injection.STATE,
+        worst_case_h2=1.0 if bound else None,
+        lower_bound=bound,
     )
 
 
@@ -149,7 +171,11 @@ def scores(condition: str) -> OutlierModel:
     found = models("koopman_edmd", condition, 1 if condition == "noload" else 2)
     freqs = np.geomspace(0.1, 400.0, 40)
     return score_outliers(
-        found.systems().frequency_response(freqs), freqs, unit_ids=UNITS, output_scale=found.output_scale, input_scale=found.input_scale
+        found.systems().frequency_response(freqs),
+        freqs,
+        unit_ids=UNITS,
+        output_scale=found.output_scale,
+        input_scale=found.input_scale,
     )
 
 
@@ -157,7 +183,10 @@ def beside_others(name: str) -> UnitResiduals:
     found = models(name, "load", 2)
     covered = quantify_systems(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2)
     inside = beside(covered, found)
-    outer = np.concatenate([3 * inside.entries[:1], inside.entries]), np.concatenate([3 * inside.ratio[:1], inside.ratio])
+    outer = (
+        np.concatenate([3 * inside.entries[:1], inside.entries]),
+        np.concatenate([3 * inside.ratio[:1], inside.ratio]),
+    )
     return dataclasses.replace(inside, unit_ids=UNITS, outside=UNITS[:1], entries=outer[0], ratio=outer[1])
 
 
@@ -176,11 +205,15 @@ def write_observers(run: Path) -> list[str]:
         found = models(kind, "noload", 1)
         result = synthesis(found.lifting.n_lifted, method)
         result.save(run / "synthesis" / name)
-        observer = Observer(name, found.lifting, found.A[1], found.B[1], (0,), found.inputs, result.controller, Injection.STATE, DT)
+        observer = Observer(
+            name, found.lifting, found.A[1], found.B[1], (0,), found.inputs, result.controller, Injection.STATE, DT
+        )
         observer.save(run / "observers" / f"{name}.json")
         if name == DEPLOYED:
             observer.save(run / "observers" / "deployed.json")
-    facts: dict[str, Any] = {n: {"order": 0, "spectral_radius_max": 0.99, "worst_case_h2": 1.0 + i} for i, n in enumerate(names)}
+    facts: dict[str, Any] = {
+        n: {"order": 0, "spectral_radius_max": 0.99, "worst_case_h2": 1.0 + i} for i, n in enumerate(names)
+    }
     facts["linear_edmd/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
     save_artifact(run / "observers", "observers", {"names": names, "deployed": DEPLOYED, "facts": facts})
     return names
@@ -222,7 +255,15 @@ def write_evaluation(run: Path, names: list[str]) -> list[dict[str, Any]]:
         for x in STATES
     ]
     free = {k: {c: {"median": 1.0 + i, "worst": 2.0 + i} for c in STATES} for i, k in enumerate(kinds)}
-    content = {"rows": rows, "free_run": free, "band_hz": [45.0, 55.0], "roles": roles, "shown": shown, "observers": names, "models": kinds}
+    content = {
+        "rows": rows,
+        "free_run": free,
+        "band_hz": [45.0, 55.0],
+        "roles": roles,
+        "shown": shown,
+        "observers": names,
+        "models": kinds,
+    }
     save_artifact(run / "evaluation", "evaluation", {**content, "states": STATES}, arrays)
     return rows
 
@@ -230,10 +271,17 @@ def write_evaluation(run: Path, names: list[str]) -> list[dict[str, Any]]:
 def write_left_out(run: Path, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Every unit left out once, half as well estimated; one observer diverges."""
     held = [
-        {**row, "fold": 0, "error_percent": row["error_percent"] and 2 * row["error_percent"]} for row in rows if row["role"] != "outlier"
+        {**row, "fold": 0, "error_percent": row["error_percent"] and 2 * row["error_percent"]}
+        for row in rows
+        if row["role"] != "outlier"
     ]
     facts = {"made": 2, "orders": [2, 3], "relift_certified": 2, "robust": 1, "reasons": []}
-    content = {"folds": [["001"], ["002"]], "failed": {}, "rows": held, "observers": {row["observer"]: facts for row in rows}}
+    content = {
+        "folds": [["001"], ["002"]],
+        "failed": {},
+        "rows": held,
+        "observers": {row["observer"]: facts for row in rows},
+    }
     save_artifact(run / "left_out", "left_out", content)
     return content
 
@@ -262,7 +310,9 @@ def write_disturbed(run: Path, names: list[str]) -> dict[str, Any]:
 
 
 @pytest.fixture(scope="session")
-def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, UncertainModel]) -> tuple[Path, dict[str, Any]]:
+def finished(
+    tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, UncertainModel]
+) -> tuple[Path, dict[str, Any]]:
     """A finished run and its metrics."""
     run = tmp_path_factory.mktemp("run")
     write_read_stage(run)
@@ -280,9 +330,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, Unce
         **early_metrics(),
         **write_disturbed(run, names),
         "left_out": write_left_out(run, rows),
-        "models": {k: {"order": 4, "spectral_radius_max": 0.99, "freerun_error_percent": {}} for k in ("koopman_edmd", "linear_edmd")},
+        "models": {
+            k: {"order": 4, "spectral_radius_max": 0.99, "freerun_error_percent": {}}
+            for k in ("koopman_edmd", "linear_edmd")
+        },
         "uncertainty": {k: entry for k in ("koopman_edmd", "linear_edmd")},
-        "observers": {n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names},
+        "observers": {
+            n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names
+        },
         "evaluation": rows,
         "outliers": [{"unit": u, "condition": "load", "score": 1.0, "outlier": u == "000000"} for u in UNITS],
     }
@@ -292,7 +347,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory, uncertain: dict[str, Unce
 
 def early_metrics() -> dict[str, Any]:
     study = {"units": 4, "conditions": ["load", "noload"], "identify_on": "noload", "sample_period_s": DT}
-    return {"schema": 1, "study": study, "timing_s": {"read": 1.0}, "units": [{"unit": u, "group": "", "status": "ok"} for u in UNITS]}
+    return {
+        "schema": 1,
+        "study": study,
+        "timing_s": {"read": 1.0},
+        "units": [{"unit": u, "group": "", "status": "ok"} for u in UNITS],
+    }
 
 
 @pytest.fixture(scope="session")
@@ -433,7 +493,9 @@ def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
 def test_shares_of_power_in_a_band() -> None:
     freqs, own, other = np.arange(100.0), np.ones((100, 2)), np.ones((100, 2))
     own[45:56], other[45:56, 1] = 0.5, 0.25
-    assert band_shares(freqs, own, other, CHANNELS[:2], (45.0, 55.0)) == pytest.approx({"position": 0.5, "velocity": 2.0})
+    assert band_shares(freqs, own, other, CHANNELS[:2], (45.0, 55.0)) == pytest.approx(
+        {"position": 0.5, "velocity": 2.0}
+    )
 
 
 def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
@@ -471,7 +533,9 @@ def test_same_run_gives_the_same_figures(finished: tuple[Path, dict[str, Any]], 
     assert drawn[0] == drawn[1]
 
 
-def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(finished: tuple[Path, dict[str, Any]]) -> None:
+def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(
+    finished: tuple[Path, dict[str, Any]],
+) -> None:
     run = RunFolder(finished[0])
     pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
     figure = draw("observers_in_time_paper", run).figure
@@ -546,7 +610,15 @@ def test_every_class_that_can_be_plotted_has_its_figure() -> None:
         module, _, function = place.partition(":")
         assert callable(getattr(import_module(f"kros.report.figures.{module}"), function)), name
     observer = Observer(
-        "linear/h2", Lifting(STATES), np.eye(3), np.ones((3, 2)), (0,), ("u", "v"), gain(0.1 * np.ones((3, 1)), DT), Injection.STATE, DT
+        "linear/h2",
+        Lifting(STATES),
+        np.eye(3),
+        np.ones((3, 2)),
+        (0,),
+        ("u", "v"),
+        gain(0.1 * np.ones((3, 1)), DT),
+        Injection.STATE,
+        DT,
     )
     assert [line.get_label() for line in plot(observer).axes[0].lines] == [f"position → {name}" for name in STATES]
 
@@ -576,8 +648,12 @@ def test_results_of_the_short_way_are_plotted(uncertain: dict[str, UncertainMode
         plot(sets, kind="koopman")
     made = synthesis(len(STATES), "h2")
     own = found.models()
-    observer = Observer(f"{kind}/h2", own.lifting, own.A[1], own.B[1], (0,), own.inputs, made.controller, Injection.STATE, DT)
-    design = Design(observer.name, observer, made, SimpleNamespace(certified=True, gain=2.0), {"hidden_error_percent": 1.0})
+    observer = Observer(
+        f"{kind}/h2", own.lifting, own.A[1], own.B[1], (0,), own.inputs, made.controller, Injection.STATE, DT
+    )
+    design = Design(
+        observer.name, observer, made, SimpleNamespace(certified=True, gain=2.0), {"hidden_error_percent": 1.0}
+    )
     assert any(text.get_text() == "gain 2.00" for text in plot(design).axes[1].texts)
     drawn = plot(design, models=found).axes[1].lines
     assert [line.get_label() for line in drawn] == ["recorded", observer_label(observer.name)]

@@ -55,9 +55,13 @@ def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainMod
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
-    with pytest.raises(ConfigError, match=r"'memory': it is not made for these kinds of models.*known are linear_edmd/open_loop"):
+    with pytest.raises(
+        ConfigError, match=r"'memory': it is not made for these kinds of models.*known are linear_edmd/open_loop"
+    ):
         kros.synthesize(uncertain, method="memory")
-    with pytest.raises(ConfigError, match="Quantify: needs IdentifiedModels, found Population; identify the population first"):
+    with pytest.raises(
+        ConfigError, match="Quantify: needs IdentifiedModels, found Population; identify the population first"
+    ):
         kros.quantify(population)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Synthesize: needs UncertainModels, found IdentifiedModels"):
         kros.synthesize(uncertain.models)  # type: ignore[arg-type]
@@ -69,7 +73,9 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.run(population, "out", data={"reader": "parquet"})
     with pytest.raises(ConfigError, match="'learned': it is a baseline"):
         kros.synthesize(uncertain, method="learned")
-    with pytest.raises(ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, input_weight"):
+    with pytest.raises(
+        ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, input_weight"
+    ):
         kros.synthesize(uncertain, penalti=1.0)
     with pytest.raises(ConfigError, match="Identify: alpha_factor"):
         kros.identify(population, alpha_factor=0.5)
@@ -83,9 +89,14 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         uncertain.models.models("koopman")
 
 
-def test_units_that_were_not_recorded_where_it_counts_are_named(population: Population, caplog: pytest.LogCaptureFixture) -> None:
+def test_units_that_were_not_recorded_where_it_counts_are_named(
+    population: Population, caplog: pytest.LogCaptureFixture
+) -> None:
     keys = population.keys
-    data = {unit: {"cold" if i < 2 else "warm": [population.read(k) for k in keys(unit)]} for i, unit in enumerate(population.unit_ids)}
+    data = {
+        unit: {"cold" if i < 2 else "warm": [population.read(k) for k in keys(unit)]}
+        for i, unit in enumerate(population.unit_ids)
+    }
     names = {"states": population.states, "inputs": population.inputs, "measured": ["position"]}
     found = kros.identify(kros.from_arrays(data, **names, sample_period_s=population.sample_period_s), refine=False)
     assert len(found.models().unit_ids) == 2
@@ -101,14 +112,21 @@ def test_episodes_with_gaps_can_be_dropped(population: Population, tmp_path) -> 
         kros.identify(gaps, refine=False)
     found = kros.identify(gaps, refine=False, on_nan="drop_episode")
     assert len(found.facts.dropped) == 1
-    run = kros.run(gaps, tmp_path / "run", until="identify", identify={"refine": False}, data={"on_nan": "drop_episode"})
+    run = kros.run(
+        gaps, tmp_path / "run", until="identify", identify={"refine": False}, data={"on_nan": "drop_episode"}
+    )
     assert run.metrics["study"]["units"] == len(population.unit_ids)
 
 
 def recorded(states: Sequence[str] = STATES, **metadata: float) -> Population:
     samples = np.random.default_rng(0).standard_normal((2, 50, len(states) + 2))
     return kros.from_arrays(
-        {"a": list(samples)}, states=states, inputs=INPUTS, measured=[states[0]], sample_period_s=1e-3, metadata=metadata
+        {"a": list(samples)},
+        states=states,
+        inputs=INPUTS,
+        measured=[states[0]],
+        sample_period_s=1e-3,
+        metadata=metadata,
     )
 
 
@@ -133,7 +151,8 @@ def test_the_ratio_of_a_calibrated_angle_follows_from_the_formula(
 
 
 @pytest.mark.parametrize(
-    "functions", [["sin(100*position + phase)", "sin(50*position + phase)"], ["sin(position**2 + phase)"], ["phase*position"]]
+    "functions",
+    [["sin(100*position + phase)", "sin(50*position + phase)"], ["sin(position**2 + phase)"], ["phase*position"]],
 )
 def test_a_ratio_that_does_not_follow_is_asked_for(functions: list[str]) -> None:
     population = recorded()

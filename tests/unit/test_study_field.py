@@ -35,8 +35,12 @@ def recordings(units: int, noise: float) -> FieldRecordings:
     return FieldRecordings(replace(plain, monitor=watch), population, {"a": {}}, {}, frozenset(), None)
 
 
-@pytest.mark.parametrize(("units", "noise", "outlier"), [(FEWEST, 100.0, True), (FEWEST, 1e-3, False), (FEWEST - 1, 100.0, False)])
-def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(units: int, noise: float, outlier: bool) -> None:
+@pytest.mark.parametrize(
+    ("units", "noise", "outlier"), [(FEWEST, 100.0, True), (FEWEST, 1e-3, False), (FEWEST - 1, 100.0, False)]
+)
+def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(
+    units: int, noise: float, outlier: bool
+) -> None:
     (row,) = monitored(recordings(units, noise))
     assert (row["outlier"], row["score"], row["missing"]) == (outlier, None, ["velocity"])
     assert (row["level_db"] > 0) == (noise == 100.0)
@@ -48,7 +52,15 @@ def test_a_unit_beyond_the_bound_is_an_outlier_where_enough_units_made_it(units:
 
 
 def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_text() -> None:
-    plain = {"score": 1.0, "threshold": 2.0, "detectable": 5.0, "detectable_hz": 3.0, "units": 12, "left_out": [], "outlier": False}
+    plain = {
+        "score": 1.0,
+        "threshold": 2.0,
+        "detectable": 5.0,
+        "detectable_hz": 3.0,
+        "units": 12,
+        "left_out": [],
+        "outlier": False,
+    }
     rows = [
         with_verdict(plain | {"unit": unit, "condition": condition, "status": status, "outlier": status == "outlier"})
         for unit, condition, status in (
@@ -59,7 +71,11 @@ def test_a_unit_has_the_worst_verdict_of_its_conditions_and_hostile_names_stay_t
             ("c", "hot", "cannot tell"),
         )
     ]
-    assert [line.split()[0] for line in verdict_lines(rows) if not line.startswith(" ")] == ["PASS", "UNDECIDED", "FAIL"]
+    assert [line.split()[0] for line in verdict_lines(rows) if not line.startswith(" ")] == [
+        "PASS",
+        "UNDECIDED",
+        "FAIL",
+    ]
     assert (worst(rows[:1]), worst(rows[:3]), worst(rows)) == ("PASS", "UNDECIDED", "FAIL")
     suite = ElementTree.fromstring(junit_text(rows))
     assert (suite.attrib["tests"], suite.attrib["failures"], suite.attrib["errors"]) == ("3", "1", "1")

@@ -64,7 +64,11 @@ def test_the_working_folder_does_not_matter(tmp_path, monkeypatch):
 
 def drives(unsteady: str, condition: str) -> Population:
     """Drives, one of which never runs at constant velocity and is recorded in a condition of its own."""
-    whole = PLANTS["harmonic-drive"](n_units=3, n_episodes=2, seconds=3.0, seed=2, conditions=("noload",)).simulate().population
+    whole = (
+        PLANTS["harmonic-drive"](n_units=3, n_episodes=2, seconds=3.0, seed=2, conditions=("noload",))
+        .simulate()
+        .population
+    )
     keys = {EpisodeKey(k.unit, condition if k.unit == unsteady else k.condition, k.episode): k for k in whole.episodes}
     velocity = (whole.states + whole.inputs).index("target_velocity")
 
@@ -96,7 +100,10 @@ def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
 @pytest.mark.parametrize(
     ("section", "reason"),
     [
-        ({"sensor": {"velocity": {"noise": 1e-3}}}, "sensor: velocity should be among the states that are measured, position"),
+        (
+            {"sensor": {"velocity": {"noise": 1e-3}}},
+            "sensor: velocity should be among the states that are measured, position",
+        ),
         (
             {"predictor": {"importance": {"position": 2.0}}},
             "predictor.importance: position should be among the states that are not measured",

@@ -55,7 +55,9 @@ def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
     assert made.seen is not None
     assert (
         "linear/load"
-        in load_torque.draw(SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists()))[1]
+        in load_torque.draw(
+            SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
+        )[1]
     )
 
 

@@ -95,7 +95,9 @@ def test_an_optimum_of_zero_is_an_optimum(method):
     rng = np.random.default_rng(3)
     B2, D12, D21, Q = rng.standard_normal((3, 2)), *rng.standard_normal((3, 2, 2))
     C1, zero = rng.standard_normal((2, 3)), np.zeros((2, 2))
-    case = GeneralizedPlant(np.diag([0.9, 0.5, -0.3]), B2 @ Q @ D21, B2, C1, np.zeros((2, 3)), D12 @ Q @ D21, D12, D21, zero, 0.1)
+    case = GeneralizedPlant(
+        np.diag([0.9, 0.5, -0.3]), B2 @ Q @ D21, B2, C1, np.zeros((2, 3)), D12 @ Q @ D21, D12, D21, zero, 0.1
+    )
     found = method(case)
     assert found.status is Status.OPTIMAL
     assert found.lower_bound <= found.h2_norm < 1e-9
@@ -145,7 +147,10 @@ def test_h2_names_the_violated_assumption(one_state, changes, label):
         ({"input_scale": [-1.0]}, "input_scale should be 1 positive"),
         ({"output_scale": [1.0]}, "output_scale should be 2 positive"),
         ({"W_L": gain([[0.2]], 0.5)}, "W_L is sampled at 0.5 s, the nominal model at 0.001 s"),
-        ({"W_R": gain(np.eye(2), DT)}, "W_R should be any x 1 for inverse_input_multiplicative uncertainty, found 2 x 2"),
+        (
+            {"W_R": gain(np.eye(2), DT)},
+            "W_R should be any x 1 for inverse_input_multiplicative uncertainty, found 2 x 2",
+        ),
         ({"W_p": np.eye(3)}, "W_p should be any x 2 for .* found 3 x 3"),
         ({"n_original": 3}, "n_original = 3"),
         ({"correction_penalty": 0.0}, "correction_penalty"),
@@ -174,10 +179,16 @@ def test_weights_fit_the_form():
         ({"W_L": gain([[1.0]], DT)}, r"\|\|W_R W_L\|\| = 1 should be below 1"),
         ({"W_L": StateSpace([[1.0]], [[1.0]], [[0.1]], [[0.1]], DT)}, "W_L has spectral radius 1"),
         (
-            {"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT), "C": [[0.0, 1.0]]},
+            {
+                "nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT),
+                "C": [[0.0, 1.0]],
+            },
             "not detectable, mode 1",
         ),
-        ({"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)}, "nominal has spectral radius 1"),
+        (
+            {"nominal": StateSpace(np.diag([1.0, 0.9]), [[1.0], [0.1]], np.eye(2), np.zeros((2, 1)), DT)},
+            "nominal has spectral radius 1",
+        ),
         (
             {
                 "nominal": StateSpace(-np.eye(2), [[0.0], [0.1]], np.eye(2), np.zeros((2, 1)), 0.0),

@@ -54,13 +54,21 @@ def test_a_pole_at_the_end_of_the_map_is_named(one_state):
 
 
 def test_a_level_below_the_optimum_is_refused_with_both_ends(one_state):
-    with pytest.raises(SynthesisError, match=r"gamma = 0\.5 is out of reach; the best that was reached is .* below .*Raise gamma"):
+    with pytest.raises(
+        SynthesisError, match=r"gamma = 0\.5 is out of reach; the best that was reached is .* below .*Raise gamma"
+    ):
         hinf(one_state(), gamma=0.5)
 
 
 def test_an_uncontrolled_stable_mode_in_the_weights_is_fine(one_state):
     # A state that the control does not reach and y does not see, but z does: stable, so allowed.
-    wide = one_state(A=np.diag([0.9, 0.3]), B1=[[1.0, 0.0], [1.0, 0.0]], B2=[[1.0], [0.0]], C1=[[1.0, 1.0], [0.0, 0.0]], C2=[[1.0, 0.0]])
+    wide = one_state(
+        A=np.diag([0.9, 0.3]),
+        B1=[[1.0, 0.0], [1.0, 0.0]],
+        B2=[[1.0], [0.0]],
+        C1=[[1.0, 1.0], [0.0, 0.0]],
+        C2=[[1.0, 0.0]],
+    )
     assert hinf(wide).status is Status.OPTIMAL
 
 
@@ -70,7 +78,10 @@ def test_better_than_the_zero_gain_and_never_below_the_bound(one_state):
         n = int(rng.integers(1, 6))
         A = rng.standard_normal((n, n))
         A *= 0.95 / np.abs(np.linalg.eigvals(A)).max()
-        B1, C1 = np.hstack([rng.standard_normal((n, 2)), np.zeros((n, 1))]), np.vstack([rng.standard_normal((2, n)), np.zeros((1, n))])
+        B1, C1 = (
+            np.hstack([rng.standard_normal((n, 2)), np.zeros((n, 1))]),
+            np.vstack([rng.standard_normal((2, n)), np.zeros((1, n))]),
+        )
         p = replace(
             one_state(),
             A=A,

@@ -23,7 +23,11 @@ def models() -> ModelSet:
         name="koopman",
         condition="default",
         lifting=Lifting(("position", "velocity"), ("sin(0.5*position)",)),
-        channels=(Channel("position", Role.STATE, measured=True), Channel("velocity", Role.STATE), Channel("target", Role.INPUT)),
+        channels=(
+            Channel("position", Role.STATE, measured=True),
+            Channel("velocity", Role.STATE),
+            Channel("target", Role.INPUT),
+        ),
         sample_period_s=DT,
         unit_ids=tuple(f"unit.{i}" for i in range(4)),
         A=A,
@@ -70,6 +74,8 @@ def test_a_nominal_that_is_no_unit_is_refused(models, uncertain):
 
 
 def test_entrywise_weights_are_refused(models):
-    entrywise = quantify_systems(models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2)
+    entrywise = quantify_systems(
+        models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2
+    )
     with pytest.raises(SynthesisError, match="made for a diagonal perturbation"):
         ObserverProblem.from_uncertain(models, entrywise, [1e-3])

@@ -36,7 +36,9 @@ def test_the_checking_grid_reaches_from_zero_to_nyquist_and_holds_what_is_asked_
 
 def test_residuals_between_points_are_three_decibels_below_the_smaller_neighbour() -> None:
     E = np.array([4.0, 1.0, 2.0, 0.0])[None, :, None, None] * np.array([[1.0, 0.0], [0.0, -0.5j]])
-    held = between_points(E, np.array([1.0, 2.0, 4.0, 8.0]))(np.array([0.5, 1.0, 1.1, 1.9, 2.0, 2.5, 3.5, 4.5, 7.0, 20.0]))
+    held = between_points(E, np.array([1.0, 2.0, 4.0, 8.0]))(
+        np.array([0.5, 1.0, 1.1, 1.9, 2.0, 2.5, 3.5, 4.5, 7.0, 20.0])
+    )
     dip = 10 ** (-3 / 20)
     np.testing.assert_allclose(np.abs(held[0, :, 0, 0]), [4, 4, dip, dip, 1, dip, dip, 0, 0, 0])
     np.testing.assert_allclose(held[0, :, 1, 1], -0.5j * held[0, :, 0, 0])

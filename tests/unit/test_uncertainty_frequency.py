@@ -58,5 +58,7 @@ def test_spectral_factor_has_the_magnitude(seed: int) -> None:
     magnitude = RationalMagnitude(positive(), positive(), knots)
     system = spectral_factor(magnitude, DT)
     freqs = log_grid(DT, 60)
-    np.testing.assert_allclose(np.abs(system.frequency_response(freqs)[:, 0, 0]) ** 2, magnitude(bilinear_squared(freqs, DT)), rtol=1e-6)
+    np.testing.assert_allclose(
+        np.abs(system.frequency_response(freqs)[:, 0, 0]) ** 2, magnitude(bilinear_squared(freqs, DT)), rtol=1e-6
+    )
     assert system.is_stable()

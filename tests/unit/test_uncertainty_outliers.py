@@ -21,7 +21,9 @@ def responses(n_units: int, seed: int, outlier: bool = False) -> np.ndarray:
     rng = np.random.default_rng(seed)
     A, B = np.zeros((n_units, 3, 3)), np.zeros((n_units, 3, 2))
     for k in range(n_units):
-        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4))
+        inertia, friction, torque, lag = np.array([0.5, 6.0, 40.0, 2e-3]) * np.exp(
+            np.array([0.05, 0.15, 0.05, 0.1]) * rng.normal(size=4)
+        )
         if outlier and k == n_units - 1:
             inertia, friction, torque, lag = 1.5 * inertia, 2.5 * friction, 0.6 * torque, 2 * lag
         a = np.array([[-0.5, 1, 0], [0, -friction / inertia, torque / inertia], [-14.4 / lag, -1.2 / lag, -1 / lag]])

@@ -135,11 +135,15 @@ def read_json(path: Path) -> Any:
         raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
     try:
         text = read_bytes(path, limits.MAX_JSON_BYTES).decode("utf-8")
-        return json.loads(text, object_hook=lambda found: LoadedContent(found, path), parse_constant=_refuse, parse_float=_finite)
+        return json.loads(
+            text, object_hook=lambda found: LoadedContent(found, path), parse_constant=_refuse, parse_float=_finite
+        )
     except (ValueError, RecursionError) as error:
         if isinstance(error, DataError):
             raise
-        raise DataError(f"Reading {path}: not valid JSON ({shortened(str(error))}); write it again with the step that made it.") from error
+        raise DataError(
+            f"Reading {path}: not valid JSON ({shortened(str(error))}); write it again with the step that made it."
+        ) from error
 
 
 def _refuse(constant: str) -> Any:
@@ -188,7 +192,9 @@ def _read_archive(path: Path) -> bytes:
     return read_bytes(path, limits.MAX_ARRAYS_BYTES)
 
 
-def save_artifact(folder: Path, kind: str, content: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None) -> None:
+def save_artifact(
+    folder: Path, kind: str, content: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
+) -> None:
     """Write `<kind>.json` (with schema version and checksum) and, where there are arrays, `arrays.npz`."""
     folder = Path(folder)
     whole = {"schema": SCHEMA, "kind": kind, **content}

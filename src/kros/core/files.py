@@ -46,7 +46,9 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
     require_regular(path, limit, error)
     try:
         with path.open("rb") as file:
-            return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)  # Python makes room for as much as is asked for
+            return file.read(
+                min(limit, os.fstat(file.fileno()).st_size) + 1
+            )  # Python makes room for as much as is asked for
     except OSError as found:
         raise error(f"Reading {path}: {found}; check the file and its permissions.") from found
 
@@ -68,7 +70,12 @@ def parse_toml(text: str) -> dict[str, Any]:
     found = tomllib.loads(text)
     level: list[Any] = [found]
     for _ in range(limits.MAX_TOML_DEPTH):
-        level = [v for item in level for v in (item.values() if isinstance(item, dict) else item) if isinstance(v, (dict, list))]
+        level = [
+            v
+            for item in level
+            for v in (item.values() if isinstance(item, dict) else item)
+            if isinstance(v, (dict, list))
+        ]
     if level:
         raise ValueError(f"tables or lists are nested more than {limits.MAX_TOML_DEPTH} deep")
     return found

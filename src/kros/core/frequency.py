@@ -27,7 +27,9 @@ def nyquist_hz(sample_period_s: float) -> float:
     return 0.5 / sample_period_s
 
 
-def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None) -> Array:
+def log_grid(
+    sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None
+) -> Array:
     """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included, shape (n_freqs,), Hz."""
     if n_freqs < 2 or not decades > 0:
         raise ConfigError(
@@ -37,7 +39,9 @@ def log_grid(sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, 
     low = top * 10.0**-decades
     if longest_s is not None:
         if not longest_s > 0:
-            raise ConfigError(f"Frequency grid: the longest recording should have a positive length, found {longest_s} s.")
+            raise ConfigError(
+                f"Frequency grid: the longest recording should have a positive length, found {longest_s} s."
+            )
         low = min(max(low, 1 / longest_s), _WIDEST * top)
     grid = np.geomspace(low, top, n_freqs)
     grid[-1] = top

@@ -10,7 +10,9 @@ from typing import Any
 from .removed import refusing
 
 
-def lazy_names(package: str, home: Mapping[str, str], public: Sequence[str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(
+    package: str, home: Mapping[str, str], public: Sequence[str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return the ``__getattr__`` and ``__dir__`` of a package (PEP 562)."""
     unknown = refusing(package)
 

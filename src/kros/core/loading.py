@@ -41,7 +41,9 @@ def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
     return guarded
 
 
-def check_shapes(arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], sizes: Mapping[str, int], path: Path) -> None:
+def check_shapes(
+    arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], sizes: Mapping[str, int], path: Path
+) -> None:
     """Check arrays against named axes."""
     known = dict(sizes)
     for name, letters in axes.items():
@@ -51,4 +53,6 @@ def check_shapes(arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], size
                 known.setdefault(letter, length)
         if kind not in "biufc" or shape != tuple(known[letter] for letter in letters if letter in known):
             expected = tuple(known.get(letter, letter) for letter in letters)
-            raise DataError(f"Reading {path}: {name} should hold numbers of shape {expected}, found {arrays[name].dtype} of shape {shape}.")
+            raise DataError(
+                f"Reading {path}: {name} should hold numbers of shape {expected}, found {arrays[name].dtype} of shape {shape}."
+            )

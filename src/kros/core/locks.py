@@ -70,8 +70,12 @@ def _open(folder: Path, shared: bool) -> int | None:
             if error.errno in _BUSY:
                 told = os.read(handle, 200).decode(errors="replace") or "another process"
                 os.close(handle)
-                raise ConfigError(f"Folder {folder}: {told} is at work in it; wait until it ends, or name another folder.") from error
-            log.warning("folder %s: its file system has no locks (%s); do not run two studies in it at once", folder, error)
+                raise ConfigError(
+                    f"Folder {folder}: {told} is at work in it; wait until it ends, or name another folder."
+                ) from error
+            log.warning(
+                "folder %s: its file system has no locks (%s); do not run two studies in it at once", folder, error
+            )
             return handle
         if _is_at(path, handle):
             return handle

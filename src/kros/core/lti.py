@@ -25,11 +25,15 @@ Array = npt.NDArray[Any]
 def real_array(name: str, values: Any) -> Array:
     """Return a matrix of doubles, or say by name what else was found."""
     if np.iscomplexobj(values):
-        raise DimensionError(f"{name} should be a matrix of real numbers, found complex ones; take the real part if that is meant.")
+        raise DimensionError(
+            f"{name} should be a matrix of real numbers, found complex ones; take the real part if that is meant."
+        )
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
-        raise DimensionError(f"{name} should be a matrix of real numbers, found {type(values).__name__}: {error}.") from error
+        raise DimensionError(
+            f"{name} should be a matrix of real numbers, found {type(values).__name__}: {error}."
+        ) from error
 
 
 def sampling_period(name: str, dt: Any) -> float:
@@ -130,7 +134,9 @@ class StateSpace:
     def __getitem__(self, index: Any) -> StateSpace:
         """Return one system, or a smaller batch, of a batch."""
         shape = self.batch_shape
-        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in (self.A, self.B, self.C, self.D))
+        A, B, C, D = (
+            np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in (self.A, self.B, self.C, self.D)
+        )
         return StateSpace(A, B, C, D, self.dt)
 
     def poles(self) -> Array:
@@ -163,7 +169,9 @@ class StateSpace:
         eye = np.eye(self.n_states)
         shifted = self.A - eye if self.dt > 0 else self.A
         resolvent = zeta[:, None, None] * eye - shifted[..., None, :, :]
-        states = np.linalg.solve(resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, (*resolvent.shape[:-1], self.n_inputs)))
+        states = np.linalg.solve(
+            resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, (*resolvent.shape[:-1], self.n_inputs))
+        )
         return self.C[..., None, :, :] @ states + self.D[..., None, :, :]
 
     def __matmul__(self, other: StateSpace) -> StateSpace:
@@ -227,7 +235,9 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
     from scipy.linalg import block_diag
 
     if not systems or len({s.dt for s in systems}) > 1:
-        raise DimensionError(f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample first.")
+        raise DimensionError(
+            f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample first."
+        )
 
     def stack(blocks: list[Array]) -> Array:
         rows, cols = sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)

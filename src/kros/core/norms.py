@@ -42,7 +42,9 @@ def as_state_space(system: Any) -> StateSpace:
             f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it, for example system[0]."
         )
     if not all(np.isfinite(getattr(system, name)).all() for name in "ABCD"):
-        raise KrosError("System norm: the state-space matrices contain NaN or infinity; look at the step that built them.")
+        raise KrosError(
+            "System norm: the state-space matrices contain NaN or infinity; look at the step that built them."
+        )
     return system
 
 
@@ -173,7 +175,9 @@ def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower:
         before, (at, lower) = lower, (found, best) if best > lower else (at, lower)
         if best <= before * (1 + error):
             return precise_gain(system, _in_hz(system, at))
-    raise KrosError(f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and time.")
+    raise KrosError(
+        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and time."
+    )
 
 
 def to_continuous(system: StateSpace) -> StateSpace:
@@ -182,7 +186,9 @@ def to_continuous(system: StateSpace) -> StateSpace:
     solved = np.linalg.solve(system.A + eye, np.hstack([system.A - eye, system.B]))
     n = system.n_states
     output = np.linalg.solve((system.A + eye).T, system.C.T).T
-    return StateSpace(solved[:, :n], np.sqrt(2) * solved[:, n:], np.sqrt(2) * output, system.D - system.C @ solved[:, n:], 0.0)
+    return StateSpace(
+        solved[:, :n], np.sqrt(2) * solved[:, n:], np.sqrt(2) * output, system.D - system.C @ solved[:, n:], 0.0
+    )
 
 
 def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
@@ -224,7 +230,11 @@ def _rounding(system: StateSpace, nu: float) -> float:
         return 0.0
     z = np.exp(2j * np.pi * _in_hz(system, nu) * system.dt) if system.dt > 0 else 1j * nu
     resolvent = np.linalg.inv(z * np.eye(system.n_states) - system.A)
-    inside = np.abs(system.C @ resolvent) @ (np.abs(z) * np.eye(system.n_states) + np.abs(system.A)) @ np.abs(resolvent @ system.B)
+    inside = (
+        np.abs(system.C @ resolvent)
+        @ (np.abs(z) * np.eye(system.n_states) + np.abs(system.A))
+        @ np.abs(resolvent @ system.B)
+    )
     return float(_EPSILON * np.linalg.norm(inside, 2))
 
 
@@ -250,7 +260,9 @@ def crossings(system: StateSpace, gamma: float, rounded: bool = False) -> Array:
     H = np.block([[closed, gamma * (B @ F[:, n:])], [-Q / gamma, -closed.T]])
     eigenvalues = np.linalg.eigvals(H)
     rounding = 100 * _EPSILON * np.linalg.norm(H) if rounded else 0.0
-    near = eigenvalues[(np.abs(eigenvalues.real) <= np.maximum(1e-3 * np.abs(eigenvalues), rounding)) & (eigenvalues.imag >= 0)]
+    near = eigenvalues[
+        (np.abs(eigenvalues.real) <= np.maximum(1e-3 * np.abs(eigenvalues), rounding)) & (eigenvalues.imag >= 0)
+    ]
     points = np.unique(np.concatenate([[0.0], near.imag]))
     between = np.concatenate([(points[1:] + points[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])
     return np.concatenate([points, between])

@@ -28,7 +28,9 @@ def precise_h2_norm(system: StateSpace) -> float:
         if before is not None and (found == before or abs(found - before) <= 1e-9 * abs(found)):
             return found
         before, digits = found, 2 * digits
-    raise KrosError(f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit.")
+    raise KrosError(
+        f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit."
+    )
 
 
 def _h2_norm(mp: Any, system: StateSpace) -> float:
@@ -57,7 +59,9 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
     with mpmath.workdps(DIGITS):
         s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(freq_hz))
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
-        states = mpmath.inverse(point * mpmath.eye(system.n_states) - mpmath.matrix(system.A.tolist())) * mpmath.matrix(system.B.tolist())
+        states = mpmath.inverse(point * mpmath.eye(system.n_states) - mpmath.matrix(system.A.tolist())) * mpmath.matrix(
+            system.B.tolist()
+        )
         response = mpmath.matrix(system.C.tolist()) * states + mpmath.matrix(system.D.tolist())
         values = np.array([[complex(response[i, j]) for j in range(response.cols)] for i in range(response.rows)])
     return float(np.linalg.norm(values, 2))

@@ -37,9 +37,13 @@ class Record:
     stage: str
     key: str = ""  # hash of all that the stage depends on
     seconds: float = 0.0  # time it took
-    files: Mapping[str, str] = field(default_factory=dict)  # SHA-256 of every file, by its name relative to the run folder, with slashes
+    files: Mapping[str, str] = field(
+        default_factory=dict
+    )  # SHA-256 of every file, by its name relative to the run folder, with slashes
     stamps: Mapping[str, str] = field(default_factory=dict)  # size and time of large files
-    runs: tuple[str, ...] = ()  # folders that are runs of their own: their files are listed here too, and looked after there
+    runs: tuple[
+        str, ...
+    ] = ()  # folders that are runs of their own: their files are listed here too, and looked after there
     own: Mapping[str, str] = field(default_factory=dict)  # as `files`, for files of the run that are of no stage
 
     @property
@@ -49,7 +53,13 @@ class Record:
 
     def content(self) -> dict[str, Any]:
         """Return what is written; parts that are empty are left out."""
-        content: dict[str, Any] = {"schema": _SCHEMA, "stage": self.stage, "key": self.key, "seconds": self.seconds, "files": self.files}
+        content: dict[str, Any] = {
+            "schema": _SCHEMA,
+            "stage": self.stage,
+            "key": self.key,
+            "seconds": self.seconds,
+            "files": self.files,
+        }
         return content | {name: part for name in ("stamps", "runs", "own") if (part := getattr(self, name))}
 
     def matches(self, folder: Path, name: str) -> bool:
@@ -75,12 +85,16 @@ def read_record(folder: Path, stage: str) -> Record | None:
     try:
         return _parsed(folder, stage, read_json(path))
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DataError(f"Record {path}: is damaged, or of another version of kros ({error}); run the study again.") from error
+        raise DataError(
+            f"Record {path}: is damaged, or of another version of kros ({error}); run the study again."
+        ) from error
 
 
 def _parsed(folder: Path, stage: str, content: Any) -> Record:
     if (content["schema"], content["stage"]) != (_SCHEMA, stage):
-        raise ValueError(f"schema and stage should be {(_SCHEMA, stage)}, found {(content['schema'], content['stage'])}")
+        raise ValueError(
+            f"schema and stage should be {(_SCHEMA, stage)}, found {(content['schema'], content['stage'])}"
+        )
     seconds, runs = float(content["seconds"]), tuple(content.get("runs", ()))
     if not math.isfinite(seconds) or seconds < 0:
         raise ValueError(f"seconds should be a number of at least 0, found {seconds}")
@@ -88,7 +102,9 @@ def _parsed(folder: Path, stage: str, content: Any) -> Record:
     texts = [content["key"], *runs, *(text for table in tables for pair in table.items() for text in pair)]
     if wrong := [text for text in texts if not isinstance(text, str)]:
         raise ValueError(f"{wrong[0]!r} should be a text")
-    for above in dict.fromkeys(_parts(folder, name)[:-1] for name in (*content["files"], *runs, *content.get("own", {}))):
+    for above in dict.fromkeys(
+        _parts(folder, name)[:-1] for name in (*content["files"], *runs, *content.get("own", {}))
+    ):
         _folder(folder, above)
     return Record(stage, content["key"], seconds, tables[0], tables[1], runs, tables[2])
 
@@ -115,7 +131,9 @@ def _folder(folder: Path, parts: Sequence[str]) -> Path:
     for part in parts:
         path = path / part
         if path.is_symlink():
-            raise DataError(f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place.")
+            raise DataError(
+                f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place."
+            )
     return path
 
 
@@ -141,7 +159,11 @@ def recorded_files(folder: Path) -> frozenset[str]:
 
 def _stages(folder: Path) -> list[str]:
     where = folder / FOLDER
-    return sorted(p.stem for p in where.glob("*.json") if not p.name.startswith(".")) if where.is_dir() and not where.is_symlink() else []
+    return (
+        sorted(p.stem for p in where.glob("*.json") if not p.name.startswith("."))
+        if where.is_dir() and not where.is_symlink()
+        else []
+    )
 
 
 def is_file(path: Path) -> bool:

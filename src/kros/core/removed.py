@@ -8,7 +8,10 @@ from typing import Any
 # A sentence, then the public names ``kros.package.name``, the keys of a study ``section.key``, and their values ``section.key=value`` that it is for.
 REMOVED: tuple[tuple[str, str], ...] = (
     ("The section [memory] of a study is called [predictor]; rename it.", "memory"),
-    ("Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.", "synthesis.noise"),
+    (
+        "Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.",
+        "synthesis.noise",
+    ),
     (
         "Structures of weights to choose from are no longer part of kros; remove the key structure, weights are diagonal, or "
         "scalar where these are loose.",
@@ -26,7 +29,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "Where a form is exact is no longer a function of its own; use misfit, which is zero there.",
         "kros.uncertainty.completion kros.uncertainty.existence",
     ),
-    ("The nominals of all forms are no longer one function; use choose_nominal for each form.", "kros.uncertainty.choose_nominals"),
+    (
+        "The nominals of all forms are no longer one function; use choose_nominal for each form.",
+        "kros.uncertainty.choose_nominals",
+    ),
     (
         "Margins of stability and the largest residual of identification are no longer settings; identify.alpha_factor keeps "
         "models away from the edge.",
@@ -62,13 +68,19 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.",
         "observer.baselines=kalman_white observer.baselines=luenberger",
     ),
-    ("The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.", "synthesis.set"),
+    (
+        "The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.",
+        "synthesis.set",
+    ),
     (
         "Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify, recordings go both "
         "ways with kros.data.",
         "kros.interop.AdoptedModel kros.interop.from_pykoop kros.interop.models_from_pykoop",
     ),
-    ("Pairs of rows are no longer part of kros; use y of KoopmanRegressor.fit, or GroupKFold.", "kros.interop.one_step_pairs"),
+    (
+        "Pairs of rows are no longer part of kros; use y of KoopmanRegressor.fit, or GroupKFold.",
+        "kros.interop.one_step_pairs",
+    ),
     (
         "Preparation steps that follow events are no longer part of kros; use offset and trim, or a class of your own that "
         "derives from Step.",
@@ -131,7 +143,9 @@ REMOVED: tuple[tuple[str, str], ...] = (
 
 def instead_of(place: str) -> str:
     """Return the sentence for a name, or for a key or value, whose section may be missing; empty where it was never there."""
-    matches = (sentence for sentence, places in REMOVED if any(p == place or p.endswith(f".{place}") for p in places.split()))
+    matches = (
+        sentence for sentence, places in REMOVED if any(p == place or p.endswith(f".{place}") for p in places.split())
+    )
     return next(matches, "")
 
 

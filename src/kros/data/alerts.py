@@ -11,7 +11,10 @@ import numpy.typing as npt
 from .population import Channel, EpisodeKey, Role
 from .recording import some, title
 
-LONGEST_S, SHORTEST_S = 0.5, 1e-6  # sampling periods outside are rare for machines, and usual for a time in ms or us taken for seconds
+LONGEST_S, SHORTEST_S = (
+    0.5,
+    1e-6,
+)  # sampling periods outside are rare for machines, and usual for a time in ms or us taken for seconds
 _FACTORS = {  # between units of measure that are mixed up, and what they are
     57.29578: "degrees and radians",
     9.549297: "revolutions per minute and radians per second",
@@ -19,7 +22,10 @@ _FACTORS = {  # between units of measure that are mixed up, and what they are
     60.0: "minutes and seconds",
     1000.0: "a unit and its thousandth",
 }
-_NEAR, _COMPACT = 1.2, 3.0  # factor within which a ratio of sizes is one of these; factor that sizes may differ by on either side
+_NEAR, _COMPACT = (
+    1.2,
+    3.0,
+)  # factor within which a ratio of sizes is one of these; factor that sizes may differ by on either side
 _CORRELATED = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
 
 

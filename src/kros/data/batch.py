@@ -79,7 +79,13 @@ class EpisodeBatch:
         rows = [(parameters or {}).get(k.unit, {}) for k in keys]
         own = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
         return cls(
-            tuple(keys), lengths, values[..., :n], np.ascontiguousarray(values[..., n:]), population.sample_period_s, own, truths=true
+            tuple(keys),
+            lengths,
+            values[..., :n],
+            np.ascontiguousarray(values[..., n:]),
+            population.sample_period_s,
+            own,
+            truths=true,
         )
 
     @property
@@ -99,9 +105,14 @@ class EpisodeBatch:
     def head(self, n_samples: int) -> EpisodeBatch:
         """Return the same episodes, cut to so many samples."""
         lengths, inputs = np.minimum(self.lengths, n_samples), np.ascontiguousarray(self.inputs[:n_samples])
-        shown, lost = None if self.shown is None else self.shown[:n_samples], None if self.lost is None else self.lost[:n_samples]
+        shown, lost = (
+            None if self.shown is None else self.shown[:n_samples],
+            None if self.lost is None else self.lost[:n_samples],
+        )
         truths = None if self.truths is None else self.truths[:n_samples]
-        return replace(self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost, truths=truths)
+        return replace(
+            self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost, truths=truths
+        )
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
         """Return some of the episodes."""

@@ -36,7 +36,9 @@ class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
 
 
-def check_episode(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
+def check_episode(
+    values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
+) -> None:
     """Check one episode's samples."""
     if values.ndim != 2 or values.shape[1] != len(channels):
         raise DataError(
@@ -102,7 +104,9 @@ def check_range(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequ
             continue
         few = np.sort(column[:: max(1, len(column) // 64)])
         with np.errstate(over="ignore", invalid="ignore"):
-            if np.abs(column[[column.argmin(), column.argmax()]] - few[len(few) // 2]).max() <= _BEYOND * (few[-2] - few[1]):
+            if np.abs(column[[column.argmin(), column.argmax()]] - few[len(few) // 2]).max() <= _BEYOND * (
+                few[-2] - few[1]
+            ):
                 continue  # a few samples show already that the channel moves as much
             low, middle, high = np.percentile(column, (1, 50, 99))
             bad = np.flatnonzero(np.abs(column - middle) > (_BEYOND * (high - low) if high > low else _LARGEST))
@@ -157,7 +161,9 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
         if not isinstance(name, str) or not name.strip():
             raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
         if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-            raise DataError(f"The name of a {kind} should hold printable characters in UTF-8 only, found {name!r}; rename it.")
+            raise DataError(
+                f"The name of a {kind} should hold printable characters in UTF-8 only, found {name!r}; rename it."
+            )
 
 
 def check_period(period_s: Any, what: str) -> float:
@@ -168,7 +174,9 @@ def check_period(period_s: Any, what: str) -> float:
         seconds = math.inf
     if not 1 / limits.MAX_VALUE < seconds < limits.MAX_VALUE:
         found = shortened(repr(period_s))
-        raise DataError(f"{what}: the sampling period should be a number of seconds above zero, found {found}; give it in seconds.")
+        raise DataError(
+            f"{what}: the sampling period should be a number of seconds above zero, found {found}; give it in seconds."
+        )
     return seconds
 
 
@@ -179,7 +187,9 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
     twice = [name for name, count in Counter(c.name for c in channels).items() if count > 1]
     if twice:
-        raise DataError(f"Channel names should differ, found {twice} more than once in {[c.name for c in channels]}; rename them.")
+        raise DataError(
+            f"Channel names should differ, found {twice} more than once in {[c.name for c in channels]}; rename them."
+        )
     if not any(c.role is Role.STATE for c in channels):
         raise DataError(
             f"A population needs at least one channel with role 'state', found {[(c.name, c.role.value) for c in channels]}; declare one."
@@ -197,7 +207,10 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
 
 def _check_truths(channels: Sequence[Channel]) -> None:
     """Refuse truths of what is no state, and two of the same."""
-    states, owners = [c.name for c in channels if c.role is Role.STATE], [getattr(c, "of", "") for c in channels if c.role is Role.TRUTH]
+    states, owners = (
+        [c.name for c in channels if c.role is Role.STATE],
+        [getattr(c, "of", "") for c in channels if c.role is Role.TRUTH],
+    )
     if (
         set(owners) <= set(states)
         and len(set(owners)) == len(owners)
@@ -229,9 +242,15 @@ def check_population(population: Population, allow_single: bool = False) -> None
             )
 
 
-def scan_digests(population: Population, on_nan: str = "error", look: Look | None = None) -> list[tuple[EpisodeKey, str]]:
+def scan_digests(
+    population: Population, on_nan: str = "error", look: Look | None = None
+) -> list[tuple[EpisodeKey, str]]:
     """Read and check every episode, and return those that are left with their digests; `look` is shown the samples of each."""
-    kept = [(key, digest) for _, _, keys in population.groups() for key, _, digest in usable_episodes(population, keys, on_nan, look)]
+    kept = [
+        (key, digest)
+        for _, _, keys in population.groups()
+        for key, _, digest in usable_episodes(population, keys, on_nan, look)
+    ]
     refuse_copies(kept)
     return kept
 

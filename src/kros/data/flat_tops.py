@@ -151,7 +151,10 @@ def limit_of(found: Sequence[FlatTops], ranges: Array) -> _Level | None:
     width = max(f.width for f, _ in at)
     varied = np.all(np.ptp(inputs, axis=0) > _VARIED * ranges)
     often = len(lengths) >= _RUNS and len({(f.unit, f.episode) for f, _ in at}) >= _EPISODES
-    cut_off = np.average(sides.any(axis=1), weights=lengths) >= 0.5 and abs(np.average(bend, weights=lengths)) <= _BENT * width
+    cut_off = (
+        np.average(sides.any(axis=1), weights=lengths) >= 0.5
+        and abs(np.average(bend, weights=lengths)) <= _BENT * width
+    )
     if not (often and varied and cut_off):
         return None
     values = np.concatenate([f.values[rows] for f, rows in at])
@@ -178,7 +181,9 @@ def _means(signal: Array, starts: npt.NDArray[np.int64], stops: npt.NDArray[np.i
     return np.asarray(np.add.reduceat(signal[: stops[-1]], bounds)[::2] / (stops - starts))
 
 
-def _sides(signal: Array, starts: npt.NDArray[np.int64], stops: npt.NDArray[np.int64], far: float) -> npt.NDArray[np.bool_]:
+def _sides(
+    signal: Array, starts: npt.NDArray[np.int64], stops: npt.NDArray[np.int64], far: float
+) -> npt.NDArray[np.bool_]:
     """Whether the signal is below a value a quarter of the run's length before and after it; unknown where an episode begins or ends."""
     away = np.maximum((stops - starts) // 4, 2)
     before, after = starts - away, stops - 1 + away

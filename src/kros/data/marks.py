@@ -33,7 +33,12 @@ def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declar
             source = source.source
     if not isinstance(source, Recordings):
         return [None for _ in groups]
-    about.append((type(source).__name__, [(f.name, getattr(source, f.name)) for f in dataclasses.fields(source) if f.name != "places"]))
+    about.append(
+        (
+            type(source).__name__,
+            [(f.name, getattr(source, f.name)) for f in dataclasses.fields(source) if f.name != "places"],
+        )
+    )
     stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, declared)
     return [_mark(source, keys, how, stamp) for keys in groups]
 

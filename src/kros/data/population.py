@@ -155,7 +155,10 @@ def columns_in_order(channels: Iterable[AnyChannel]) -> tuple[AnyChannel, ...]:
 def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
     columns = tuple(columns)
-    return {"channels": tuple(c for c in columns if c.role is not Role.TRUTH), "truths": tuple(c for c in columns if c.role is Role.TRUTH)}
+    return {
+        "channels": tuple(c for c in columns if c.role is not Role.TRUTH),
+        "truths": tuple(c for c in columns if c.role is Role.TRUTH),
+    }
 
 
 @dataclass(frozen=True)
@@ -272,7 +275,9 @@ class Population:
     def read_with_truths(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode, shape (n_samples, n_channels), and what its states really were, shape (n_samples, n_truths)."""
         values, n = self.source(key), len(self.channels)
-        return np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values, values[:, n : n + len(self.truths)]
+        return np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values, values[
+            :, n : n + len(self.truths)
+        ]
 
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
@@ -287,7 +292,9 @@ class Population:
         positions = sorted(i for u in wanted for c in allowed for i in self._positions.get((u, c), ()))
         kept = sorted(self._unit_positions[u] for u in wanted if u in self._unit_positions)
         episodes = tuple(self.episodes[i] for i in positions)
-        return replace(self, units=tuple(self.units[i] for i in kept), episodes=episodes, source=restrict(self.source, episodes))
+        return replace(
+            self, units=tuple(self.units[i] for i in kept), episodes=episodes, source=restrict(self.source, episodes)
+        )
 
     def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
         """Iterate over (unit, condition, episodes)."""
@@ -336,7 +343,9 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
                 "record more, or leave the unit out."
             )
         held_out = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
-        split = Split(tuple(k for k in ordered if k.episode not in held_out), tuple(k for k in ordered if k.episode in held_out))
+        split = Split(
+            tuple(k for k in ordered if k.episode not in held_out), tuple(k for k in ordered if k.episode in held_out)
+        )
         if not split.train or not split.test:
             raise DataError(
                 f"Splitting the episodes of unit {unit} ({condition}): split.test = {sorted(held_out, key=natural_key)} "

@@ -11,7 +11,17 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from .checks import check_episode, check_period, check_range, check_structure
-from .population import Channel, EpisodeKey, EpisodeSource, Population, Unit, columns_in_order, natural_key, part_columns, restrict
+from .population import (
+    Channel,
+    EpisodeKey,
+    EpisodeSource,
+    Population,
+    Unit,
+    columns_in_order,
+    natural_key,
+    part_columns,
+    restrict,
+)
 from .recording import Recording, Recordings, check_even, estimate_period
 from .scaling import Scalings
 from .steps import Step
@@ -65,7 +75,14 @@ class PreparedSource:
 
 def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
     """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
-    return natural_key(key.unit), key.unit, natural_key(key.condition), key.condition, natural_key(key.episode), key.episode
+    return (
+        natural_key(key.unit),
+        key.unit,
+        natural_key(key.condition),
+        key.condition,
+        natural_key(key.episode),
+        key.episode,
+    )
 
 
 def assemble(
@@ -88,7 +105,9 @@ def assemble(
     facts = {unit.id: unit for unit in units}
     found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
     first = episodes[0]
-    period = check_period(sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population")
+    period = check_period(
+        sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population"
+    )
     source = PreparedSource(recordings, channels, period, first)
     parts = part_columns(channels)
     return prepare(
@@ -142,11 +161,17 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
         return population
     channels, period, scaling = population.columns, population.sample_period_s, population.scaling
     for step in added:
-        channels, period, scaling = step.channels_after(channels), step.period_after(period), step.scaling_after(scaling)
+        channels, period, scaling = (
+            step.channels_after(channels),
+            step.period_after(period),
+            step.scaling_after(scaling),
+        )
     check_structure(channels, population.episodes)
     source = population.source
     if isinstance(source, PreparedSource):
         source = replace(source, steps=source.steps + added)
     else:
-        source = PreparedSource(EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added)
+        source = PreparedSource(
+            EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added
+        )
     return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))

@@ -45,7 +45,9 @@ class Recordings:
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode, or say that this source does not have it."""
         if key not in self.places:
-            raise DataError(f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes.")
+            raise DataError(
+                f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes."
+            )
         return without_repeated_end(self.read(key, self.places[key]))
 
     def where(self, key: EpisodeKey) -> str:

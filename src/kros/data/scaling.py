@@ -14,7 +14,9 @@ class Scaling:
     factor: float = 1.0
     lag_samples: int = 0  # samples by which the column lagged behind the others
     offset: str = ""  # what was added in every episode, in words; empty where nothing was
-    converted: float = 1.0  # the part of the factor that is in the files that were read, since recordings were converted
+    converted: float = (
+        1.0  # the part of the factor that is in the files that were read, since recordings were converted
+    )
 
 
 Scalings = Mapping[str, Scaling]

@@ -47,7 +47,9 @@ class RecordingFacts:
     dropped: tuple[str, ...] = ()  # episodes that were left out, with the reason
     alerts: tuple[str, ...] = ()  # what looks wrong in the recordings without making them unusable
     reserve: tuple[str, ...] = ()
-    limits: Mapping[str, FoundLimit] = field(default_factory=dict)  # limits that states which are not measured were seen at
+    limits: Mapping[str, FoundLimit] = field(
+        default_factory=dict
+    )  # limits that states which are not measured were seen at
     digests: Mapping[EpisodeKey, str] = field(default_factory=dict)
 
     @cached_property
@@ -80,7 +82,12 @@ class RecordingFacts:
         names = ("identify_on", "groups", "resolution", "dropped", "alerts", "reserve")
         limits = {name: asdict(limit) for name, limit in self.limits.items()}
         digests = {part: [self.digests.get(k) for k in getattr(self, part)] for part in rows} if self.digests else {}
-        return {name: getattr(self, name) for name in names} | rows | {"limits": limits} | ({"digests": digests} if digests else {})
+        return (
+            {name: getattr(self, name) for name in names}
+            | rows
+            | {"limits": limits}
+            | ({"digests": digests} if digests else {})
+        )
 
     @classmethod
     @loader
@@ -89,10 +96,26 @@ class RecordingFacts:
         content, _ = load_artifact(folder, "facts")
         train, test = (tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test"))
         texts = {name: tuple(content.get(name, ())) for name in ("dropped", "alerts", "reserve")}
-        limits = {name: FoundLimit(**{**own, "units": tuple(own["units"])}) for name, own in content.get("limits", {}).items()}
+        limits = {
+            name: FoundLimit(**{**own, "units": tuple(own["units"])}) for name, own in content.get("limits", {}).items()
+        }
         known = content.get("digests", {})
-        digests = {k: d for part, keys in (("train", train), ("test", test)) for k, d in zip(keys, known.get(part, ()), strict=False) if d}
-        return cls(content["identify_on"], content["groups"], train, test, content["resolution"], **texts, limits=limits, digests=digests)
+        digests = {
+            k: d
+            for part, keys in (("train", train), ("test", test))
+            for k, d in zip(keys, known.get(part, ()), strict=False)
+            if d
+        }
+        return cls(
+            content["identify_on"],
+            content["groups"],
+            train,
+            test,
+            content["resolution"],
+            **texts,
+            limits=limits,
+            digests=digests,
+        )
 
 
 @dataclass(frozen=True)
@@ -173,7 +196,11 @@ def survey(
         alerts=tuple(dict.fromkeys(alerts)),
         reserve=tuple(reserve),
         limits=_limits(
-            [f for task, f in zip(tasks, found, strict=True) if task.unit not in aside and kept.unit(task.unit).group != OUTLIERS]
+            [
+                f
+                for task, f in zip(tasks, found, strict=True)
+                if task.unit not in aside and kept.unit(task.unit).group != OUTLIERS
+            ]
         ),
         digests=dict(pair for f in own for pair in f.scanned),
     )
@@ -184,7 +211,9 @@ def survey(
     return kept, facts
 
 
-def check_usable(population: Population, test: Iterable[str] | None, identify_on: str | None, single_allowed: bool) -> None:
+def check_usable(
+    population: Population, test: Iterable[str] | None, identify_on: str | None, single_allowed: bool
+) -> None:
     """Refuse what can be refused from names alone, before anything is read or written."""
     check_population(population, allow_single=single_allowed)
     split_episodes(population, test)
@@ -202,7 +231,9 @@ def condition_of(population: Population, wanted: str | None) -> str:
     if wanted is None:
         return UNLOADED if UNLOADED in conditions else (conditions[0] if conditions else DEFAULT_CONDITION)
     if wanted not in conditions:
-        raise DataError(f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(conditions)}; name one of them.")
+        raise DataError(
+            f"data.identify_on = {wanted!r}: the recordings have the conditions {', '.join(conditions)}; name one of them."
+        )
     return wanted
 
 
@@ -235,7 +266,9 @@ def _read_group(task: _Group) -> _Found:
         digests, record = record.recognised, replace(record, digests=())
     episodes = tuple(key for key, _ in digests)
     if not episodes:
-        raise DataError(f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out.")
+        raise DataError(
+            f"Unit {task.unit} ({task.condition}): every episode was dropped; fix the source or leave the unit out."
+        )
     first = shown[0][:, : len(population.channels)]
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
@@ -272,7 +305,9 @@ def _kept(population: Population, found: Sequence[_Found], folder: Path | None) 
     if folder is not None:
         from .readers.parquet import read_parquet
 
-        records = [replace(f.record, digests=tuple(digest for _, digest in f.scanned)) for f in found if f.record is not None]
+        records = [
+            replace(f.record, digests=tuple(digest for _, digest in f.scanned)) for f in found if f.record is not None
+        ]
         write_index(population, records, folder, converted=False)
         return read_parquet(folder)
     refuse_copies(pair for f in found for pair in f.scanned)

@@ -23,9 +23,13 @@ def build(kind: type[T], table: Mapping[str, Any], where: str) -> T:
     known = [f.name for f in fields]
     unknown = [key for key in table if key not in known]
     if unknown:
-        raise ConfigError(f"{where}: unknown key {unknown[0]!r}{did_you_mean(unknown[0], known) or ';'} known keys are {', '.join(known)}.")
+        raise ConfigError(
+            f"{where}: unknown key {unknown[0]!r}{did_you_mean(unknown[0], known) or ';'} known keys are {', '.join(known)}."
+        )
     missing = [
-        f.name for f in fields if f.name not in table and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
+        f.name
+        for f in fields
+        if f.name not in table and f.default is dataclasses.MISSING and f.default_factory is dataclasses.MISSING
     ]
     if missing:
         raise ConfigError(f"{where}: key {missing[0]!r} is missing, found {list(table)}; add it.")
@@ -56,7 +60,9 @@ def _float(value: float, where: str) -> float:
     try:
         return float(value)
     except OverflowError as error:
-        raise ConfigError(f"{where}: should be a number that fits 64 bits, found one of {value.bit_length()} bits; correct it.") from error  # type: ignore[attr-defined]
+        raise ConfigError(
+            f"{where}: should be a number that fits 64 bits, found one of {value.bit_length()} bits; correct it."
+        ) from error  # type: ignore[attr-defined]
 
 
 def _convert_union(value: Any, arguments: tuple[Any, ...], where: str) -> Any:
@@ -65,14 +71,18 @@ def _convert_union(value: Any, arguments: tuple[Any, ...], where: str) -> Any:
             return _convert(value, option, where)
         except ConfigError:
             continue
-    raise ConfigError(f"{where}: should be {' or '.join(_word(a) for a in arguments if a is not type(None))}, found {value!r}; correct it.")
+    raise ConfigError(
+        f"{where}: should be {' or '.join(_word(a) for a in arguments if a is not type(None))}, found {value!r}; correct it."
+    )
 
 
 def _convert_enum(value: Any, kind: type[Enum], where: str) -> Enum:
     try:
         return kind(value)
     except ValueError as error:
-        raise ConfigError(f"{where}: should be one of {[member.value for member in kind]}, found {value!r}; correct it.") from error
+        raise ConfigError(
+            f"{where}: should be one of {[member.value for member in kind]}, found {value!r}; correct it."
+        ) from error
 
 
 def _fits(value: Any, kind: type) -> bool:

@@ -13,7 +13,12 @@ from ..identify.identified import IdentifiedModels
 from ..observer import Observer, ReliftCertificate, Sensor
 from .task import DesignTask
 
-_SIGNALS = {"set_certified": "certified", "set_reason": "reason", "set_bound_percent": "bound_percent", "set_outside": "outside"}
+_SIGNALS = {
+    "set_certified": "certified",
+    "set_reason": "reason",
+    "set_bound_percent": "bound_percent",
+    "set_outside": "outside",
+}
 _LOSSES = {
     "dropout_rate": "rate",
     "dropout_certified": "certified",
@@ -23,7 +28,11 @@ _LOSSES = {
 
 
 def about(
-    task: DesignTask, identified: IdentifiedModels, observer: Observer, certificate: ReliftCertificate, facts: Mapping[str, Any]
+    task: DesignTask,
+    identified: IdentifiedModels,
+    observer: Observer,
+    certificate: ReliftCertificate,
+    facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Return the object ``about`` of an observer's file, in the recordings' units."""
     population, known, calibration = identified.population, identified.facts, identified.calibration
@@ -32,7 +41,9 @@ def about(
         "kros": version("kros"),
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,
-        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in (*population.states, *population.inputs)},
+        "columns": {
+            name: asdict(scaling_of(population.scaling, name)) for name in (*population.states, *population.inputs)
+        },
         "sensor": {name: _sensor(observer, name, known.resolution[name]) for name in population.measured},
         "trained_on": {
             "units": len(set(known.pooled) & set(task.models.unit_ids)),

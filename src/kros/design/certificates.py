@@ -82,11 +82,18 @@ class Running:
             facts |= self.signals.facts(self.measured)
         if self.dropout is not None:
             lost = self.dropout
-            facts |= {"dropout_rate": lost.rate, "dropout_certified": lost.gain is not None, "dropout_mean_square_gain": lost.gain}
+            facts |= {
+                "dropout_rate": lost.rate,
+                "dropout_certified": lost.gain is not None,
+                "dropout_mean_square_gain": lost.gain,
+            }
             facts |= {"dropout_reason": lost.reason} if lost.reason else {}
         if not found.certified:
             return facts | {"relift_reason": found.reason}
-        return facts | {"relift_mismatch_gain": found.mismatch_gain, "relift_bound_worst": max((r.bound for r in self.rows), default=None)}
+        return facts | {
+            "relift_mismatch_gain": found.mismatch_gain,
+            "relift_bound_worst": max((r.bound for r in self.rows), default=None),
+        }
 
 
 def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
@@ -107,7 +114,10 @@ def other_conditions(task: DesignTask) -> list[ValidationSet]:
     training, recordings = task.training, task.recordings or task.training
     home, units = {k.condition for k in training.keys}, {k.unit for k in training.keys}
     known = [k for k in recordings.keys if k.condition not in home and k.unit in units]
-    parts = [replace(recordings, keys=tuple(k for k in known if k.condition == c)) for c in dict.fromkeys(k.condition for k in known)]
+    parts = [
+        replace(recordings, keys=tuple(k for k in known if k.condition == c))
+        for c in dict.fromkeys(k.condition for k in known)
+    ]
     return [_beginnings(part) for part in parts]
 
 
@@ -124,7 +134,9 @@ def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
     return list(groups.values())
 
 
-def running_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet] = ()) -> list[Running]:
+def running_of(
+    observers: Sequence[Observer], data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet] = ()
+) -> list[Running]:
     """Certify observers of one lifting, and compare with what they do, in other conditions too; certificates come back in the recordings' units."""
     first, batch = observers[0], data.batch
     scales = scales_of(observers, data, task)
@@ -160,7 +172,9 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
         if model not in known:
             batch, values = data.batch, observer.own(data.batch.parameters)
             driven = with_internal(observer, batch.states, batch.inputs, values)
-            residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[..., :n]
+            residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[
+                ..., :n
+            ]
             typical = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
             known[model] = typical.with_internal(observer.lifting.n_states - n)
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]

@@ -84,7 +84,9 @@ class Baseline:
         return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
 
 
-def restarted(run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+def restarted(
+    run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]
+) -> Array:
     """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n)."""
     n_samples, batch = samples.starts.shape
     found = run(samples.y, samples.u, parameters)
@@ -135,7 +137,9 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
     shape_name, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
-    return Baseline({"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen)
+    return Baseline(
+        {"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen
+    )
 
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
@@ -151,12 +155,20 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     truth = states[..., estimated]
     best: tuple[float, FilteredDifference] | None = None
     for cutoff in cutoffs_hz(population.sample_period_s):
-        trial = FilteredDifference(len(population.states), pairs, float(cutoff), population.sample_period_s).scaled_to(data.batch, measured)
+        trial = FilteredDifference(len(population.states), pairs, float(cutoff), population.sample_period_s).scaled_to(
+            data.batch, measured
+        )
         error = float(error_percent(trial.run(y, data.batch.inputs)[..., estimated], truth, lengths).mean())
         if best is None or error < best[0]:
             best = (error, trial)
     assert best is not None
-    return Baseline({"": best[1]}, measured, tuple(estimated), {"status": "tuned", "cutoff_hz": best[1].cutoff_hz}, seen=training.seen)
+    return Baseline(
+        {"": best[1]},
+        measured,
+        tuple(estimated),
+        {"status": "tuned", "cutoff_hz": best[1].cutoff_hz},
+        seen=training.seen,
+    )
 
 
 def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
@@ -180,6 +192,13 @@ def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, .
     moments = Moments.of(features, episodes(), _LEAST * np.abs(few.batch.states).max(axis=(0, 1)))
     choices = moments.choose()
     estimators: dict[str, Learned] = {unit: moments.estimator([unit], choices) for unit in moments.units}
-    facts = {"status": "trained", "episodes": len(lengths), "episodes_recorded": len(training.keys), "left_out": "the unit under test"}
+    facts = {
+        "status": "trained",
+        "episodes": len(lengths),
+        "episodes_recorded": len(training.keys),
+        "left_out": "the unit under test",
+    }
     facts["chosen"] = {lifting.states[i]: asdict(choice) for i, choice in zip(moments.estimated, choices, strict=True)}
-    return Baseline(estimators | {"": moments.estimator((), choices)}, measured, moments.estimated, facts, seen=training.seen)
+    return Baseline(
+        estimators | {"": moments.estimator((), choices)}, measured, moments.estimated, facts, seen=training.seen
+    )

@@ -60,7 +60,9 @@ def difference(u: Array, motion: Array, sizes: Array) -> float:
     return float(np.sqrt(np.mean(((u - held(motion, len(u))) / sizes) ** 2, axis=0)).max())
 
 
-def make_mean_profile(training: TrainingSet, measured: tuple[int, ...], population: Population, keys: Iterable[EpisodeKey]) -> Baseline:
+def make_mean_profile(
+    training: TrainingSet, measured: tuple[int, ...], population: Population, keys: Iterable[EpisodeKey]
+) -> Baseline:
     """Average the states of training episodes that are the same motions as some episodes, over units, once for every unit without it."""
     n = len(population.states)
     estimated = [i for i in range(n) if i not in measured]
@@ -110,4 +112,12 @@ def make_mean_profile(training: TrainingSet, measured: tuple[int, ...], populati
         "episodes": sum(sum(c.values()) for c in counts),
         "left_out": "the unit under test",
     }
-    return Baseline(by_unit | {"": without("")}, measured, tuple(estimated), facts, takes_missing=True, restarts=False, seen=training.seen)
+    return Baseline(
+        by_unit | {"": without("")},
+        measured,
+        tuple(estimated),
+        facts,
+        takes_missing=True,
+        restarts=False,
+        seen=training.seen,
+    )

@@ -43,32 +43,55 @@ def fit_monitor(observer: Observer, training: TrainingSet, rate: float, work: Wo
     own = {task.group: found for task, found in zip(tasks, met, strict=True) if found}
     episodes, units = [e for found in own.values() for e in found], list(dict.fromkeys(unit for unit, _ in own))
     if len(units) < LEAST_SCORES:
-        log.info("%s has no monitor: its bound needs training episodes of %d units, found %d.", observer.name, LEAST_SCORES, len(units))
+        log.info(
+            "%s has no monitor: its bound needs training episodes of %d units, found %d.",
+            observer.name,
+            LEAST_SCORES,
+            len(units),
+        )
         return None
     size = np.sqrt(np.mean([e.mean_square() for e in episodes], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
     even = np.ones((len(size), len(filters)))
-    free = Monitor(filters, 1 / MEMORY, settling(observer), size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING)
+    free = Monitor(
+        filters, 1 / MEMORY, settling(observer), size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING
+    )
 
-    def squares(group: tuple[str, str]) -> list[Array]:  # found anew wherever they are needed: all of them fill a memory
+    def squares(
+        group: tuple[str, str],
+    ) -> list[Array]:  # found anew wherever they are needed: all of them fill a memory
         return free.in_turn([(e.innovation, e.judged) for e in own[group]])
 
-    largest = {group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in squares(group)], axis=0), 1e-30)) for group in own}
+    largest = {
+        group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in squares(group)], axis=0), 1e-30))
+        for group in own
+    }
     weights = weighted(steady(largest))
     peaks = {group: [float(_decibels(p, weights).max()) for p in squares(group)] for group in own}
     conditions = list(dict.fromkeys(condition for _, condition in own))
     of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions}
     loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
     bound = bound_of_peaks(loudest, rate)
-    bounds = {c: bound_of_peaks(p, rate) - bound for c, p in of.items() if len(conditions) > 1 and len(p) >= LEAST_SCORES}
+    bounds = {
+        c: bound_of_peaks(p, rate) - bound for c, p in of.items() if len(conditions) > 1 and len(p) >= LEAST_SCORES
+    }
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
     step = np.sqrt(np.nanmean([e.step_square() for e in episodes], axis=0))
     moving = sum(e.moving(MOVING * step) for e in episodes)
-    alarms = sum(_alarms(_decibels(p, weights) > bound) for group in own if max(peaks[group]) > bound for p in squares(group))
-    return replace(free, limits=limits, weights=weights, bounds=bounds, hours=moving * observer.sample_period_s / 3600, alarms=alarms)
+    alarms = sum(
+        _alarms(_decibels(p, weights) > bound) for group in own if max(peaks[group]) > bound for p in squares(group)
+    )
+    return replace(
+        free,
+        limits=limits,
+        weights=weights,
+        bounds=bounds,
+        hours=moving * observer.sample_period_s / 3600,
+        alarms=alarms,
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +134,9 @@ def _tasks(observer: Observer, training: TrainingSet, settle: int) -> Iterator[_
     for (unit, condition), keys in groups.items():
         if unit in units:
             population, chosen = training.population.select([unit], [condition]), tuple(spread(keys, EPISODES))
-            own = replace(training, population=population, keys=chosen, parameters={unit: training.parameters.get(unit, {})})
+            own = replace(
+                training, population=population, keys=chosen, parameters={unit: training.parameters.get(unit, {})}
+            )
             yield _Task((unit, condition), observer, own, settle)
 
 
@@ -138,7 +163,9 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
         return bound
     every, half = np.array([own[:shared] for own in peaks]), shared // 2
     means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), half)}
-    apart = [means[one] - means[other] for one in means for other in combinations(sorted({*range(shared)} - {*one}), half)]
+    apart = [
+        means[one] - means[other] for one in means for other in combinations(sorted({*range(shared)} - {*one}), half)
+    ]
     wider = stdtrit(shared - 1, 1 - rate) ** 2 - stdtrit(MOTIONS - 1, 1 - rate) ** 2
     return mean + float(np.sqrt((bound - mean) ** 2 + wider * np.mean(np.square(apart))))
 
@@ -179,7 +206,12 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:
     """Return both rates of false alarms: of one more good unit as stated, an hour of motion as counted in training, with its 95 % interval."""
     low, high = poisson_interval(monitor.alarms)
-    found = {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "hours": monitor.hours, "alarms": monitor.alarms}
+    found = {
+        "false_alarm_rate": monitor.false_alarm_rate,
+        "units": monitor.units,
+        "hours": monitor.hours,
+        "alarms": monitor.alarms,
+    }
     per_hour = (None, None) if monitor.hours == 0 else (low / monitor.hours, high / monitor.hours)
     return found | {"alarms_per_hour": per_hour, "settle_samples": monitor.settle}
 

@@ -18,9 +18,12 @@ class SynthesisSettings(Settings):
     """Observer synthesis."""
 
     methods: tuple[METHODS, ...] = Field(
-        ("mixed", "worst_case_h2", "residual_h2", "memory"), description="ways to an observer, each for every kind of model"
+        ("mixed", "worst_case_h2", "residual_h2", "memory"),
+        description="ways to an observer, each for every kind of model",
     )
-    input_weight: float | Literal["tuned", "identity"] = Field("tuned", description="corner of the low-pass spectrum of the inputs in Hz")
+    input_weight: float | Literal["tuned", "identity"] = Field(
+        "tuned", description="corner of the low-pass spectrum of the inputs in Hz"
+    )
     penalty: float = Field(1e-3, gt=0, description="on the correction, relative to the error")
     time_limit_s: float = Field(60.0, gt=0, description="for the optimisation of mixed")
 
@@ -39,13 +42,18 @@ class PredictorSettings(Settings):
         "full", description="full tries longer memories, more states, more recordings and more steps than quick"
     )
     states: int | None = Field(None, ge=1, description="states besides the recorded ones; chosen where none is given")
-    steps: int | None = Field(None, ge=0, description="most steps of tuning; by default 15 with full effort and 4 with quick")
+    steps: int | None = Field(
+        None, ge=0, description="most steps of tuning; by default 15 with full effort and 4 with quick"
+    )
     episodes: int = Field(2, ge=1, description="of every unit and condition that tuning uses")
     others: float = Field(
-        1.0, ge=0, description="how much errors count in conditions besides that of synthesis; with zero these are left out of everything"
+        1.0,
+        ge=0,
+        description="how much errors count in conditions besides that of synthesis; with zero these are left out of everything",
     )
     importance: dict[str, float] = Field(
-        default_factory=dict, description="weights of the logarithmic errors of hidden states, by name; one where none is given"
+        default_factory=dict,
+        description="weights of the logarithmic errors of hidden states, by name; one where none is given",
     )
 
     @field_validator("importance")

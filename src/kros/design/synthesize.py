@@ -77,9 +77,16 @@ class Design:
     facts: Mapping[str, Any]
 
     def __repr__(self) -> str:
-        percent, holds = self.facts.get("hidden_error_percent"), "certified" if self.certificate.certified else "not certified"
-        error = "diverges in training" if percent is None or not np.isfinite(percent) else f"training error {percent:.3g} %"
-        return f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, {error}, {holds} as it runs>"
+        percent, holds = (
+            self.facts.get("hidden_error_percent"),
+            "certified" if self.certificate.certified else "not certified",
+        )
+        error = (
+            "diverges in training" if percent is None or not np.isfinite(percent) else f"training error {percent:.3g} %"
+        )
+        return (
+            f"<Design {self.name}: {self.facts['order']} states beside the recorded ones, {error}, {holds} as it runs>"
+        )
 
     @property
     def lower_bound(self) -> float | None:
@@ -175,7 +182,10 @@ def synthesize(
     """
     require_kind(uncertain, UncertainModels, "Synthesize", "quantify the models first, kros.quantify(models)")
     asked = SynthesisSettings.of(settings, "Synthesize")
-    among, of = ObserverSettings.of(observer or {}, "Synthesize, observer"), PredictorSettings.of(predictor or {}, "Synthesize, predictor")
+    among, of = (
+        ObserverSettings.of(observer or {}, "Synthesize, observer"),
+        PredictorSettings.of(predictor or {}, "Synthesize, predictor"),
+    )
     told = {name: Sensor.of(own, f"Synthesize, sensor.{name}") for name, own in (sensor or {}).items()}
     kept = {name: Limit.of(own, f"Synthesize, limits.{name}") for name, own in (limits or {}).items()}
     if method is None:
@@ -211,13 +221,19 @@ def synthesize_all(
         work or Work(),
     )
     wanted = {*observer.baselines, *settings.methods}
-    tasks = [task for kind in uncertain.models.kinds for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor, limits)]
+    tasks = [
+        task
+        for kind in uncertain.models.kinds
+        for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor, limits)
+    ]
     results = designed(tasks, work)
     for task, found in zip(tasks, results, strict=True):
         if found.observer is None and found.facts["reason"] != task.refusal:
             log.warning("%s could not be made: %s", task.name, found.facts["reason"])
     designs, running = certified(tasks, results, uncertain.models, work)
-    facts = {found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results}
+    facts = {
+        found.name: dict(designs[found.name].facts) if found.name in designs else dict(found.facts) for found in results
+    }
     eligible = robust_of(running, facts) if robust else running
     deployed = choose_deployed(observer.deployed, list(designs), eligible)
     designs[deployed] = watched(designs[deployed], uncertain.models, sensor, observer.false_alarm_rate, work)
@@ -225,18 +241,26 @@ def synthesize_all(
     return Designs(designs, deployed, facts, tuple(running))
 
 
-def watched(design: Design, identified: IdentifiedModels, sensor: Sensors | None, rate: float, work: Work | None = None) -> Design:
+def watched(
+    design: Design, identified: IdentifiedModels, sensor: Sensors | None, rate: float, work: Work | None = None
+) -> Design:
     """Return a design whose observer has a monitor, where there are enough units."""
     training = TrainingSet.whole(identified, identified.models(split_name(design.name)[0]), sensor)
     monitor = fit_monitor(design.observer, training, rate, work)
     if monitor is None:
         return design
-    return replace(design, observer=replace(design.observer, monitor=monitor), facts={**design.facts, "monitor": monitor_facts(monitor)})
+    return replace(
+        design,
+        observer=replace(design.observer, monitor=monitor),
+        facts={**design.facts, "monitor": monitor_facts(monitor)},
+    )
 
 
 def named(uncertain: UncertainModels, method: str) -> str:
     """Return the full name of an observer: that of a method for the first kind of model that it is for."""
-    every = [f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, kind_of(kind).refined)]
+    every = [
+        f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, kind_of(kind).refined)
+    ]
     found = [name for name in every if method in (name, split_name(name)[1])]
     if not found:
         reason = "there is no such method"
@@ -264,13 +288,26 @@ def tasks_of(
     predictor.require_hidden(identified.population.states, identified.population.measured)
     require_measured(sensor or {}, identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
-    training, whole = (of(identified, recorded, sensor).normalised(recorded) for of in (TrainingSet.of, TrainingSet.whole))
+    training, whole = (
+        of(identified, recorded, sensor).normalised(recorded) for of in (TrainingSet.of, TrainingSet.whole)
+    )
     models = recorded.normalised()
     noise = measurement_noise(identified, recorded, sensor or {}) / recorded.output_scale[list(recorded.measured)]
     problem, refusal = usable_problem(models, own, noise, settings)
-    shared: dict[str, Any] = {"models": models, "unit": uncertain.nominal, "problem": problem, "refusal": refusal, "noise": noise}
+    shared: dict[str, Any] = {
+        "models": models,
+        "unit": uncertain.nominal,
+        "problem": problem,
+        "refusal": refusal,
+        "noise": noise,
+    }
     shared |= {"training": training, "recordings": whole, "covered": own.unit_ids}
-    shared |= {"max_order": uncertain.max_order, "pooled": uncertain.pooled, "settings": settings, "predictor": predictor}
+    shared |= {
+        "max_order": uncertain.max_order,
+        "pooled": uncertain.pooled,
+        "settings": settings,
+        "predictor": predictor,
+    }
     if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
         shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}
         shared["at_limits"] = TrainingSet.at_limits(identified, recorded, sensor).normalised(recorded)
@@ -284,8 +321,12 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
     if any(own.jitter_samples for own in sensor.values()):
         steps = TrainingSet.of(identified, models).read().steps(models.measured)
     told = [sensor.get(name, Sensor()) for name in names]
-    found = [max(own.resolution or 0.0, identified.facts.resolution[name]) for name, own in zip(names, told, strict=True)]
-    return np.sqrt([own.model_copy(update={"resolution": r}).variance(s) for own, r, s in zip(told, found, steps, strict=True)])
+    found = [
+        max(own.resolution or 0.0, identified.facts.resolution[name]) for name, own in zip(names, told, strict=True)
+    ]
+    return np.sqrt(
+        [own.model_copy(update={"resolution": r}).variance(s) for own, r, s in zip(told, found, steps, strict=True)]
+    )
 
 
 def designed(tasks: list[DesignTask], work: Work) -> list[DesignResult]:
@@ -337,7 +378,9 @@ def choose_deployed(wanted: str | None, made: list[str], running: Sequence[Runni
     """Return the observer that is deployed: the one asked for, else the most accurate one with all certificates that tolerates dropouts."""
     if wanted is not None:
         if wanted not in made:
-            raise SynthesisError(f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them.")
+            raise SynthesisError(
+                f"observer.deployed = {wanted!r}: there is no such observer, only {', '.join(made)}; name one of them."
+            )
         return wanted
     bounded = [r for r in running if r.certificate.certified and np.isfinite(r.hidden_percent)]
     safe = [r for r in bounded if r.certified] or bounded

@@ -44,7 +44,9 @@ class DesignTask:
     pooled: bool = True
     recordings: TrainingSet | None = None
 
-    def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None) -> Observer:
+    def observer(
+        self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None
+    ) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
         models, row = self.models, self.models.index(self.unit)
         return Observer(
@@ -65,14 +67,20 @@ class DesignTask:
 
     def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> DesignResult:
         """Return the result of a method that corrects the nominal model; `problem` is the set that it was designed for, else the task's."""
-        return DesignResult(self.name, self.observer(synthesis), synthesis, facts, self.problem if problem is None else problem)
+        return DesignResult(
+            self.name, self.observer(synthesis), synthesis, facts, self.problem if problem is None else problem
+        )
 
     @property
     def nominals(self) -> tuple[tuple[str, Array, Array], ...]:
         """Names and models that may be the nominal: the unit, and the mean over the covered units."""
         models, rows = self.models, [self.models.index(unit) for unit in self.covered]
         unit = (self.unit, models.A[models.index(self.unit)], models.B[models.index(self.unit)])
-        return (unit, ("mean", models.A[rows].mean(axis=0), models.B[rows].mean(axis=0))) if self.pooled and rows else (unit,)
+        return (
+            (unit, ("mean", models.A[rows].mean(axis=0), models.B[rows].mean(axis=0)))
+            if self.pooled and rows
+            else (unit,)
+        )
 
     @property
     def sensor(self) -> Sensors:

@@ -62,5 +62,8 @@ def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) ->
     units = check_units(problem, found.synthesis.controller, task.models.systems(task.covered), task.covered)
     if not units.holds:
         log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, units.largest_ratio)
-    ratios = {"unit_to_h2_bound_max": units.largest_ratio, "unit_to_density_max": float(units.density_ratio.max(initial=0.0))}
+    ratios = {
+        "unit_to_h2_bound_max": units.largest_ratio,
+        "unit_to_density_max": float(units.density_ratio.max(initial=0.0)),
+    }
     return {"bound_holds": units.holds} | ratios

@@ -49,7 +49,11 @@ class TrainingSet:
         count = TUNING_EPISODES * max(1, round(SHORT_SAMPLES / length))
         keys = tuple(k for own in every for k in spread(own, count))
         return cls(
-            identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
+            identified.population.select(units),
+            keys,
+            {u: known[u] for u in units},
+            seen_by(identified, models.measured),
+            sensor or {},
         )
 
     @classmethod
@@ -57,24 +61,38 @@ class TrainingSet:
         """Take all training episodes of all pooled units in all conditions, one of every unit and condition before the second of any."""
         facts, known = identified.facts, identified.parameters
         units = [u for u in facts.pooled if u in models.unit_ids]
-        groups = [facts.keys("train", u, c) for u in units for c in dict.fromkeys(k.condition for k in facts.keys("train", u))]
+        groups = [
+            facts.keys("train", u, c) for u in units for c in dict.fromkeys(k.condition for k in facts.keys("train", u))
+        ]
         keys = tuple(k for turn in zip_longest(*groups) for k in turn if k is not None)
         return cls(
-            identified.population.select(units), keys, {u: known[u] for u in units}, seen_by(identified, models.measured), sensor or {}
+            identified.population.select(units),
+            keys,
+            {u: known[u] for u in units},
+            seen_by(identified, models.measured),
+            sensor or {},
         )
 
     @classmethod
     def at_limits(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
         """Take some training episodes of all conditions, first those of units that were seen at a limit."""
-        every, seen = cls.whole(identified, models, sensor), {u for limit in identified.facts.limits.values() for u in limit.units}
-        return replace(every, keys=tuple(sorted(every.keys, key=lambda k: k.unit not in seen))[:TUNING_EPISODES_AT_LIMITS])
+        every, seen = (
+            cls.whole(identified, models, sensor),
+            {u for limit in identified.facts.limits.values() for u in limit.units},
+        )
+        return replace(
+            every, keys=tuple(sorted(every.keys, key=lambda k: k.unit not in seen))[:TUNING_EPISODES_AT_LIMITS]
+        )
 
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
         seen = None if self.seen is None else self.seen.times(1 / outputs, 1 / inputs)
         return replace(
-            self, population=scale_population(self.population, models.sizes), seen=seen, sensor=in_units(self.sensor, models.sizes)
+            self,
+            population=scale_population(self.population, models.sizes),
+            seen=seen,
+            sensor=in_units(self.sensor, models.sizes),
         )
 
     def first_of_units(self) -> TrainingSet:
@@ -93,9 +111,13 @@ class TrainingSet:
     def within(self, n_samples: int, groups: int) -> TrainingSet:
         """Return as many whole episodes as have about so many samples, the first ones; of so many units and conditions at most, and two of each of these."""
         own = list(dict.fromkeys((key.unit, key.condition) for key in self.keys))
-        units = set(spread(list(dict.fromkeys(unit for unit, _ in own)), max(2, groups * len({u for u, _ in own}) // len(own))))
+        units = set(
+            spread(list(dict.fromkeys(unit for unit, _ in own)), max(2, groups * len({u for u, _ in own}) // len(own)))
+        )
         keys = [key for key in self.keys if key.unit in units]
-        count = max(2 * len([group for group in own if group[0] in units]), n_samples // len(self.population.read(keys[0])))
+        count = max(
+            2 * len([group for group in own if group[0] in units]), n_samples // len(self.population.read(keys[0]))
+        )
         return replace(self, keys=tuple(keys[:count]))
 
     def one_by_one(self) -> Iterator[ValidationSet]:
@@ -120,7 +142,9 @@ class ValidationSet:
     def on_time(self) -> ValidationSet:
         """The same with measurements that are neither late, which observers know of, nor biased, which none can learn: what they are fitted to."""
         sensor = _without(self.sensor, "delay_samples", "bias")
-        return replace(self, batch=as_shown(replace(self.batch, shown=None, lost=None), sensor, self.states), sensor=sensor)
+        return replace(
+            self, batch=as_shown(replace(self.batch, shown=None, lost=None), sensor, self.states), sensor=sensor
+        )
 
     @property
     def parameters(self) -> dict[str, Array]:
@@ -155,7 +179,9 @@ class ValidationSet:
         y = self.measurements(observers[0].measured)
         found = []
         for start in range(0, len(observers), SIDE_BY_SIDE):
-            found += [*self.compare(run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values))]
+            found += [
+                *self.compare(run_observers(observers[start : start + SIDE_BY_SIDE], y, self.batch.inputs, values))
+            ]
         return np.array(found)
 
     def compare(self, estimates: Iterable[Array]) -> Array:
@@ -163,7 +189,9 @@ class ValidationSet:
         x, lengths = self.batch.states, self.batch.lengths
         inside = np.arange(len(x))[:, None, None] < lengths[:, None]
         size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
-        groups = [(key.unit, key.condition) for key in self.batch.keys]  # an episode in which a machine hardly moves has no size of its own
+        groups = [
+            (key.unit, key.condition) for key in self.batch.keys
+        ]  # an episode in which a machine hardly moves has no size of its own
         of = {group: size[[i for i, own in enumerate(groups) if own == group]].max(axis=0) for group in set(groups)}
         size = np.array([of[group] for group in groups])
         x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are

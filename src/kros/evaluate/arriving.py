@@ -26,7 +26,9 @@ class Arriving:
 
     def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
         """Return the lifting parameters of some episodes."""
-        return {name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()}
+        return {
+            name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()
+        }
 
 
 def arriving(

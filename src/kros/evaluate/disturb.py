@@ -88,7 +88,9 @@ class Disturbance:
         object.__setattr__(self, "kind", member(Kind, self.kind, "Disturbance: the kind"))
         most = 1.0 if self.kind is Kind.DROPPED else np.inf
         if not 0 <= self.severity <= most or self.severity == np.inf:
-            raise ConfigError(f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}.")
+            raise ConfigError(
+                f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}."
+            )
         if self.kind in {Kind.GAP, Kind.DELAY} and self.severity != int(self.severity):
             raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be a whole number of samples.")
 
@@ -134,7 +136,9 @@ class Measured:
         """Return the measurements under every disturbance, side by side."""
         n_samples, batch, q = self.y.shape
         y = np.empty((n_samples, len(disturbances), batch, q))
-        parameters = {name: np.repeat(values[None], len(disturbances), axis=0) for name, values in self.parameters.items()}
+        parameters = {
+            name: np.repeat(values[None], len(disturbances), axis=0) for name, values in self.parameters.items()
+        }
         for i, disturbance in enumerate(disturbances):
             y[:, i] = self.y
             if disturbance is None:

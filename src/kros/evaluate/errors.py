@@ -53,8 +53,20 @@ def summarise_all(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64]
             return [_summary(estimate[..., :n], truth, lengths, dt) for estimate in estimates]
         x = estimates.transpose(1, 0, 3, 2)
         (samples, count, states, batch), turn = x.shape, 2 * np.pi * np.arange(_SEGMENT) / _SEGMENT
-        largest, squares, powers = np.empty((n, batch)), np.empty((count, n, 2, batch)), np.empty((count, n, _SEGMENT // 2 + 1, batch))
-        job = {"samples": samples, "estimates": count, "states": states, "n": n, "batch": batch, "begun": START, "lengths": lengths}
+        largest, squares, powers = (
+            np.empty((n, batch)),
+            np.empty((count, n, 2, batch)),
+            np.empty((count, n, _SEGMENT // 2 + 1, batch)),
+        )
+        job = {
+            "samples": samples,
+            "estimates": count,
+            "states": states,
+            "n": n,
+            "batch": batch,
+            "begun": START,
+            "lengths": lengths,
+        }
         job |= {
             "x": x,
             "truth": truth.swapaxes(1, 2),
@@ -84,14 +96,20 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
     return _of_squares(squares, spectra, _largest(truth, lengths), lengths, dt)
 
 
-def _of_squares(squares: Array, spectra: Array, largest: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
+def _of_squares(
+    squares: Array, spectra: Array, largest: Array, lengths: npt.NDArray[np.int64], dt: float
+) -> ErrorSummary:
     """The summary of sums of squares of the start and the whole, shape (2, batch, n), and largest values, shape (batch, n)."""
     first, whole = squares
     rest = np.maximum(whole - first, 0.0)
     counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
-    rms, start, behind = (np.sqrt(sums / count[:, None]) for sums, count in zip((whole, first, rest), counts, strict=True))
+    rms, start, behind = (
+        np.sqrt(sums / count[:, None]) for sums, count in zip((whole, first, rest), counts, strict=True)
+    )
     percent, of_start, of_rest = (_percent(values, largest) for values in (rms, start, behind))
-    return ErrorSummary(rms, percent, of_start, of_rest, spectra, np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float))
+    return ErrorSummary(
+        rms, percent, of_start, of_rest, spectra, np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
+    )
 
 
 def _signals(estimate: Array, truth: Array) -> Array:
@@ -139,7 +157,9 @@ def _largest(truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
     """Largest absolute values of episodes, shape (batch, n)."""
     if np.all(lengths == len(truth)):
         return np.maximum(truth.max(axis=0), -truth.min(axis=0))
-    return np.asarray(np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0))
+    return np.asarray(
+        np.max(np.abs(truth), axis=0, where=np.arange(len(truth))[:, None, None] < lengths[:, None], initial=0.0)
+    )
 
 
 def _percent(rms: Array, largest: Array) -> Array:

@@ -64,7 +64,9 @@ def mean_intervals(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal")
     found: dict[Cell, dict[str, float | None]] = {}
     for row in rows:
         if row["role"] == role:
-            found.setdefault((row["observer"], row["condition"], row["channel"]), {})[row["unit"]] = row["error_percent"]
+            found.setdefault((row["observer"], row["condition"], row["channel"]), {})[row["unit"]] = row[
+                "error_percent"
+            ]
     alike: dict[tuple[str, ...], list[Cell]] = {}
     for cell, by_unit in found.items():
         if len(by_unit) >= _FEWEST and all(v is not None and np.isfinite(v) for v in by_unit.values()):

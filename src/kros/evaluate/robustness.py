@@ -83,13 +83,19 @@ class DisturbedEpisodes:
     def _percent(self, estimate: Array, count: int) -> Array:
         width = len(self.batch.keys)
         if estimate.shape[1] != count * width:
-            raise DimensionError(f"Disturbed episodes: expected estimates of {count * width} episodes, found {estimate.shape}.")
+            raise DimensionError(
+                f"Disturbed episodes: expected estimates of {count * width} episodes, found {estimate.shape}."
+            )
         parts = [estimate[:, i * width : (i + 1) * width] for i in range(count)]
         return np.stack([error_percent(part, self.batch.states, self.batch.lengths) for part in parts])
 
 
 def robustness_rows(
-    name: str, errors: Array, episodes: DisturbedEpisodes, channels: Sequence[str], estimated: Sequence[int] | None = None
+    name: str,
+    errors: Array,
+    episodes: DisturbedEpisodes,
+    channels: Sequence[str],
+    estimated: Sequence[int] | None = None,
 ) -> list[dict[str, Any]]:
     """Return a row for every disturbance, severity, condition and channel: mean and worst unit of `DisturbedEpisodes.errors`, first draws alone.
 
@@ -121,16 +127,32 @@ def robustness_rows(
     [('none', 0.0), ('bias', 0.1)]
     """
     keys, rows = episodes.batch.keys, []
-    severities = [(0, "none", 0.0)] + [(i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw]
+    severities = [(0, "none", 0.0)] + [
+        (i, d.kind.value, float(d.severity)) for i, d in enumerate(episodes.disturbances, 1) if not d.draw
+    ]
     for condition in dict.fromkeys(k.condition for k in keys):
-        units = {u: [i for i, k in enumerate(keys) if (k.unit, k.condition) == (u, condition)] for u in dict.fromkeys(k.unit for k in keys)}
-        per_unit = np.stack([errors[:, chosen].mean(axis=1) for chosen in units.values() if chosen])  # (unit, 1 + disturbance, n)
+        units = {
+            u: [i for i, k in enumerate(keys) if (k.unit, k.condition) == (u, condition)]
+            for u in dict.fromkeys(k.unit for k in keys)
+        }
+        per_unit = np.stack(
+            [errors[:, chosen].mean(axis=1) for chosen in units.values() if chosen]
+        )  # (unit, 1 + disturbance, n)
         for i, kind, severity in severities:
             for j in range(len(channels)) if estimated is None else estimated:
                 values = per_unit[:, i, j]
                 known = bool(np.isfinite(values).all())
-                error = {"mean": float(values.mean()) if known else None, "worst": float(values.max()) if known else None}
-                row = {"observer": name, "disturbance": kind, "severity": severity, "condition": condition, "channel": channels[j]}
+                error = {
+                    "mean": float(values.mean()) if known else None,
+                    "worst": float(values.max()) if known else None,
+                }
+                row = {
+                    "observer": name,
+                    "disturbance": kind,
+                    "severity": severity,
+                    "condition": condition,
+                    "channel": channels[j],
+                }
                 rows.append(row | {"error_percent": error})
     return rows
 
@@ -139,7 +161,9 @@ def severity_of_growth(severities: npt.ArrayLike, errors: npt.ArrayLike, factor:
     """Return the severity at which an error reaches a multiple of that without disturbance."""
     s, e = np.asarray(severities, dtype=float), np.asarray(errors, dtype=float)
     if s.shape != e.shape or s.ndim != 1 or not len(s) or s[0] != 0:
-        raise DimensionError(f"Severity of growth: severities {s} should begin at zero, with as many errors, found {e.shape}.")
+        raise DimensionError(
+            f"Severity of growth: severities {s} should begin at zero, with as many errors, found {e.shape}."
+        )
     limit = factor * e[0]
     beyond = np.flatnonzero(~(e < limit))
     if not len(beyond) or beyond[0] == 0:

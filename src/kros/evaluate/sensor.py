@@ -54,7 +54,9 @@ def _late(y: Array, behind: Array) -> Array:
     low = np.floor(at).astype(int)
     share = at - low
     value = np.take_along_axis(y, low, axis=0)
-    return np.where(share > 0, value + share * (np.take_along_axis(y, np.minimum(low + 1, len(y) - 1), axis=0) - value), value)
+    return np.where(
+        share > 0, value + share * (np.take_along_axis(y, np.minimum(low + 1, len(y) - 1), axis=0) - value), value
+    )
 
 
 def _noisy(y: Array, own: Sensor, eta: Array) -> Array:

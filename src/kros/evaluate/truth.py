@@ -49,11 +49,14 @@ class TrueErrors:
     def joined(cls, parts: Sequence[TrueErrors]) -> TrueErrors:
         """Return the errors of one batch after the other."""
         return cls(
-            parts[0].states, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("rms", "error_percent", "lag_s"))
+            parts[0].states,
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("rms", "error_percent", "lag_s")),
         )
 
 
-def true_errors(signals: Array, truths: Array, states: tuple[int, ...], lengths: npt.NDArray[np.int64], dt: float) -> TrueErrors:
+def true_errors(
+    signals: Array, truths: Array, states: tuple[int, ...], lengths: npt.NDArray[np.int64], dt: float
+) -> TrueErrors:
     """Return the errors of recorded or estimated states against truths.
 
     Parameters

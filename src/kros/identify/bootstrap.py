@@ -130,7 +130,9 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     return weights
 
 
-def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None) -> ModelSamples:
+def bootstrap_edmd(
+    R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None
+) -> ModelSamples:
     """Return EDMD models of resampled episodes at a fixed alpha.
 
     Parameters
@@ -169,7 +171,9 @@ def bootstrap_edmd(R: Array, n_lifted: int, alpha: float, weights: Array, unit_i
     """
     units, episodes, width, _ = R.shape
     if weights.shape[0] != units or weights.shape[2] != episodes:
-        raise DimensionError(f"Bootstrap: factors {R.shape} need weights of shape ({units}, draws, {episodes}), found {weights.shape}.")
+        raise DimensionError(
+            f"Bootstrap: factors {R.shape} need weights of shape ({units}, draws, {episodes}), found {weights.shape}."
+        )
     p, draws = width - n_lifted, weights.shape[1]
     W = np.empty((units, draws, n_lifted, p))
     for row in range(units):

@@ -17,7 +17,9 @@ log = logging.getLogger(__name__)
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 
-def calibrate(population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None) -> PhaseCalibration:
+def calibrate(
+    population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None
+) -> PhaseCalibration:
     """Calibrate all units on training episodes; a unit that cannot be calibrated is left out, with its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}

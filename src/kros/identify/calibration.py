@@ -83,7 +83,9 @@ class UnitPhase:
     def on_branch_of(self, lag_rad: float) -> UnitPhase:
         """Return the same calibration with the lag within 90 degrees of `lag_rad`."""
         turns = np.round((self.lag_rad - lag_rad) / np.pi)
-        return UnitPhase(wrap(self.phase_rad - turns * np.pi), self.lag_rad - turns * np.pi, self.concentration, self.n_segments)
+        return UnitPhase(
+            wrap(self.phase_rad - turns * np.pi), self.lag_rad - turns * np.pi, self.concentration, self.n_segments
+        )
 
 
 @dataclass(frozen=True)
@@ -114,7 +116,9 @@ class PhaseCalibration:
     def load(cls, folder: Path) -> PhaseCalibration:
         """Read what `save` wrote."""
         content, _ = load_artifact(folder, "calibration")
-        return cls(PhaseSpec(**content["spec"]), content["lag_rad"], {k: UnitPhase(**v) for k, v in content["units"].items()})
+        return cls(
+            PhaseSpec(**content["spec"]), content["lag_rad"], {k: UnitPhase(**v) for k, v in content["units"].items()}
+        )
 
     def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
         """Calibrate a new unit on the population's branch."""
@@ -155,7 +159,9 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
     top = np.max(np.abs(reference))
     if top == 0:
         return []
-    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top / len(reference)) & (np.abs(reference) > 0.1 * top)
+    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top / len(reference)) & (
+        np.abs(reference) > 0.1 * top
+    )
     per_reference = _speed_per_reference(angle, reference, steady, dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
     segments = []
@@ -179,7 +185,9 @@ def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
     """Phase and amplitude of the error at the disturbance's frequency; drift and second harmonic are fitted beside it."""
     ramp = np.linspace(-1, 1, turn.size)
-    columns = np.stack([np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2], axis=1)
+    columns = np.stack(
+        [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2], axis=1
+    )
     along_sin, along_cos = np.linalg.lstsq(columns, error, rcond=None)[0][:2]
     return float(np.arctan2(along_cos, along_sin)), float(np.hypot(along_cos, along_sin))
 
@@ -265,6 +273,7 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     lag = lag - np.pi if lag >= 0 else lag
     if np.abs(doubled) < _LOW_CONCENTRATION:
         log.warning(
-            "phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch", np.abs(doubled)
+            "phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch",
+            np.abs(doubled),
         )
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})

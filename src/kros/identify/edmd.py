@@ -97,7 +97,9 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
     bottom = np.concatenate([np.broadcast_to(ridge, (*batch, p, p)), np.zeros((*batch, p, n_lifted))], axis=-1)
     triangle = qr_triangle(np.concatenate([top, bottom], axis=-2))
     R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
-    pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(R11, axis=-2), np.finfo(float).tiny)
+    pivots = np.abs(np.diagonal(R11, axis1=-2, axis2=-1)) / np.maximum(
+        np.linalg.norm(R11, axis=-2), np.finfo(float).tiny
+    )
     if np.any(pivots < p * np.finfo(float).eps):
         *unit, column = (int(i) for i in np.argwhere(pivots < p * np.finfo(float).eps)[0])
         raise IdentificationError(
@@ -145,7 +147,9 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
     """
     ridges = [_Ridge.of(R, n) for R, n in factors]
     top = 2 + np.ceil(
-        np.log10(max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors))
+        np.log10(
+            max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) ** 2 for R, n in factors)
+        )
     )
     grid = 10.0 ** np.arange(top, top - 2 - _DECADES_BELOW, -1 / _PER_DECADE)
     at_once = max(1, min(_PER_DECADE, _MODELS // max(len(R) for R, _ in factors)))
@@ -158,7 +162,9 @@ def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float =
         return 0.0 if _stable_without(factors, margin) else float(grid[-1])
     first = int(np.argmax(found))
     if start + first == 0:
-        raise IdentificationError(f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}.")
+        raise IdentificationError(
+            f"EDMD: models stay unstable up to alpha = {grid[0]:.1e} with a stability margin of {margin}."
+        )
     low, high = np.log10(grid[start + first]), np.log10(grid[start + first - 1])
     suspects = [ridge.take(own[first]) for ridge, own in zip(ridges, unstable, strict=True)]
     for _ in range(_BISECTIONS):
@@ -184,7 +190,9 @@ class _Ridge:
     def of(cls, R: Array, n_lifted: int) -> _Ridge:
         p = R.shape[-1] - n_lifted
         P, values, Q = np.linalg.svd(R[:, :p, :p])
-        return cls(np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted]), values, np.swapaxes(P, 1, 2) @ R[:, :p, p:])
+        return cls(
+            np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted]), values, np.swapaxes(P, 1, 2) @ R[:, :p, p:]
+        )
 
     def take(self, rows: npt.NDArray[np.bool_]) -> _Ridge:
         """Return those of some units."""

@@ -14,7 +14,9 @@ log = logging.getLogger(__name__)
 _ROUNDING = 1e-13  # relative: what conversions of units leave of a constant
 
 
-def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0) -> None:
+def require_excitation(
+    factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0
+) -> None:
     """Refuse inputs that are constant over all training episodes of a unit."""
     if factor.input_range is None:
         return
@@ -25,9 +27,13 @@ def require_excitation(factor: Factor, inputs: Sequence[str], units: Sequence[st
         problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {'zero' if low[i, j] == 0 else 'constant'} ({low[i, j]:g}) over all training episodes"
         if not alpha or inputs[j] in dead:
             remedy = (
-                "declare it as another role or drop the channel" if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
+                "declare it as another role or drop the channel"
+                if inputs[j] in dead
+                else "excite it, drop the channel, or use alpha > 0"
             )
-            raise IdentificationError(f"Identifying {problem}, so the response to it is not in the recordings; {remedy}.")
+            raise IdentificationError(
+                f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
+            )
         log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
 
 

@@ -103,7 +103,9 @@ def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
     now = np.concatenate([x.T, g.T, u.T, v.T])  # a signal a row: extremes and reflections run along memory
     data = np.concatenate([now[:, :-1], now[: x.shape[1] + g.shape[1], 1:]])
     least, most, inputs = now.min(axis=1), now.max(axis=1), slice(x.shape[1] + g.shape[1], now.shape[0] - v.shape[1])
-    return Factor(triangular(data.T), np.maximum(most, -least), np.asarray(data.shape[1]), np.stack([least[inputs], most[inputs]]))
+    return Factor(
+        triangular(data.T), np.maximum(most, -least), np.asarray(data.shape[1]), np.stack([least[inputs], most[inputs]])
+    )
 
 
 def triangular(rows: Array) -> Array:
@@ -182,7 +184,9 @@ def episode_factors(
     first = next(f for row in rows for f in row)
     none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
     own = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
-    stacked = Factor.stack([Factor.stack([replace(f, input_range=None) for f in row] + [none] * (most - len(row))) for row in rows])
+    stacked = Factor.stack(
+        [Factor.stack([replace(f, input_range=None) for f in row] + [none] * (most - len(row))) for row in rows]
+    )
     return lifted_factor(stacked, lifting, own, lifting)
 
 
@@ -243,6 +247,8 @@ def _peaks(M: Array, peak: Array) -> Array:
 def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
     """Return unit and column of the first of `n_columns` that depends on those before it, or None; R (unit, p, p)."""
     part = R[..., :n_columns]
-    pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(np.linalg.norm(part, axis=-2), np.finfo(float).tiny)
+    pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(
+        np.linalg.norm(part, axis=-2), np.finfo(float).tiny
+    )
     found = np.argwhere(pivots < n_columns * np.finfo(float).eps)
     return (int(found[0, 0]), int(found[0, 1])) if len(found) else None

@@ -17,7 +17,9 @@ from ..loops import Library, formulas, library, tape_of
 Array = npt.NDArray[np.float64]
 
 
-def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], x0: Array, u: Array) -> Array:
+def free_run(
+    A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], x0: Array, u: Array
+) -> Array:
     """Simulate a batch of models, compiled where there is a compiler.
 
     Parameters
@@ -66,7 +68,9 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
     lifting.window.require(n_samples)
     if (loops := library()) is not None:
         return _compiled(loops, A, B, lifting, parameters, first, u)
-    step = np.ascontiguousarray(np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2))  # (.., n_lifted + m, n)
+    step = np.ascontiguousarray(
+        np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2)
+    )  # (.., n_lifted + m, n)
     psi = np.empty((batch, n_lifted + width))
     states = np.empty((n_samples, batch, n))
     states[: h + 1] = np.swapaxes(first, 0, 1)
@@ -94,7 +98,13 @@ def free_run(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.
 
 
 def _compiled(
-    loops: Library, A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], first: Array, u: Array
+    loops: Library,
+    A: Array,
+    B: Array,
+    lifting: Lifting,
+    parameters: Mapping[str, npt.ArrayLike],
+    first: Array,
+    u: Array,
 ) -> Array:
     batch, n_samples, m = u.shape
     n, h, rows = lifting.n_states, lifting.history, np.concatenate([A, B], axis=-1)[..., : lifting.n_states, :]

@@ -72,7 +72,11 @@ class EpisodeFactors:
     def save(self, folder: Path, lifting: Lifting, inputs: tuple[str, ...]) -> None:
         """Write them with the names of what they are of."""
         arrays = {name: getattr(self.factor, name) for name in ("R", "peak", "n_samples")}
-        content: dict[str, Any] = {"condition": self.condition, "states": lifting.states, "functions": lifting.functions}
+        content: dict[str, Any] = {
+            "condition": self.condition,
+            "states": lifting.states,
+            "functions": lifting.functions,
+        }
         content |= {"inputs": inputs, "input_functions": lifting.input_functions, "rows": self.rows}
         save_artifact(folder, "factors", content, arrays)
 
@@ -140,7 +144,9 @@ class IdentifiedModels:
     def conditions(self) -> tuple[str, ...]:
         """Conditions that models were identified in, that of synthesis first; none where no unit of it can be modelled."""
         own = self.parameters
-        found = sorted({k.condition for k in self.facts.train if k.unit in own}, key=lambda c: c != self.facts.identify_on)
+        found = sorted(
+            {k.condition for k in self.facts.train if k.unit in own}, key=lambda c: c != self.facts.identify_on
+        )
         return tuple(found)
 
     @property
@@ -168,7 +174,13 @@ class IdentifiedModels:
         states, inputs = self.population.states, self.population.inputs
         peak = np.concatenate([self.factors[c].factor.peak for c in sorted(self.conditions)]).max(axis=0)
         behind = len(states) + len(self.lifting.separation.basis)
-        return dict(zip(states + inputs, [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()], strict=True))
+        return dict(
+            zip(
+                states + inputs,
+                [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()],
+                strict=True,
+            )
+        )
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with the recordings, in the layout of a run folder."""
@@ -189,7 +201,12 @@ class IdentifiedModels:
             factors.save(folder / "factors" / quote(condition, safe=""), self.lifting, self.population.inputs)
         for kind, refined in self.refined.items():
             refined.save(folder / "refinement" / kind)
-        content = {"kinds": self.kinds, "sets": list(self.sets), "conditions": list(self.factors), "refined": list(self.refined)}
+        content = {
+            "kinds": self.kinds,
+            "sets": list(self.sets),
+            "conditions": list(self.factors),
+            "refined": list(self.refined),
+        }
         save_artifact(folder / "models", _KIND, content)
 
     @classmethod
@@ -205,7 +222,9 @@ class IdentifiedModels:
         """Read what `save_models` wrote, of recordings that are open already."""
         content, _ = load_artifact(folder / "models", _KIND)
         sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
-        factors = Stored(EpisodeFactors.load, {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]})
+        factors = Stored(
+            EpisodeFactors.load, {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
+        )
         refined = Stored(RefinedModels.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
         lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None

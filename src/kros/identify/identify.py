@@ -100,18 +100,29 @@ def identify(
     >>> kros.identify(drives, refine=False)
     <IdentifiedModels: linear_edmd of 2 units, identified on 'default'>
     """
-    require_kind(population, Population, "Identify", "read recordings with kros.read, or make a population of arrays with kros.from_arrays")
+    require_kind(
+        population,
+        Population,
+        "Identify",
+        "read recordings with kros.read, or make a population of arrays with kros.from_arrays",
+    )
     asked, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
         population, facts = survey(population, test, identify_on, on_nan, work=work)
     known = isinstance(calibration, PhaseCalibration)
     declared = CalibrationSettings() if known else CalibrationSettings.of(calibration or {}, "Calibrate")
-    found = lifting if isinstance(lifting, Lifting) else resolve_lifting(lifting_settings(lifting), declared, population, test)
+    found = (
+        lifting
+        if isinstance(lifting, Lifting)
+        else resolve_lifting(lifting_settings(lifting), declared, population, test)
+    )
     if not known:
         spec = resolve_phase(declared, population, found)
         calibration = None if spec is None else calibrate(population, facts, spec, work)
-    base = IdentifiedModels(population, facts, found, calibration if isinstance(calibration, PhaseCalibration) else None)
+    base = IdentifiedModels(
+        population, facts, found, calibration if isinstance(calibration, PhaseCalibration) else None
+    )
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
             f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; set data.identify_on to another one."
@@ -125,7 +136,9 @@ def identify(
             facts.identify_on,
         )
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
-    first = sorted(base.conditions, key=lambda c: c != facts.identify_on)  # its models are refined while the others are identified
+    first = sorted(
+        base.conditions, key=lambda c: c != facts.identify_on
+    )  # its models are refined while the others are identified
     identified = {condition: identify_condition(base, condition, asked, work) for condition in first}
     for condition in base.conditions:
         factors[condition], models, refining = identified[condition]
@@ -143,11 +156,15 @@ def identify_condition(
     population, facts, own = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in own and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
-    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, factor_marks(facts, tasks), (Factor,)))
+    episodes = list(
+        work.recall(f"identify ({condition})", reduce_episodes, tasks, factor_marks(facts, tasks), (Factor,))
+    )
     factor = Factor.stack([combine(f) for f in episodes])
     parameters = {name: np.array([own[u][name] for u in units]) for name in base.lifting.parameters}
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
-    models = [replace(m, longest_s=longest_s) for m in identify_models(base, condition, units, factor, parameters, settings)]
+    models = [
+        replace(m, longest_s=longest_s) for m in identify_models(base, condition, units, factor, parameters, settings)
+    ]
     wanted = settings.refine and condition == facts.identify_on
     refining = begin_refinement(base, units, factor, parameters, models, work) if wanted else _not_refined
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
@@ -158,7 +175,10 @@ def identify_condition(
 def factor_marks(facts: RecordingFacts, tasks: Iterable[Task]) -> list[str | None]:
     """Return what the factors of each task follow from: samples, what they are of, and the lifting but for its parameters' values."""
     found = [(facts.marks(keys), population, keys, lifting) for population, keys, lifting in tasks]
-    return [None if known is None else mark_of(known, keys, own.channels, repr(lifting)) for known, own, keys, lifting in found]
+    return [
+        None if known is None else mark_of(known, keys, own.channels, repr(lifting))
+        for known, own, keys, lifting in found
+    ]
 
 
 def reduce_episodes(task: Task) -> Factor:
@@ -174,7 +194,12 @@ def reduce_episodes(task: Task) -> Factor:
 
 
 def identify_models(
-    base: IdentifiedModels, condition: str, units: list[str], factor: Factor, parameters: dict[str, Array], settings: IdentifySettings
+    base: IdentifiedModels,
+    condition: str,
+    units: list[str],
+    factor: Factor,
+    parameters: dict[str, Array],
+    settings: IdentifySettings,
 ) -> list[ModelSet]:
     """Identify every kind of model of one condition with one common regularisation."""
     population, on = base.population, condition == base.facts.identify_on
@@ -186,16 +211,22 @@ def identify_models(
     ranges = {kind: Ranges.of(factors[kind], lifting.n_lifted, rows) for kind, lifting in liftings.items()}
     alpha = settings.alpha
     if alpha == "auto":
-        shared = [(ranges[kind].triangles(factors[kind].R[rows]), lifting.n_lifted) for kind, lifting in liftings.items()]
+        shared = [
+            (ranges[kind].triangles(factors[kind].R[rows]), lifting.n_lifted) for kind, lifting in liftings.items()
+        ]
         edge = smallest_stabilising_alpha(shared)
         times = alpha_factor(shared, edge, settings.alpha_factor) if on else settings.alpha_factor
         alpha = times * edge
-        note = "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        note = (
+            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        )
         log.info(note, condition, alpha, times)
     require_excitation(factor, population.inputs, units, condition, float(alpha))
     if alpha == 0:
         for kind, lifting in liftings.items():
-            require_independent(factors[kind], lifting.names + population.inputs + lifting.input_functions, units, condition)
+            require_independent(
+                factors[kind], lifting.names + population.inputs + lifting.input_functions, units, condition
+            )
     models = []
     for kind, lifting in liftings.items():
         nothing = np.zeros((len(units), 0, 0))
@@ -241,7 +272,9 @@ def alpha_factor(shared: list[tuple[Array, int]], edge: float, smallest: float) 
     for doubled in range(_DOUBLINGS if edge > 0 else 0):
         factor = smallest * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
-        if not any(peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models):
+        if not any(
+            peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models
+        ):
             return factor
     return smallest
 

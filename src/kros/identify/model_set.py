@@ -83,9 +83,7 @@ class ModelSet:
     def __repr__(self) -> str:
         """Say what was modelled, and how."""
         outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
-        return (
-            f"ModelSet({self.name!r}: {len(self.unit_ids)} units in condition {self.condition!r}; lifted states {outputs}; inputs {inputs})"
-        )
+        return f"ModelSet({self.name!r}: {len(self.unit_ids)} units in condition {self.condition!r}; lifted states {outputs}; inputs {inputs})"
 
     @property
     def recorded_inputs(self) -> tuple[str, ...]:
@@ -187,7 +185,9 @@ class ModelSet:
             "status": self.status,
             "longest_s": self.longest_s,
         }
-        arrays = {name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")}
+        arrays = {
+            name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")
+        }
         save_artifact(folder, "model", content, arrays)
 
     @classmethod
@@ -195,10 +195,15 @@ class ModelSet:
     def load(cls, folder: Path) -> ModelSet:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "model")
-        n, m = len(content["states"]) + len(content["lifting"]), len(content["inputs"]) + len(content.get("input_functions", ()))
+        n, m = (
+            len(content["states"]) + len(content["lifting"]),
+            len(content["inputs"]) + len(content.get("input_functions", ())),
+        )
         axes = {"A": "unn", "B": "unm", "residual_covariance": "unn", "output_scale": "n", "input_scale": "m"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"]), "n": n, "m": m}, Path(folder))
-        parameters = {k: np.array([v[u] for u in content["unit_ids"]], dtype=float) for k, v in content["parameters"].items()}
+        parameters = {
+            k: np.array([v[u] for u in content["unit_ids"]], dtype=float) for k, v in content["parameters"].items()
+        }
         return cls(
             name=content["name"],
             condition=content["condition"],

@@ -24,7 +24,10 @@ _LAGS, _UNITS, _EPISODES, _SAMPLES = 3, 6, 3, 40_000
 _ABOVE = 15.0  # of a peak over the median around it; the largest of some thousand values of noise alone is about 8 times their median
 _EVERY_UNIT = 3.0  # of each unit's own peak over its own surroundings
 _SHARE = 0.002  # of the residual that a term has to explain
-_GRAVITY, _LEAST_TRAVEL = 0.01, 0.5  # the same for sin(angle), which other smooth terms resemble, and the travel that it needs, rad
+_GRAVITY, _LEAST_TRAVEL = (
+    0.01,
+    0.5,
+)  # the same for sin(angle), which other smooth terms resemble, and the travel that it needs, rad
 _ODD = 0.9  # of what sine and cosine explain
 _WHOLE = 0.8  # of what the best ratio explains, that a whole number near it has to explain to be taken
 _BINS = 1 << 21
@@ -41,7 +44,9 @@ class PeriodicTerm:
     odd: bool = False
 
 
-def periodic_term(population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey] | None = None) -> PeriodicTerm | None:
+def periodic_term(
+    population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey] | None = None
+) -> PeriodicTerm | None:
     """Return the periodic term that shows most, or None where none does."""
     keys = _some_keys(population) if keys is None else keys
     units = [[population.read(k) for k in keys if k.unit == unit] for unit in dict.fromkeys(k.unit for k in keys)]
@@ -81,7 +86,15 @@ def _residuals(episodes: Sequence[Array], column: int, n_states: int) -> tuple[A
         n = len(x) - _LAGS
         if n < 1:
             continue
-        rows.append(np.hstack([*(x[_LAGS - 1 - lag : _LAGS - 1 - lag + n] for lag in range(_LAGS)), x[_LAGS:, n_states:], np.ones((n, 1))]))
+        rows.append(
+            np.hstack(
+                [
+                    *(x[_LAGS - 1 - lag : _LAGS - 1 - lag + n] for lag in range(_LAGS)),
+                    x[_LAGS:, n_states:],
+                    np.ones((n, 1)),
+                ]
+            )
+        )
         targets.append(x[_LAGS:, :n_states])
         angles.append(values[_LAGS - 1 : _LAGS - 1 + n, column])
         left = max(left - len(x), 0)
@@ -90,10 +103,14 @@ def _residuals(episodes: Sequence[Array], column: int, n_states: int) -> tuple[A
     return y - basis @ (basis.T @ y), np.concatenate(angles), basis
 
 
-def _peak(parts: Sequence[tuple[Array, Array, Array]], low: float, width: float, travel: float) -> tuple[float, float] | None:
+def _peak(
+    parts: Sequence[tuple[Array, Array, Array]], low: float, width: float, travel: float
+) -> tuple[float, float] | None:
     """Return the ratio of the fundamental, and how far its peak stands out."""
     advance = max(float(np.quantile(np.abs(np.diff(q)), 0.9)) for _, q, _ in parts)
-    largest = min(LARGEST_RATIO, 1.0 / advance if advance > 0 else np.inf, np.pi * _BINS / (32 * width)) if width > 0 else 0.0
+    largest = (
+        min(LARGEST_RATIO, 1.0 / advance if advance > 0 else np.inf, np.pi * _BINS / (32 * width)) if width > 0 else 0.0
+    )
     smallest = 6 * np.pi / travel if travel > 0 else np.inf
     if largest < 1.5 * smallest:
         return None
@@ -150,7 +167,10 @@ def _around(ratios: Array, ratio: float, resolution: float, smallest: float, lar
     """Ratios near one, without its own peak."""
     reach = max(ratio / 3, 20 * resolution)
     return np.asarray(
-        (np.abs(ratios - ratio) < reach) & (np.abs(ratios - ratio) > 3 * resolution) & (ratios > smallest) & (ratios < largest)
+        (np.abs(ratios - ratio) < reach)
+        & (np.abs(ratios - ratio) > 3 * resolution)
+        & (ratios > smallest)
+        & (ratios < largest)
     )
 
 
@@ -159,7 +179,9 @@ def _at(power: Array, ratios: Array, ratio: float, half: float) -> float:
     return float(near.max()) if near.size else 0.0
 
 
-def _share(part: tuple[Array, Array, Array], ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)) -> float:
+def _share(
+    part: tuple[Array, Array, Array], ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)
+) -> float:
     """Return the share of the residual of one unit that sines and cosines explain beside the regressors, the largest over the states."""
     residuals, angle, basis = part
     pair = np.stack([f(r * angle) for r in ratios for f in functions], axis=1)

@@ -26,7 +26,10 @@ _SAMPLES = 5000
 
 
 def resolve_lifting(
-    declared: LiftingSettings, calibration: CalibrationSettings, population: Population, test: Iterable[str] | None = None
+    declared: LiftingSettings,
+    calibration: CalibrationSettings,
+    population: Population,
+    test: Iterable[str] | None = None,
 ) -> Lifting:
     """Return the lifting that is declared, or the plant's own (35); `test` names held-out episodes, of which families see nothing."""
     inputs = declared.input_functions
@@ -101,7 +104,9 @@ def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) 
 
     phase, found = sp.Symbol(PHASE, real=True), set()
     for formula in lifting.formulas:
-        for argument in {a for node in formula.written.atoms(sp.Function) for a in node.args if phase in a.free_symbols}:
+        for argument in {
+            a for node in formula.written.atoms(sp.Function) for a in node.args if phase in a.free_symbols
+        }:
             rest = sp.expand(argument / argument.coeff(phase)) - phase if argument.coeff(phase) != 0 else phase
             symbols = {s.name for s in rest.free_symbols}
             if len(symbols) == 1 and (name := symbols.pop()) in angles and wanted in (None, name):
@@ -111,7 +116,9 @@ def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) 
     return dict(zip(("angle", "ratio"), found.pop(), strict=True)) if len(found) == 1 else {}
 
 
-def gearbox_band_hz(declared: CalibrationSettings, population: Population, top_speed: float) -> tuple[float, float] | None:
+def gearbox_band_hz(
+    declared: CalibrationSettings, population: Population, top_speed: float
+) -> tuple[float, float] | None:
     """Return the band around the gearbox frequency at top speed, within 10 %; None for other plants."""
     if population.metadata.get("plant") != HARMONIC_DRIVE or not top_speed:
         return None

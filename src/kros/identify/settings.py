@@ -20,8 +20,12 @@ class LiftingSettings(Settings):
         None,
         description="lifted functions of the states, as formulas; without any and without families those that suit the plant that the reader names",
     )
-    families: tuple[dict[str, Any], ...] = Field((), description="tables with a kind each, whose formulas stand behind the functions")
-    input_functions: tuple[str, ...] = Field((), description="further inputs of the model, as formulas of states and inputs")
+    families: tuple[dict[str, Any], ...] = Field(
+        (), description="tables with a kind each, whose formulas stand behind the functions"
+    )
+    input_functions: tuple[str, ...] = Field(
+        (), description="further inputs of the model, as formulas of states and inputs"
+    )
 
     @field_validator("families")
     @classmethod
@@ -35,10 +39,13 @@ class CalibrationSettings(Settings):
     """Phase calibration; ``None`` takes what suits the plant that the reader names."""
 
     angle: str | None = Field(
-        None, description="state in the periodic function; by default that of the formula, such as position in sin(100*position + phase)"
+        None,
+        description="state in the periodic function; by default that of the formula, such as position in sin(100*position + phase)",
     )
     ratio: float | None = Field(None, gt=0, description="periods a radian; by default that of the formula, here 100")
-    reference: str | None = Field(None, description="commanded speed, which is constant for a while in the segments that are used")
+    reference: str | None = Field(
+        None, description="commanded speed, which is constant for a while in the segments that are used"
+    )
     measured: str | None = Field(None, description="speed that follows it and shows the periodic error")
 
 
@@ -55,7 +62,9 @@ class IdentifySettings(Settings):
         "auto",
         description="regularisation, in channels divided by their ranges; a number is in the recordings' units of measure, as the paper's",
     )
-    alpha_factor: float = Field(4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model")
+    alpha_factor: float = Field(
+        4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model"
+    )
     refine: bool = Field(True, description="models refined on their free-run error, beside those of the paper's recipe")
 
     @field_validator("alpha")

@@ -21,7 +21,10 @@ if TYPE_CHECKING:
     from .sklearn_estimator import KoopmanRegressor
 
 _HOME = {
-    **dict.fromkeys(("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"), "control"),
+    **dict.fromkeys(
+        ("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"),
+        "control",
+    ),
     "quantify_models": "models",
     "KoopmanRegressor": "sklearn_estimator",
 }

@@ -76,10 +76,14 @@ def quantify_models(
         raise DataError("quantify_models: found no models; give at least two.")
     if all(is_system(model) for model in models):
         base = from_control(nominal) if is_system(nominal) else nominal
-        return uncertainty_to_control(quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, **options))
+        return uncertainty_to_control(
+            quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, **options)
+        )
     if not all(isinstance(model, control.FRD) for model in models):
         kinds = sorted({type(model).__name__ for model in models})
-        raise DimensionError(f"quantify_models: found {' and '.join(kinds)} in one list; give all as systems or all as control.FRD.")
+        raise DimensionError(
+            f"quantify_models: found {' and '.join(kinds)} in one list; give all as systems or all as control.FRD."
+        )
     if freqs_hz is not None:
         raise ConfigError("quantify_models: response data bring their own frequencies; drop freqs_hz.")
     freqs, period = _common_axis([*models, *([nominal] if isinstance(nominal, control.FRD) else [])])
@@ -93,7 +97,9 @@ def quantify_models(
     model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, **options)
     G = model.nominal_response
     scaled = G / model.output_scale[:, None] * model.input_scale
-    data, scaled_data = (control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0) for g in (G, scaled))
+    data, scaled_data = (
+        control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0) for g in (G, scaled)
+    )
     return with_weights(data, scaled_data, model, model.certificate)
 
 
@@ -102,15 +108,21 @@ def _common_axis(data: list[Any]) -> tuple[Array, float]:
     first = data[0]
     for k, other in enumerate(data):
         if not isinstance(other, control.FRD):
-            raise DimensionError(f"quantify_models: candidates beside response data should be response data, found {type(other).__name__}.")
+            raise DimensionError(
+                f"quantify_models: candidates beside response data should be response data, found {type(other).__name__}."
+            )
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
             raise DimensionError(
                 f"quantify_models: response {k} has other frequencies than the first; interpolate or measure them on one grid."
             )
         if other.dt != first.dt:
-            raise DimensionError(f"quantify_models: response {k} has dt = {other.dt}, the first dt = {first.dt}; bring them to one.")
+            raise DimensionError(
+                f"quantify_models: response {k} has dt = {other.dt}, the first dt = {first.dt}; bring them to one."
+            )
     if first.dt is True:
-        raise DimensionError("quantify_models: the sampling period of the responses is not known (dt = True); give it in seconds.")
+        raise DimensionError(
+            "quantify_models: the sampling period of the responses is not known (dt = True); give it in seconds."
+        )
     return np.asarray(first.omega) / (2 * np.pi), float(first.dt or 0.0)
 
 

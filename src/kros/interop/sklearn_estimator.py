@@ -119,22 +119,32 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         IdentificationError
             With ``alpha = 0``, a function or input that depends on the others or does not vary; the message names it.
         """
-        if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or (self.horizon is not None and self.horizon < 1):
+        if (
+            isinstance(self.functions, str)
+            or not 0 <= self.alpha < np.inf
+            or (self.horizon is not None and self.horizon < 1)
+        ):
             raise ConfigError(
                 f"KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one or None, found "
                 f"{self.functions!r}, {self.alpha!r}, {self.horizon!r}."
             )
         values, edges = self._read(X, reset=True)
-        target = None if y is None else check_array(y, dtype=np.float64, ensure_2d=False, input_name="y", estimator=self)
+        target = (
+            None if y is None else check_array(y, dtype=np.float64, ensure_2d=False, input_name="y", estimator=self)
+        )
         self._one_dimensional = target is not None and target.ndim == 1
         after = None if target is None else target.reshape(len(target), -1)
         if after is not None and len(after) != len(values):
-            raise DataError(f"X has {len(values)} rows and y has {len(after)}; y holds the next state of every row of X.")
+            raise DataError(
+                f"X has {len(values)} rows and y has {len(after)}; y holds the next state of every row of X."
+            )
         self._name_columns(X, values.shape[1], None if after is None else after.shape[1])
         before, n = values, len(self.state_names_)
         if after is None:
             if np.diff(edges).min() < 2:
-                raise DataError("KoopmanRegressor: an episode has n_samples = 1, a transition needs at least 2; leave the episode out.")
+                raise DataError(
+                    "KoopmanRegressor: an episode has n_samples = 1, a transition needs at least 2; leave the episode out."
+                )
             now = np.delete(np.arange(len(values)), edges[1:] - 1)
             before, after = values[now], values[now + 1, :n]
         with np.errstate(all="ignore"):
@@ -209,7 +219,10 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _step(self, x: Array, u: Array) -> Array:
         n = len(self.state_names_)
         with np.errstate(all="ignore"):
-            return np.asarray(np.concatenate([self.lifting_.lift(x), u], axis=1) @ np.concatenate([self.A_[:n], self.B_[:n]], axis=1).T)
+            return np.asarray(
+                np.concatenate([self.lifting_.lift(x), u], axis=1)
+                @ np.concatenate([self.A_[:n], self.B_[:n]], axis=1).T
+            )
 
     def _free_run(self, values: Array, edges: npt.NDArray[np.int64]) -> Array:
         """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""
@@ -229,12 +242,18 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.episode_feature and ids is None:
             ids, values = values[:, 0], values[:, 1:]
         if not values.shape[1]:
-            raise DataError("KoopmanRegressor: rows hold no state beside the episode; add the columns of states and inputs.")
+            raise DataError(
+                "KoopmanRegressor: rows hold no state beside the episode; add the columns of states and inputs."
+            )
         if not reset and values.shape[1] != len(self.state_names_) + len(self.input_names_):
-            raise DataError(f"KoopmanRegressor: found {values.shape[1]} columns beside the episode; pass rows in the layout of `fit`.")
+            raise DataError(
+                f"KoopmanRegressor: found {values.shape[1]} columns beside the episode; pass rows in the layout of `fit`."
+            )
         inner = np.zeros(0, dtype=np.int64) if ids is None else np.flatnonzero(ids[1:] != ids[:-1]) + 1
         if ids is not None and len(set(ids[[0, *inner]].tolist())) <= len(inner):
-            raise DataError("KoopmanRegressor: an episode stands in several places; keep its rows together and in order of time.")
+            raise DataError(
+                "KoopmanRegressor: an episode stands in several places; keep its rows together and in order of time."
+            )
         return values, np.concatenate([[0], inner, [len(values)]]).astype(np.int64)
 
     def _name_columns(self, X: Any, n_columns: int, n_targets: int | None) -> None:
@@ -251,14 +270,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         named = hasattr(X, "iloc") and all(isinstance(c, str) for c in X.columns)
         frame = [c for c in X.columns if c != EPISODE][-n_columns:] if named else []
         names = frame or [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(n_columns - n)]
-        self.state_names_, self.input_names_ = tuple(names[:n] if self.states is None else self.states), tuple(names[n:])
+        self.state_names_, self.input_names_ = (
+            tuple(names[:n] if self.states is None else self.states),
+            tuple(names[n:]),
+        )
         if frame and self.state_names_ != tuple(frame[:n]):
             raise DataError(
                 f"The states are {self.state_names_}, the frame has the columns {frame}; put the states first, the inputs after them."
             )
         self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_)
         if self.lifting_.history:
-            raise ConfigError("KoopmanRegressor: rows stand by themselves, functions cannot read earlier samples; use kros.identify.")
+            raise ConfigError(
+                "KoopmanRegressor: rows stand by themselves, functions cannot read earlier samples; use kros.identify."
+            )
 
     def __sklearn_tags__(self) -> Any:
         """Return scikit-learn's facts about the estimator: no target is needed."""
@@ -283,5 +307,7 @@ def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
 
 def _r2(truth: Array, predicted: Array) -> float:
     if len(truth) < 2:
-        raise DataError(f"score: found {len(truth)} samples to compare with, R2 needs 2; pass longer episodes, or lower the horizon.")
+        raise DataError(
+            f"score: found {len(truth)} samples to compare with, R2 needs 2; pass longer episodes, or lower the horizon."
+        )
     return float(r2_score(truth, predicted)) if np.isfinite(predicted).all() else -np.inf

@@ -48,7 +48,9 @@ class ColumnEvaluator:
     """Expressions evaluated together, one column each."""
 
     singles: tuple[tuple[int, Evaluator], ...]  # columns whose shape no other has
-    blocks: tuple[tuple[Any, Evaluator], ...]  # columns of one shape; the evaluator wants values with a trailing axis of length one
+    blocks: tuple[
+        tuple[Any, Evaluator], ...
+    ]  # columns of one shape; the evaluator wants values with a trailing axis of length one
 
     @classmethod
     def of(cls, expressions: Sequence[Any], first: int = 0) -> ColumnEvaluator:
@@ -119,7 +121,9 @@ def _real(number: Any) -> float:
     try:
         return float(number)
     except TypeError as error:
-        raise ConfigError(f"Formula node {number!r}: is not a real number; keep roots and logarithms of positive quantities.") from error
+        raise ConfigError(
+            f"Formula node {number!r}: is not a real number; keep roots and logarithms of positive quantities."
+        ) from error
 
 
 def _assemble(shape: Shape, numbers: Iterator[Any]) -> Evaluator:
@@ -143,7 +147,9 @@ def _assemble(shape: Shape, numbers: Iterator[Any]) -> Evaluator:
     return lambda values: function(inner(values))
 
 
-def _assemble_sharing(shape: Shape, numbers: list[float], shared: dict[tuple[Shape, tuple[float, ...]], Evaluator]) -> Evaluator:
+def _assemble_sharing(
+    shape: Shape, numbers: list[float], shared: dict[tuple[Shape, tuple[float, ...]], Evaluator]
+) -> Evaluator:
     """Assemble a function whose argument others may have, too, such as sine and cosine of an angle: it is then evaluated once."""
     if shape[0] not in FUNCTIONS or shape[1][0] in ("symbol", "number"):
         return _assemble(shape, iter(numbers))

@@ -75,7 +75,9 @@ def delays(names: Sequence[str], depth: int) -> Formulas:
     _require_whole("delays", "depth", [depth], 1)
     others = [name for name in names if not name.isidentifier()]
     if others:
-        raise ConfigError(f"delays: only states and inputs have earlier values, found {others}; write the delay inside the formula.")
+        raise ConfigError(
+            f"delays: only states and inputs have earlier values, found {others}; write the delay inside the formula."
+        )
     if depth > MAX_DELAY:
         raise ConfigError(f"delays: depth = {depth} is too deep; at most {MAX_DELAY} samples are kept.")
     require_count("delays", depth * len(names))
@@ -100,7 +102,9 @@ def concatenate(*families: Sequence[str]) -> Formulas:
     joined = tuple(text for family in families for text in family)
     repeated = sorted({text for text in joined if joined.count(text) > 1})
     if repeated:
-        raise ConfigError(f"Lifting families: {', '.join(map(repr, repeated))} appears more than once; leave it out of one family.")
+        raise ConfigError(
+            f"Lifting families: {', '.join(map(repr, repeated))} appears more than once; leave it out of one family."
+        )
     return joined
 
 
@@ -123,7 +127,10 @@ def require_names(family: str, names: Sequence[str]) -> Formulas:
 def is_whole(value: object, least: int) -> bool:
     """Whether a value is a whole number, at least so large and no larger than a double can count."""
     return bool(
-        isinstance(value, int | float | np.number) and not isinstance(value, bool) and least <= value <= 2**53 and int(value) == value
+        isinstance(value, int | float | np.number)
+        and not isinstance(value, bool)
+        and least <= value <= 2**53
+        and int(value) == value
     )
 
 
@@ -135,5 +142,12 @@ def require_count(family: str, count: float) -> None:
 
 def _require_whole(family: str, option: str, values: Sequence[int], least: int) -> None:
     listed = isinstance(values, Iterable) and not isinstance(values, str)
-    if not listed or not (numbers := list(values)) or not all(is_whole(v, least) for v in numbers) or len(set(numbers)) != len(numbers):
-        raise ConfigError(f"{family}: {option} = {values!r:.200} should be different whole numbers of at least {least}.")
+    if (
+        not listed
+        or not (numbers := list(values))
+        or not all(is_whole(v, least) for v in numbers)
+        or len(set(numbers)) != len(numbers)
+    ):
+        raise ConfigError(
+            f"{family}: {option} = {values!r:.200} should be different whole numbers of at least {least}."
+        )

@@ -22,7 +22,13 @@ from ..core.files import did_you_mean
 from .evaluation import FUNCTIONS, Evaluator, compile_expression
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
 
-_BINARY = {ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: operator.truediv, ast.Pow: operator.pow}
+_BINARY = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.Pow: operator.pow,
+}
 _UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 _SPELLINGS = {"abs": "Abs"}
 MAX_DELAY = 1000
@@ -34,7 +40,9 @@ class Formula:
 
     text: str  # as written by the user
     names: tuple[str, ...]  # quantities that may appear
-    delayed: tuple[str, ...] = ()  # quantities of which earlier values may appear: ``position[-2]`` is the value two samples before
+    delayed: tuple[
+        str, ...
+    ] = ()  # quantities of which earlier values may appear: ``position[-2]`` is the value two samples before
     sizes: tuple[tuple[str, float], ...] = ()  # sizes of quantities whose values come divided by them
     size: float = 1.0  # what the value of the formula is divided by
 
@@ -50,7 +58,9 @@ class Formula:
 
         sizes = dict(self.sizes)
         known = {symbol: sizes.get(base_and_delay(symbol.name)[0], 1.0) for symbol in self.written.free_symbols}
-        tree = self.written.xreplace({symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1})
+        tree = self.written.xreplace(
+            {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
+        )
         return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
 
     @cached_property
@@ -90,13 +100,17 @@ def base_and_delay(name: str) -> tuple[str, int]:
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     """Read a formula into a SymPy tree. What may take long is refused before it does: see `limits`."""
     if len(require_text(text)) > MAX_LENGTH:
-        raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions.")
+        raise ConfigError(
+            f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions."
+        )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Python warns of text such as 1if
             tree = ast.parse(text.strip(), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError, Warning) as error:
-        raise ConfigError(f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'.") from error
+        raise ConfigError(
+            f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'."
+        ) from error
     try:
         require_size(tree.body)
         return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
@@ -123,7 +137,9 @@ def _real_magnitude() -> tuple[Any, Any]:
 def require_text(text: object) -> str:
     """Return what is a text, as a formula should be."""
     if not isinstance(text, str):
-        raise ConfigError(f"Formula {text!r}: should be a text such as 'sin(100*position + phase)', found {type(text).__name__}.")
+        raise ConfigError(
+            f"Formula {text!r}: should be a text such as 'sin(100*position + phase)', found {type(text).__name__}."
+        )
     return text
 
 
@@ -161,7 +177,9 @@ class _Reader:
             if function in FUNCTIONS:
                 return getattr(sp, function)(self.read(node.args[0]))
             raise self._error(f"unknown function {node.func.id!r}; known are {', '.join(sorted(FUNCTIONS))}.")
-        raise self._error(f"{ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument.")
+        raise self._error(
+            f"{ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument."
+        )
 
     def _name(self, name: str) -> Any:
         import sympy as sp
@@ -170,24 +188,34 @@ class _Reader:
             return sp.Symbol(name, real=True)
         if name == "pi":
             return sp.pi
-        raise self._error(f"unknown name {name!r}{did_you_mean(name, self.names) or ';'} known are {', '.join(self.names)} and pi.")
+        raise self._error(
+            f"unknown name {name!r}{did_you_mean(name, self.names) or ';'} known are {', '.join(self.names)} and pi."
+        )
 
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp
 
         if name not in self.delayed:
-            known = f"only {', '.join(self.delayed)} have earlier values" if self.delayed else "nothing here has earlier values"
+            known = (
+                f"only {', '.join(self.delayed)} have earlier values"
+                if self.delayed
+                else "nothing here has earlier values"
+            )
             raise self._error(f"there is no {name}[{ast.unparse(index)}]; {known}.")
         negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
         amount = index.operand if isinstance(index, ast.UnaryOp) else index
         if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
-            raise self._error(f"the delay in {name}[{ast.unparse(index)}] should be a whole number of samples, such as {name}[-1].")
+            raise self._error(
+                f"the delay in {name}[{ast.unparse(index)}] should be a whole number of samples, such as {name}[-1]."
+            )
         if not negative or amount.value == 0:
             raise self._error(
                 f"{name}[{ast.unparse(index)}] is not an earlier value; write {name}[-1] for one sample before, {name} for the present."
             )
         if amount.value > MAX_DELAY:
-            raise self._error(f"the delay in {name}[-{amount.value}] is too deep; at most {MAX_DELAY} samples are kept.")
+            raise self._error(
+                f"the delay in {name}[-{amount.value}] is too deep; at most {MAX_DELAY} samples are kept."
+            )
         return sp.Symbol(delayed_name(name, amount.value), real=True)
 
     def _error(self, problem: str) -> ConfigError:

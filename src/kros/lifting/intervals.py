@@ -38,7 +38,9 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
 def _range(name: str, value: Any) -> tuple[float, float]:
     low, high = (float(v) for v in (value if np.ndim(value) else (value, value)))
     if not low <= high:
-        raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give a lower and an upper number in this order.")
+        raise ConfigError(
+            f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give a lower and an upper number in this order."
+        )
     return low, high
 
 
@@ -83,7 +85,9 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
         return _power(_walk(expression.base, values), expression.exp)
     function = _FUNCTIONS.get(type(expression).__name__)
     if function is None:
-        raise ConfigError(f"Bounds of {expression}: nothing is known about {type(expression).__name__}; use functions that formulas know.")
+        raise ConfigError(
+            f"Bounds of {expression}: nothing is known about {type(expression).__name__}; use functions that formulas know."
+        )
     return function(*_walk(expression.args[0], values))
 
 
@@ -100,7 +104,9 @@ def _add(a: Interval, b: Interval) -> Interval:
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
-    products = [np.where((x == 0) | (y == 0), 0.0, _away_from_zero(x * y, np.sign(x) * np.sign(y))) for x in a for y in b]
+    products = [
+        np.where((x == 0) | (y == 0), 0.0, _away_from_zero(x * y, np.sign(x) * np.sign(y))) for x in a for y in b
+    ]
     return _outward(np.minimum.reduce(products), np.maximum.reduce(products))
 
 
@@ -129,7 +135,9 @@ def _reciprocal(a: Interval) -> Interval:
     through = (low < 0) & (high > 0)
     lower = np.where(through | (high == 0), -np.inf, 1 / np.where(high == 0, 1.0, high))
     upper = np.where(through | (low == 0), np.inf, 1 / np.where(low == 0, 1.0, low))
-    return _outward(np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper))
+    return _outward(
+        np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper)
+    )
 
 
 def _or_reals(low: Array, high: Array) -> Interval:
@@ -150,7 +158,9 @@ def _sine(low: Array, high: Array) -> Interval:
 
     ends = np.sin(np.where(np.isfinite(low), low, 0.0)), np.sin(np.where(np.isfinite(high), high, 0.0))
     endless = ~(np.isfinite(low) & np.isfinite(high))
-    slack = _ULPS * _EPSILON * (1 + np.maximum(np.abs(low), np.abs(high)))  # of the argument too, which may have been shifted
+    slack = (
+        _ULPS * _EPSILON * (1 + np.maximum(np.abs(low), np.abs(high)))
+    )  # of the argument too, which may have been shifted
     return (
         np.where(endless | touches(-np.pi / 2), -1.0, np.maximum(np.minimum(*ends) - slack, -1.0)),
         np.where(endless | touches(np.pi / 2), 1.0, np.minimum(np.maximum(*ends) + slack, 1.0)),
@@ -173,7 +183,9 @@ def _logarithm(low: Array, high: Array) -> Interval:
 
 
 def _magnitude(low: Array, high: Array) -> Interval:
-    return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(np.abs(low), np.abs(high))), np.maximum(np.abs(low), np.abs(high))
+    return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(np.abs(low), np.abs(high))), np.maximum(
+        np.abs(low), np.abs(high)
+    )
 
 
 def _spike(low: Array, high: Array) -> Interval:
@@ -181,7 +193,9 @@ def _spike(low: Array, high: Array) -> Interval:
     return np.zeros_like(low), np.where((low <= 0) & (high >= 0), np.inf, 0.0)
 
 
-def _rising(function: Callable[[Array], Array], least: float = -np.inf, most: float = np.inf) -> Callable[[Array, Array], Interval]:
+def _rising(
+    function: Callable[[Array], Array], least: float = -np.inf, most: float = np.inf
+) -> Callable[[Array, Array], Interval]:
     """Bounds of a rising function, whose values are known to lie between two numbers."""
 
     def bounds(low: Array, high: Array) -> Interval:

@@ -88,7 +88,9 @@ def length_scales(family: str, length: float | Sequence[float], n: int) -> Array
     """Return n length scales from one or n, refusing what is not positive."""
     lengths = np.asarray(length, dtype=float)
     if lengths.shape not in ((), (n,)) or not np.isfinite(lengths).all() or np.any(lengths <= 0):
-        raise ConfigError(f"{family}: length = {length} should be a positive number, or {n} of them, one for each quantity.")
+        raise ConfigError(
+            f"{family}: length = {length} should be a positive number, or {n} of them, one for each quantity."
+        )
     return np.broadcast_to(lengths, (n,))
 
 
@@ -122,7 +124,9 @@ def kmeans_centres(data: npt.ArrayLike, n: int, seed: int) -> Array:
         raise ConfigError(f"Centres by k-means: need finite data of shape (n_samples, d), found shape {data.shape}.")
     distinct = np.unique(data, axis=0)
     if len(distinct) < _count(n):
-        raise ConfigError(f"Centres by k-means: {n} clusters need as many different samples, found {len(distinct)}; ask for fewer.")
+        raise ConfigError(
+            f"Centres by k-means: {n} clusters need as many different samples, found {len(distinct)}; ask for fewer."
+        )
     spread = data.std(axis=0)
     spread[spread == 0] = 1.0
     rng, scaled = np.random.default_rng(seed), data / spread

@@ -115,7 +115,9 @@ class Lifting:
 
     def extension(self) -> dict[str, Any]:
         """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        found: dict[str, Any] = {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
+        found: dict[str, Any] = (
+            {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
+        )
         return found | ({"sizes": self.sizes} if self.sizes else {})
 
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
@@ -158,7 +160,9 @@ class Lifting:
     @cached_property
     def window(self) -> Window:
         """Which earlier values the formulas read."""
-        return Window.of(self.states, self.inputs, [name for f in self.formulas + self.input_formulas for name in f.used])
+        return Window.of(
+            self.states, self.inputs, [name for f in self.formulas + self.input_formulas for name in f.used]
+        )
 
     @property
     def history(self) -> int:
@@ -246,7 +250,9 @@ class Lifting:
         given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
-            raise DimensionError(f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first.")
+            raise DimensionError(
+                f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first."
+            )
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
     def retract(self, lifted: npt.ArrayLike) -> Array:
@@ -331,11 +337,16 @@ class Lifting:
 
     @cached_property
     def _parameter_derivatives(self) -> dict[str, ColumnEvaluator]:
-        return {name: ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas]) for name in self.parameters}
+        return {
+            name: ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas])
+            for name in self.parameters
+        }
 
     @cached_property
     def _input_derivatives(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.derivative(name) for formula in self.input_formulas for name in self.window.names])
+        return ColumnEvaluator.of(
+            [formula.derivative(name) for formula in self.input_formulas for name in self.window.names]
+        )
 
     @cached_property
     def _read_states(self) -> tuple[tuple[int, str], ...]:
@@ -348,16 +359,22 @@ class Lifting:
         names = self.window.names
         if x.shape[-1:] != (len(names),):
             what = "states" if names == self.states else "entries of a window"
-            raise DimensionError(f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}.")
+            raise DimensionError(
+                f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}."
+            )
         return x
 
-    def _values(self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None) -> dict[str, Array]:
+    def _values(
+        self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None
+    ) -> dict[str, Array]:
         values = self.parameter_values(parameters)
         values.update({name: x[..., i] for i, name in self._read_states})
         if earlier is not None:
             values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
         elif self.window.depths:
-            raise DimensionError(f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows.")
+            raise DimensionError(
+                f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows."
+            )
         if u is not None:
             values.update({name: u[..., i] for i, name in enumerate(self.inputs)})
         return values

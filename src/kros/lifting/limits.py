@@ -15,7 +15,9 @@ from ..core.errors import ConfigError
 MAX_LENGTH = 2000
 MAX_EXPONENT = 64
 MAX_NODES = 300  # numbers, names, operators and functions
-MAX_DEPTH = 20  # parentheses, functions and powers inside each other; sums and products are as deep as their deepest term
+MAX_DEPTH = (
+    20  # parentheses, functions and powers inside each other; sums and products are as deep as their deepest term
+)
 MAX_FACTORS = 40  # of one product, whose derivative has as many terms of as many factors
 MAX_TERMS = 2000  # of a formula with parameters, multiplied out
 _EXACT = 2**53
@@ -37,7 +39,9 @@ def require_size(tree: ast.AST) -> None:
             own = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
             depth += not (isinstance(node, ast.Name | ast.Constant) or (own is not None and own is chain))
             if count > MAX_NODES:
-                raise TooCostlyError(f"has more than {MAX_NODES} numbers, names and operators; split it into several functions.")
+                raise TooCostlyError(
+                    f"has more than {MAX_NODES} numbers, names and operators; split it into several functions."
+                )
             if depth > MAX_DEPTH:
                 raise TooCostlyError(f"is nested more than {MAX_DEPTH} deep; split it into several functions.")
             chain = own
@@ -56,7 +60,9 @@ def settled(value: Any) -> Any:
         if part.is_number:
             finite(part)
         if isinstance(part, sp.Pow) and part.exp.is_number and abs(finite(part.exp)) > MAX_EXPONENT:
-            raise TooCostlyError(f"holds a power of {finite(part.exp):g}; exponents are numbers of magnitude at most {MAX_EXPONENT}.")
+            raise TooCostlyError(
+                f"holds a power of {finite(part.exp):g}; exponents are numbers of magnitude at most {MAX_EXPONENT}."
+            )
     if isinstance(value, sp.Mul) and len(value.args) > MAX_FACTORS:
         raise TooCostlyError(f"holds a product of {len(value.args)} factors; at most {MAX_FACTORS} are read.")
     return value

@@ -26,7 +26,9 @@ class FormulaSeparation:
     window: Window  # what ``w`` holds
     parameters: tuple[str, ...]
     basis: tuple[Any, ...]  # SymPy trees of ``g``
-    terms: tuple[tuple[tuple[int, Any], ...], ...]  # for each function its pairs of a column of ``g`` and the SymPy tree of the coefficient
+    terms: tuple[
+        tuple[tuple[int, Any], ...], ...
+    ]  # for each function its pairs of a column of ``g`` and the SymPy tree of the coefficient
 
     @classmethod
     def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
@@ -75,7 +77,9 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
     _require_short(formula, apart)
     pairs = []
     for term in sp.Add.make_args(sp.expand(apart, trig=False)):
-        coefficient, function = term.as_independent(*(s for s in term.free_symbols if s not in parameters), as_Add=False)
+        coefficient, function = term.as_independent(
+            *(s for s in term.free_symbols if s not in parameters), as_Add=False
+        )
         if function.free_symbols & parameters:
             names = tuple(sorted(p.name for p in parameters))
             raise ConfigError(

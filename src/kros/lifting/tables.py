@@ -47,7 +47,9 @@ def check_family(table: Table) -> None:
         if "data" in centres:
             raise ConfigError("Lifting centres 'kmeans': unknown key 'data'; the data are those of the study.")
         count = centres.get("n", 1)
-        points = np.random.default_rng(0).normal(size=(int(count) if is_whole(count, 1) and count <= MAX_FORMULAS else 1, width))
+        points = np.random.default_rng(0).normal(
+            size=(int(count) if is_whole(count, 1) and count <= MAX_FORMULAS else 1, width)
+        )
         family(table, lambda _: points)
     else:
         family(table)

@@ -54,7 +54,10 @@ class Window:
     @cached_property
     def quantities(self) -> tuple[tuple[str, int], ...]:
         """The quantity behind every entry, and how many samples before it is meant."""
-        return (*((state, 0) for state in self.states), *((q, d) for q, depth in self.depths for d in range(1, depth + 1)))
+        return (
+            *((state, 0) for state in self.states),
+            *((q, d) for q, depth in self.depths for d in range(1, depth + 1)),
+        )
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -65,7 +68,10 @@ class Window:
     def shift(self) -> Index:
         """Entry of ``[window, inputs]`` that every earlier value has at the next sample."""
         entries = (*self.names, *self.inputs)
-        return np.array([entries.index(delayed_name(q, d - 1)) for q, depth in self.depths for d in range(1, depth + 1)], dtype=np.intp)
+        return np.array(
+            [entries.index(delayed_name(q, d - 1)) for q, depth in self.depths for d in range(1, depth + 1)],
+            dtype=np.intp,
+        )
 
     @cached_property
     def present(self) -> Index:
@@ -87,7 +93,11 @@ class Window:
         if not self.depths:
             return x
         self.require(x.shape[-2])
-        columns = {name: values[..., i] for names, values in ((self.states, x), (self.inputs, u)) for i, name in enumerate(names)}
+        columns = {
+            name: values[..., i]
+            for names, values in ((self.states, x), (self.inputs, u))
+            for i, name in enumerate(names)
+        }
         end, h = x.shape[-2], self.history
         earlier = [columns[q][..., h - d : end - d] for q, depth in self.depths for d in range(1, depth + 1)]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
@@ -105,7 +115,9 @@ class Window:
     def require_inputs(self, u: Array) -> None:
         """Refuse inputs that are not those the formulas were written for."""
         if self.inputs and u.shape[-1] != len(self.inputs):
-            raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} on the last axis, found shape {u.shape}.")
+            raise DimensionError(
+                f"Lifting: expected {len(self.inputs)} inputs {self.inputs} on the last axis, found shape {u.shape}."
+            )
 
     def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
         """Return the columns by name, the present inputs with them where they are given."""

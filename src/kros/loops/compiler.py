@@ -33,7 +33,10 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
     """Return a C source as a library, compiled once for this user on this machine; None where that cannot be, with one log entry."""
     compiler = find_compiler()
     if compiler is None:
-        _log.info("Time loops run in NumPy, several times slower: no C compiler is on the PATH, tried %s.", ", ".join(COMPILERS))
+        _log.info(
+            "Time loops run in NumPy, several times slower: no C compiler is on the PATH, tried %s.",
+            ", ".join(COMPILERS),
+        )
         return None
     reason = "no folder for it can be written"
     for folder in _folders():
@@ -79,7 +82,9 @@ def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS,
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(running.pid, signal.SIGKILL)
     if running.returncode:
-        raise subprocess.SubprocessError(f"{command[0]} ended with {running.returncode}: {' '.join(printed.split())[:300]}")
+        raise subprocess.SubprocessError(
+            f"{command[0]} ended with {running.returncode}: {' '.join(printed.split())[:300]}"
+        )
     return str(printed)
 
 
@@ -95,8 +100,19 @@ def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
     """What a library depends on; code for one processor need not run on another that sees the same home."""
     found = os.stat(compiler)
     processor = Path("/proc/cpuinfo")
-    flags_of = [line for line in processor.read_text().splitlines() if line.startswith(("flags", "Features"))] if processor.exists() else []
-    parts = (source, *flags, os.path.realpath(compiler), f"{found.st_size} {found.st_mtime_ns}", *os.uname()[::4], *flags_of[:1])
+    flags_of = (
+        [line for line in processor.read_text().splitlines() if line.startswith(("flags", "Features"))]
+        if processor.exists()
+        else []
+    )
+    parts = (
+        source,
+        *flags,
+        os.path.realpath(compiler),
+        f"{found.st_size} {found.st_mtime_ns}",
+        *os.uname()[::4],
+        *flags_of[:1],
+    )
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:32]
 
 
@@ -112,7 +128,12 @@ def _folders() -> Iterator[Path]:
             found = folder.lstat()
         except (OSError, RuntimeError):
             continue
-        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022 and os.access(folder, os.W_OK):
+        if (
+            stat.S_ISDIR(found.st_mode)
+            and found.st_uid == os.getuid()
+            and not found.st_mode & 0o022
+            and os.access(folder, os.W_OK)
+        ):
             yield folder
 
 

@@ -60,12 +60,21 @@ def recursion(F: Array, driven: Array, first: Array, G: Array | None = None) -> 
     return h
 
 
-def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Array, every: int = 1, *, states: bool = True) -> Array:
+def blocks_along(
+    F: Array, G: Array, H: Array, z: Array, rest: Array, held: Array, every: int = 1, *, states: bool = True
+) -> Array:
     """Return the states of a model in blocks of two, ``h[k + 1] = F h[k] + G z[k]``, or its estimates ``H h[k]``."""
     (blocks, _, channels), (batch, samples) = G.shape, z.shape[1:]
     if (loops := library()) is not None:
         found = np.empty((2 * blocks, batch, -(-samples // every)) if states else (len(H), batch, samples))
-        job = {"blocks": blocks, "channels": channels, "outputs": len(H), "samples": samples, "batch": batch, "every": every}
+        job = {
+            "blocks": blocks,
+            "channels": channels,
+            "outputs": len(H),
+            "samples": samples,
+            "batch": batch,
+            "every": every,
+        }
         job |= {"F": F, "G": G, "H": H, "z": z, "rest": rest, "held": held, "h" if states else "sum": found}
         loops.call("kros_blocks", ("blocks_job", job))
         return found
@@ -74,7 +83,11 @@ def blocks_along(F: Array, G: Array, H: Array, z: Array, rest: Array, held: Arra
     for k in range(samples - 1):
         h[k + 1] = F @ h[k] + driven[k]
     h += held
-    return h.reshape(samples, 2 * blocks, batch)[::every].transpose(1, 2, 0) if states else np.einsum("obd,kbde->oek", H, h)
+    return (
+        h.reshape(samples, 2 * blocks, batch)[::every].transpose(1, 2, 0)
+        if states
+        else np.einsum("obd,kbde->oek", H, h)
+    )
 
 
 def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:
@@ -86,7 +99,13 @@ def lattice_along(reflections: Array, x: Array, every: int = 1) -> Array:
     single = np.isnan(reflections[:, 1])
     if (loops := library()) is not None:
         held = np.empty((int(np.sum(2 - single)), len(x), -(-x.shape[1] // every)))
-        job = {"sections": len(reflections), "states": len(held), "signals": len(x), "samples": x.shape[1], "every": every}
+        job = {
+            "sections": len(reflections),
+            "states": len(held),
+            "signals": len(x),
+            "samples": x.shape[1],
+            "every": every,
+        }
         loops.call("kros_chain", ("chain_job", job | {"reflections": reflections, "x": x, "held": held}))
         return held
     A, B = lattice(reflections)

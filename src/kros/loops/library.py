@@ -41,7 +41,9 @@ class Library:
         self._types: dict[str, dict[str, tuple[Any, bool] | None]] = {}
         for body, name in re.findall(r"typedef struct \{(.*?)\} (\w+);", source, re.DOTALL):
             fields = re.findall(r"^\s+(const )?(\w+) (\*?)(\w+);", body, re.MULTILINE)
-            self._types[name] = {field: (_TYPES[kind], not given) if pointer else None for given, kind, pointer, field in fields}
+            self._types[name] = {
+                field: (_TYPES[kind], not given) if pointer else None for given, kind, pointer, field in fields
+            }
 
     def call(self, name: str, *jobs: tuple[str, Mapping[str, Any]]) -> None:
         """Call a function with structs by type: numbers and arrays by field, nothing for a field that is left out."""
@@ -54,7 +56,9 @@ class Library:
         fields = self._types[type_]
         unknown = values.keys() - fields.keys()
         assert not unknown, unknown
-        return (ctypes.c_int64 * len(fields))(*(self._slot(values.get(field), kind, alive) for field, kind in fields.items()))
+        return (ctypes.c_int64 * len(fields))(
+            *(self._slot(values.get(field), kind, alive) for field, kind in fields.items())
+        )
 
     @staticmethod
     def _slot(value: Any, pointer: tuple[Any, bool] | None, alive: list[Any]) -> int:
@@ -79,7 +83,9 @@ def library() -> Library | None:
     return None if code is None else Library(code, source)
 
 
-def formulas(lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] | None, m: int, batch: int) -> tuple[str, dict[str, Any]]:
+def formulas(
+    lifting: Lifting, tape: Tape, values: Mapping[str, npt.ArrayLike] | None, m: int, batch: int
+) -> tuple[str, dict[str, Any]]:
     """Return what the loops need to know of a lifting with parameters of shape (batch,), and m recorded inputs."""
     window, given = lifting.window, lifting.parameter_values(values)
     own = np.array([np.broadcast_to(given[name], (batch,)) for name in lifting.parameters])

@@ -17,7 +17,22 @@ from ..lifting import Lifting
 from ..lifting.evaluation import shape_of
 
 Whole = npt.NDArray[np.int32]
-_KINDS = ("add", "multiply", "divide", "power", "sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")  # as in loops.c
+_KINDS = (
+    "add",
+    "multiply",
+    "divide",
+    "power",
+    "sin",
+    "cos",
+    "tan",
+    "exp",
+    "log",
+    "sqrt",
+    "tanh",
+    "Abs",
+    "sign",
+    "atan",
+)  # as in loops.c
 _POWERS: dict[float, tuple[int, bool, bool]] = {
     -2.0: (2, True, False),
     -1.0: (1, True, False),
@@ -52,7 +67,11 @@ def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: 
     lifted = [*states, *functions, *range(len(window), len(window) + m), *of]
     formulas = [(lifting.n_states + i, formula) for i, formula in enumerate(lifting.formulas)]
     formulas += [(n_lifted + m + i, formula) for i, formula in enumerate(lifting.input_formulas)] if of_inputs else []
-    slopes = [(column, place, formula.derivative(window[entry])) for column, formula in formulas for place, entry in enumerate(entries)]
+    slopes = [
+        (column, place, formula.derivative(window[entry]))
+        for column, formula in formulas
+        for place, entry in enumerate(entries)
+    ]
     written = [(column, place, writer.write(tree)) for column, place, tree in slopes if tree != 0]
     return writer.finished(lifted, written)
 

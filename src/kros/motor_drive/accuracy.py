@@ -39,7 +39,9 @@ def load_accuracy(
     truth = np.asarray(load, dtype=float)
     loaded = np.any(truth != 0, axis=0)
     if loaded.all() or not loaded.any():
-        raise DataError(f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} with load.")
+        raise DataError(
+            f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} with load."
+        )
     slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
     error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
 

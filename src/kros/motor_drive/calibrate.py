@@ -119,7 +119,11 @@ def calibrate_load(
             f"Load calibration: states {states.shape} and load {load.shape} should agree in (n_samples, batch), "
             f"and no state be named {LOAD!r}, found {', '.join(lifting.states)}."
         )
-    at_limit = np.zeros(load.shape[1], bool) if limit is None or current is None else np.abs(states[..., current]).max(axis=0) >= limit
+    at_limit = (
+        np.zeros(load.shape[1], bool)
+        if limit is None or current is None
+        else np.abs(states[..., current]).max(axis=0) >= limit
+    )
     used = np.flatnonzero(~at_limit)
     loaded = np.any(load[:, used] != 0, axis=0)
     if not loaded.any() or loaded.all():

@@ -104,7 +104,10 @@ class RunningAngleLoad:
         self.settings, self._pole = settings, settings.pole
         self._phi = np.stack([np.sin(position), np.cos(position)])
         self._psi, self._right = np.zeros_like(self._phi), np.zeros_like(self._phi)
-        self._excess, self._need = np.zeros_like(position), np.zeros_like(position)  # taken off the load, and off the unloaded current
+        self._excess, self._need = (
+            np.zeros_like(position),
+            np.zeros_like(position),
+        )  # taken off the load, and off the unloaded current
         trust = np.full_like(position, 0.5 * settings.settling_s)
         self._gram = np.stack([trust, np.zeros_like(position), trust])  # of sin sin, sin cos, cos cos
 
@@ -140,4 +143,6 @@ class RunningAngleLoad:
 
     def _coefficients(self) -> Array:
         a, b, d = self._gram
-        return np.stack([d * self._right[0] - b * self._right[1], a * self._right[1] - b * self._right[0]]) / (a * d - b * b)
+        return np.stack([d * self._right[0] - b * self._right[1], a * self._right[1] - b * self._right[0]]) / (
+            a * d - b * b
+        )

@@ -61,7 +61,10 @@ def load_observer(
     past = calibration.past
     hidden = len(hidden_of(past.lifting, past.measured))
     importance = np.append(np.full(hidden - 1, _OTHERS), 1.0)
-    model, batch = past.model(hidden + internal, importance=importance, deviation=deviation), calibration.batch.head(samples)
+    model, batch = (
+        past.model(hidden + internal, importance=importance, deviation=deviation),
+        calibration.batch.head(samples),
+    )
     if iterations:
         model, _ = tune_predictor(model, past, batch, importance, deviation, iterations=iterations)
     return embedded(name, past, model, inputs, batch)

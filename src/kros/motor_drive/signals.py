@@ -25,8 +25,12 @@ def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) 
     from scipy.signal import butter, sosfiltfilt
 
     if not 0 < corner_hz < 0.5 / sample_period_s:
-        raise ConfigError(f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {0.5 / sample_period_s:g} Hz.")
-    filtered: Array = sosfiltfilt(butter(_ORDER, corner_hz, fs=1 / sample_period_s, output="sos"), np.asarray(signal, dtype=float), axis=0)
+        raise ConfigError(
+            f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {0.5 / sample_period_s:g} Hz."
+        )
+    filtered: Array = sosfiltfilt(
+        butter(_ORDER, corner_hz, fs=1 / sample_period_s, output="sos"), np.asarray(signal, dtype=float), axis=0
+    )
     return filtered
 
 
@@ -35,7 +39,9 @@ def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float)
     from scipy.signal import lfilter
 
     signal = np.asarray(signal, dtype=float)
-    changed: Array = lfilter([1.0, -1.0], [1.0, -float(np.exp(-sample_period_s / level_s))], signal - signal[:1], axis=0)
+    changed: Array = lfilter(
+        [1.0, -1.0], [1.0, -float(np.exp(-sample_period_s / level_s))], signal - signal[:1], axis=0
+    )
     return changed
 
 

@@ -119,7 +119,10 @@ class ObserverData:
                 f"found {K.n_inputs} to {K.n_outputs}."
             )
         self.runtime.require_fit(self.name, n, width, len(self.inputs))
-        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (len(self.measured), len(self.inputs)):
+        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (
+            len(self.measured),
+            len(self.inputs),
+        ):
             raise DimensionError(
                 f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
                 f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
@@ -179,7 +182,9 @@ class ObserverData:
         """States that recordings hold: all but the internal ones."""
         return self.lifting.states[: self.lifting.n_states - self.internal]
 
-    def initial(self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None) -> Array:
+    def initial(
+        self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
+    ) -> Array:
         """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n)."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
@@ -191,13 +196,19 @@ class ObserverData:
             held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
             still = np.eye(len(others)) - self.A[np.ix_(others, others)]
             x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
-        return x if self.start_in_motion is None or u is None else x + self.start_in_motion.moved(first, np.asarray(u, dtype=float))
+        return (
+            x
+            if self.start_in_motion is None or u is None
+            else x + self.start_in_motion.moved(first, np.asarray(u, dtype=float))
+        )
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""
         return {name: parameters[name] for name in self.lifting.parameters if name in parameters}
 
-    def values(self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None) -> dict[str, Any]:
+    def values(
+        self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
+    ) -> dict[str, Any]:
         """Return the lifting's parameters: those that are given, the observer's own for the others; each broadcasts to `shape` where that is given.
 
         Raises
@@ -210,7 +221,11 @@ class ObserverData:
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
         unknown = [name for name in values if name not in known and name not in self.parameters]
         missing = [name for name in known if values.get(name) is None]
-        wrong = [name for name in known if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()]
+        wrong = [
+            name
+            for name in known
+            if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()
+        ]
         for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
             if names:
                 raise ConfigError(
@@ -220,11 +235,15 @@ class ObserverData:
         for name in known if shape is not None else ():
             found = np.shape(values[name])
             if found not in ((), shape, (1,) * len(shape or ())):
-                raise DimensionError(f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}.")
+                raise DimensionError(
+                    f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}."
+                )
         return values
 
 
 def measurement_replaces(observer: ObserverData) -> bool:
     """Whether a correction lets measurements take the place of the measured states' estimates."""
     columns, gain = observer.A[:, list(observer.measured)], observer.into @ observer.controller.D
-    return observer.controller.n_states == 0 and np.allclose(columns, gain, rtol=1e-9, atol=1e-12 * float(np.abs(columns).max(initial=0.0)))
+    return observer.controller.n_states == 0 and np.allclose(
+        columns, gain, rtol=1e-9, atol=1e-12 * float(np.abs(columns).max(initial=0.0))
+    )

@@ -53,7 +53,11 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
         **observer.runtime.content(),
-        **({} if observer.seen is None else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}),
+        **(
+            {}
+            if observer.seen is None
+            else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}
+        ),
         "measurement_replaces_estimate": observer.replaces,
         "internal_states": observer.internal,
         **({} if observer.start_in_motion is None else {"start_in_motion": observer.start_in_motion.content()}),
@@ -95,7 +99,9 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     """Make an observer from the content of a file; messages begin with `where`."""
     _text(content["name"], f"{where}: name")
     for key in ("states", "inputs", "lifting", "lifting_inputs", "input_functions"):
-        _names(content.get(key, []) if key.endswith(("lifting_inputs", "functions")) else content[key], f"{where}: {key}")
+        _names(
+            content.get(key, []) if key.endswith(("lifting_inputs", "functions")) else content[key], f"{where}: {key}"
+        )
     parameters = _parameters(content["parameters"], where)
     _distinct([*content["states"], *content["inputs"], *content["parameters"]], where)
     lifting = Lifting.from_content(content)
@@ -103,7 +109,9 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     measured = _indices(content["measured"], lifting.n_states, where)
     injection, q = Injection(content["injection"]), len(measured)
     period = content["sample_period_s"]
-    _require(_is_finite(period) and period > 0, f"{where}: sample_period_s should be a number of seconds above zero", period)
+    _require(
+        _is_finite(period) and period > 0, f"{where}: sample_period_s should be a number of seconds above zero", period
+    )
     width = m if injection is Injection.INPUT else n
     controller, order = content["controller"], len(content["controller"]["A"])
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
@@ -186,12 +194,18 @@ def _parameters(values: Any, where: str) -> dict[str, float]:
     """Return the values that are known; null stands for one that every unit has of its own."""
     _require(isinstance(values, dict), f"{where}: parameters should name values", values)
     for name, value in values.items():
-        _require(value is None or _is_finite(value), f"{where}: parameters.{name} should be a finite number or null", value)
+        _require(
+            value is None or _is_finite(value), f"{where}: parameters.{name} should be a finite number or null", value
+        )
     return {name: float(value) for name, value in values.items() if value is not None}
 
 
 def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
-    good = isinstance(values, list) and all(type(i) is int and 0 <= i < count for i in values) and len(set(values)) == len(values)
+    good = (
+        isinstance(values, list)
+        and all(type(i) is int and 0 <= i < count for i in values)
+        and len(set(values)) == len(values)
+    )
     _require(good, f"{where}: measured should list different states by number, 0 to {count - 1}", values)
     return tuple(values)
 
@@ -199,7 +213,9 @@ def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
 def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
     found = content.get("runtime", {})
     _known(found, Runtime.__dataclass_fields__, f"{where}: runtime")
-    _require(type(found.get("relift", True)) is bool, f"{where}: runtime.relift should be true or false", found.get("relift"))
+    _require(
+        type(found.get("relift", True)) is bool, f"{where}: runtime.relift should be true or false", found.get("relift")
+    )
     for key, value in found.items():
         entries = [] if key == "relift" else [value]
         while any(isinstance(entry, list) for entry in entries):
@@ -228,7 +244,9 @@ def _start(found: Any, n: int, measured: int, inputs: int, where: str) -> Start 
     rest = found.get("rest", [])
     _require(isinstance(rest, list), f"{where}: start_in_motion.rest should be a list of rows", rest)
     return Start(
-        gain, np.array(each).reshape(len(each), n, measured), matrix(rest, (len(rest), measured + inputs), f"{where}: start_in_motion.rest")
+        gain,
+        np.array(each).reshape(len(each), n, measured),
+        matrix(rest, (len(rest), measured + inputs), f"{where}: start_in_motion.rest"),
     )
 
 
@@ -259,10 +277,13 @@ def _monitor(found: Any, measured: int, where: str) -> Monitor | None:
         "size": (1, measured),
     }
     numbers = {
-        key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}") for key, shape in shapes.items()
+        key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}")
+        for key, shape in shapes.items()
     }
     plain_ones = {key: value for key, value in found.items() if key not in shapes}
-    _require(isinstance(found.get("bounds", {}), dict), f"{where}: monitor.bounds should be an object", found.get("bounds"))
+    _require(
+        isinstance(found.get("bounds", {}), dict), f"{where}: monitor.bounds should be an object", found.get("bounds")
+    )
     for key, value in [*plain_ones.items(), *found.get("bounds", {}).items()]:
         if key == "bounds":
             continue

@@ -73,7 +73,9 @@ class Guard:
         """Refuse bounds of another size than the observer's."""
         found = (self.lower.shape, self.upper.shape, self.correction.shape)
         if found != ((n,), (n,), (order,)):
-            raise DimensionError(f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes {found}.")
+            raise DimensionError(
+                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes {found}."
+            )
 
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it."""

@@ -41,7 +41,10 @@ class Limit(Settings):
 
     def in_unit(self, size: float) -> Limit:
         """Return the same for a channel that is divided by a size."""
-        return Limit(lower=None if self.lower is None else self.lower / size, upper=None if self.upper is None else self.upper / size)
+        return Limit(
+            lower=None if self.lower is None else self.lower / size,
+            upper=None if self.upper is None else self.upper / size,
+        )
 
 
 Limits = Mapping[str, Limit]

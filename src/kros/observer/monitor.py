@@ -110,7 +110,13 @@ class Monitor:
                 f"Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit together, found "
                 f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
             )
-        if np.any(self.size <= 0) or np.any(self.limits <= 0) or not 0 < self.forget <= 1 or not 0 <= self.first <= 1 or self.settle < 0:
+        if (
+            np.any(self.size <= 0)
+            or np.any(self.limits <= 0)
+            or not 0 < self.forget <= 1
+            or not 0 <= self.first <= 1
+            or self.settle < 0
+        ):
             raise DataError(
                 "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle at least 0."
             )
@@ -151,8 +157,20 @@ class Monitor:
         if (loops := library()) is not None:
             samples, machines, q = innovation.shape
             course = np.empty((machines, q, len(self.filters), samples))
-            job = {"machines": machines, "samples": samples, "q": q, "bands": len(self.filters), "nu": innovation, "judged": judged}
-            job |= {"filters": self.filters, "size": self.size, "gains": (max(self.first, self.forget), self.forget), "largest": (LARGEST,)}
+            job = {
+                "machines": machines,
+                "samples": samples,
+                "q": q,
+                "bands": len(self.filters),
+                "nu": innovation,
+                "judged": judged,
+            }
+            job |= {
+                "filters": self.filters,
+                "size": self.size,
+                "gains": (max(self.first, self.forget), self.forget),
+                "largest": (LARGEST,),
+            }
             loops.call("kros_monitor", ("monitor_job", job | {"squares": course}))
             return np.moveaxis(course, -1, 0)
         scaled = innovation / self.size
@@ -199,7 +217,9 @@ class Monitor:
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
         """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
-        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(condition)
+        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(
+            condition
+        )
 
     def band_levels(self, mean_squares: Array) -> Array:
         """Return the level of every band over its limit in dB, shape (..., q, bands)."""
@@ -230,7 +250,9 @@ class Monitor:
 
 def _apart(signal: Array) -> Array:
     """Return every sample minus that two before."""
-    return np.asarray(signal - np.concatenate([np.zeros((*signal.shape[:-1], 2)), signal], axis=-1)[..., : signal.shape[-1]])
+    return np.asarray(
+        signal - np.concatenate([np.zeros((*signal.shape[:-1], 2)), signal], axis=-1)[..., : signal.shape[-1]]
+    )
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -334,4 +356,6 @@ class Watch:
     @property
     def level_db(self) -> float:
         """Level of the innovation over its bound, dB; far below zero before anything was judged."""
-        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition))
+        return float(
+            self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition)
+        )

@@ -38,7 +38,14 @@ class Observer(ObserverData):
 
     @classmethod
     def open_loop(
-        cls, name: str, lifting: Lifting, A: Array, B: Array, measured: tuple[int, ...], inputs: tuple[str, ...], sample_period_s: float
+        cls,
+        name: str,
+        lifting: Lifting,
+        A: Array,
+        B: Array,
+        measured: tuple[int, ...],
+        inputs: tuple[str, ...],
+        sample_period_s: float,
     ) -> Self:
         """Return the nominal model without any correction."""
         controller = gain(np.zeros((len(A), len(measured))), sample_period_s)
@@ -48,7 +55,9 @@ class Observer(ObserverData):
         """Estimate a batch of episodes; see `run_observer`."""
         return run_observer(self, y, u, parameters)
 
-    def start(self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None, /, **own: float) -> RunningObserver:
+    def start(
+        self, y: npt.ArrayLike, parameters: Mapping[str, float] | None = None, /, **own: float
+    ) -> RunningObserver:
         """Return a running observer that starts at a first measurement, shape (q,).
 
         The machine's own lifting parameters are given by name, ``start(y, phase=1.2)``, or as a mapping; the nominal unit's stand for others.

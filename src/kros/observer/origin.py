@@ -50,7 +50,11 @@ def find_shift(observer: ObserverData) -> OriginShift | None:
     if len(observer.measured) != 1 or lifting.input_functions or lifting.history:
         return None
     at, n, m = observer.measured[0], lifting.n_states, len(observer.inputs)
-    sizes = np.ones(n + m) if observer.seen is None else np.concatenate([np.ones(n), np.maximum(observer.seen.inputs, 1e-300)])
+    sizes = (
+        np.ones(n + m)
+        if observer.seen is None
+        else np.concatenate([np.ones(n), np.maximum(observer.seen.inputs, 1e-300)])
+    )
     if observer.seen is not None:
         sizes[at] = max(float(observer.seen.measured[0]), 1e-300)
     moving: Long = np.hstack([observer.A[:n, :n] - np.eye(n, dtype=np.longdouble), observer.B[:n]])
@@ -133,7 +137,9 @@ class Origins:
             return False
         with np.errstate(invalid="ignore"):
             size = np.abs(values)
-            return bool((size > _NEAR).any()) and self.shift is not None and bool((size > FAR * self.shift.period).any())
+            return (
+                bool((size > _NEAR).any()) and self.shift is not None and bool((size > FAR * self.shift.period).any())
+            )
 
     def of(self, values: Array) -> Array:
         """Return the multiples of the period next to values; zero where these are near, or not finite."""

@@ -34,10 +34,14 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
     own = columns.get(name, {}) if isinstance(columns, dict) else columns
     unit = units.get(name, "") if isinstance(units, dict) else units
     if not isinstance(own, dict) or not isinstance(unit, str):
-        raise DataError(f"Observer {observer.name}: about.columns and about.units_of_measure should be objects; correct the file.")
+        raise DataError(
+            f"Observer {observer.name}: about.columns and about.units_of_measure should be objects; correct the file."
+        )
     factor, converted = (_factor(observer, name, own.get(key, 1.0)) for key in ("factor", "converted"))
     lag, offset = own.get("lag_samples", 0), own.get("offset", "")
-    note = ", ".join([*([f"the column comes {lag} samples late"] if lag else []), *([f"added: {offset}"] if offset else [])])
+    note = ", ".join(
+        [*([f"the column comes {lag} samples late"] if lag else []), *([f"added: {offset}"] if offset else [])]
+    )
     factor = factor if converted == 1.0 else factor / converted
     if math.isclose(factor, 1.0, rel_tol=1e-12):
         return RecordedChannel(1.0, unit, note)

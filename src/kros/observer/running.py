@@ -145,7 +145,9 @@ class RunningObserver:
         if self._watch is not None:
             self._watch.condition = name
         elif name is not None:
-            raise ConfigError(f"Running observer {self.observer.name}: it has no monitor that would know the condition {name!r}.")
+            raise ConfigError(
+                f"Running observer {self.observer.name}: it has no monitor that would know the condition {name!r}."
+            )
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
@@ -300,7 +302,9 @@ class _Checked(MutableMapping[str, float]):
         self.plain.update(self._observer.values({**self.plain, name: value}, ()))
 
     def __delitem__(self, name: str) -> None:
-        raise ConfigError(f"Running observer {self._observer.name}: the parameter {name!r} cannot be taken away; change its value.")
+        raise ConfigError(
+            f"Running observer {self._observer.name}: the parameter {name!r} cannot be taken away; change its value."
+        )
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.plain)

@@ -46,7 +46,9 @@ class Seen:
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             object.__setattr__(self, name, values)
             if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
-                raise DataError(f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}.")
+                raise DataError(
+                    f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}."
+                )
 
     def times(self, measured: Array, inputs: Array) -> Seen:
         """Return the sizes in other units of measure, by the factors of measurements, shape (q,), and inputs, shape (m,)."""
@@ -96,7 +98,9 @@ class Runtime:
 
     def __post_init__(self) -> None:
         if int(self.delay) != self.delay or self.delay < 0:
-            raise DataError(f"Runtime of an observer: the delay of {self.delay} should be a whole number of samples, at least 0.")
+            raise DataError(
+                f"Runtime of an observer: the delay of {self.delay} should be a whole number of samples, at least 0."
+            )
         for name in _ARRAYS:
             value = getattr(self, name)
             if value is not None:
@@ -107,14 +111,18 @@ class Runtime:
                     )
         for lower, upper in ((self.lower, self.upper), (self.input_lower, self.input_upper)):
             if lower is not None and upper is not None and np.any(lower > upper):
-                raise DataError(f"Runtime of an observer: lower limits {lower} should not exceed the upper ones {upper}.")
+                raise DataError(
+                    f"Runtime of an observer: lower limits {lower} should not exceed the upper ones {upper}."
+                )
         if self.correction is not None and np.any(self.correction < 0):
             raise DataError(f"Runtime of an observer: the largest corrections {self.correction} should be positive.")
 
     @property
     def limited(self) -> bool:
         """Whether a step meets limits."""
-        return self.correction is not None or (self.relift and any(side is not None for side in (self.lower, self.upper)))
+        return self.correction is not None or (
+            self.relift and any(side is not None for side in (self.lower, self.upper))
+        )
 
     @property
     def binding(self) -> bool:
@@ -132,12 +140,21 @@ class Runtime:
 
     def limited_corrections(self, into: Array) -> list[int]:
         """Return which corrections have a limit and reach a state; `into`, shape (n, width), is where they enter."""
-        return [] if self.correction is None else [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
+        return (
+            []
+            if self.correction is None
+            else [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
+        )
 
     def binds(self, x: Array, y_c: Array | None) -> bool:
         """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one; None where corrections have none."""
-        at = [limit is not None and np.any(meets(limit)) for limit, meets in ((self.lower, x.__le__), (self.upper, x.__ge__))]
-        return bool(any(at)) or (self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction)))
+        at = [
+            limit is not None and np.any(meets(limit))
+            for limit, meets in ((self.lower, x.__le__), (self.upper, x.__ge__))
+        ]
+        return bool(any(at)) or (
+            self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction))
+        )
 
     def clips_alike(self, other: Runtime) -> bool:
         """Whether two observers' estimates have the same limits, and their corrections none."""
@@ -154,7 +171,9 @@ class Runtime:
     def clip_estimates(self, x: Array) -> None:
         """Bring estimates, shape (..., n), within their limits where they are."""
         for i in self.limited_states(x.shape[-1]):
-            low, high = (none if side is None else side[i] for side, none in ((self.lower, -np.inf), (self.upper, np.inf)))
+            low, high = (
+                none if side is None else side[i] for side, none in ((self.lower, -np.inf), (self.upper, np.inf))
+            )
             np.clip(x[..., i], low, high, out=x[..., i])
 
     def within(self, states: Array) -> Array:
@@ -172,7 +191,11 @@ class Runtime:
 
     def clip_inputs(self, u: Array) -> Array:
         """Return inputs within their limits, shape (..., m)."""
-        return u if self.input_lower is None and self.input_upper is None else np.asarray(np.clip(u, self.input_lower, self.input_upper))
+        return (
+            u
+            if self.input_lower is None and self.input_upper is None
+            else np.asarray(np.clip(u, self.input_lower, self.input_upper))
+        )
 
     def require_fit(self, name: str, n: int, width: int, m: int) -> None:
         """Refuse limits of another size than the observer's."""
@@ -185,7 +208,9 @@ class Runtime:
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it: nothing where everything is as by default."""
         arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
-        found: dict[str, Any] = ({"delay": int(self.delay)} if self.delay else {}) | ({} if self.relift else {"relift": False})
+        found: dict[str, Any] = ({"delay": int(self.delay)} if self.delay else {}) | (
+            {} if self.relift else {"relift": False}
+        )
         found |= {k: _finite(v) for k, v in arrays.items()}
         return {"runtime": found} if found else {}
 

@@ -95,6 +95,10 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
             "least one sample."
         )
     if u.shape[2] != len(inputs):
-        raise DimensionError(f"Running {who}: expected inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}.")
+        raise DimensionError(
+            f"Running {who}: expected inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}."
+        )
     if y.shape[2] != measured:
-        raise DimensionError(f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}.")
+        raise DimensionError(
+            f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}."
+        )

@@ -47,14 +47,20 @@ class Bounds:
     most: Array
 
     @classmethod
-    def of_measurements(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
+    def of_measurements(
+        cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None
+    ) -> Bounds:
         """Return the bounds that follow from declared limits of the states and sizes seen in training, where there are any."""
         low, high, size = _declared(count, lower, upper, seen)
-        far = BEYOND * np.maximum(np.where(np.isfinite(low), np.abs(low), size), np.where(np.isfinite(high), np.abs(high), size))
+        far = BEYOND * np.maximum(
+            np.where(np.isfinite(low), np.abs(low), size), np.where(np.isfinite(high), np.abs(high), size)
+        )
         return cls(low, high, -np.minimum(far, _ANY), np.minimum(far, _ANY))
 
     @classmethod
-    def of_inputs(cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None) -> Bounds:
+    def of_inputs(
+        cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None
+    ) -> Bounds:
         """Return those of inputs, which are plausible beyond a declared limit: the machine gets the limit."""
         low, high, size = _declared(count, lower, upper, seen)
         far = np.minimum(BEYOND * size, _ANY)
@@ -63,12 +69,16 @@ class Bounds:
     def pass_all(self, values: Array) -> bool:
         """Whether all samples, shape (..., channels), are good as they are."""
         channels = ((values[..., i], *sides) for i, sides in enumerate(self.good))
-        return all(bool(least <= own.min(initial=least) and own.max(initial=most) <= most) for own, least, most in channels)
+        return all(
+            bool(least <= own.min(initial=least) and own.max(initial=most) <= most) for own, least, most in channels
+        )
 
     @cached_property
     def good(self) -> list[tuple[float, float]]:
         """Between which values a sample of every channel is good as it is."""
-        return list(zip(np.maximum(self.lower, self.least).tolist(), np.minimum(self.upper, self.most).tolist(), strict=True))
+        return list(
+            zip(np.maximum(self.lower, self.least).tolist(), np.minimum(self.upper, self.most).tolist(), strict=True)
+        )
 
     def pass_one(self, values: Sequence[float]) -> bool:
         """Whether one sample is good as it is, as `pass_all` for many: a comparison with what is not a number is false."""
@@ -76,7 +86,10 @@ class Bounds:
 
     def pass_where_there(self, values: Sequence[float]) -> bool:
         """Whether one sample is good but for channels that are missing."""
-        return all(least <= value <= most or not isfinite(value) for value, (least, most) in zip(values, self.good, strict=True))
+        return all(
+            least <= value <= most or not isfinite(value)
+            for value, (least, most) in zip(values, self.good, strict=True)
+        )
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
@@ -86,7 +99,9 @@ class Bounds:
 
 
 def _declared(count: int, lower: Array | None, upper: Array | None, seen: Array | None) -> tuple[Array, Array, Array]:
-    low, high = (np.full(count, side) if given is None else given for side, given in ((-np.inf, lower), (np.inf, upper)))
+    low, high = (
+        np.full(count, side) if given is None else given for side, given in ((-np.inf, lower), (np.inf, upper))
+    )
     return low, high, np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
 
 
@@ -138,9 +153,14 @@ class Screen:
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
-        lost, complete = np.asarray((since > LONGEST).any(axis=-1)), np.asarray(good.all(axis=-1) & plausible.any(axis=-1))
+        lost, complete = (
+            np.asarray((since > LONGEST).any(axis=-1)),
+            np.asarray(good.all(axis=-1) & plausible.any(axis=-1)),
+        )
         starts, stale = _starts(lost, complete, before.stale)
-        return Screened(np.where(plausible, kept, np.nan), inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
+        return Screened(
+            np.where(plausible, kept, np.nan), inputs, status, starts, complete, Held(inputs[-1], since[-1], stale)
+        )
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:

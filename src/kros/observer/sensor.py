@@ -30,7 +30,9 @@ class Sensor(Settings):
     """
 
     noise: float = Field(0.0, ge=0, description="standard deviation of white noise")
-    resolution: float | None = Field(None, ge=0, description="step; that found in the recordings where none is declared")
+    resolution: float | None = Field(
+        None, ge=0, description="step; that found in the recordings where none is declared"
+    )
     bias: float = Field(0.0, description="constant offset; nothing can correct it, it is part of evaluation alone")
     delay_samples: int = Field(0, ge=0, description="samples by which measurements arrive late")
     jitter_samples: float = Field(0.0, ge=0, description="standard deviation of the moment of measurement, in samples")
@@ -52,7 +54,9 @@ Sensors = Mapping[str, Sensor]
 def require_measured(sensor: Sensors, measured: Sequence[str]) -> None:
     """Refuse the sensor of what is not measured, and channels that are late by different numbers of samples."""
     if unknown := sorted(set(sensor) - set(measured)):
-        raise ConfigError(f"sensor: {', '.join(unknown)} should be among the states that are measured, {', '.join(measured)}.")
+        raise ConfigError(
+            f"sensor: {', '.join(unknown)} should be among the states that are measured, {', '.join(measured)}."
+        )
     delays = {name: sensor.get(name, Sensor()).delay_samples for name in measured}
     if len(set(delays.values())) > 1:
         raise ConfigError(

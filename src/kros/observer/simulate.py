@@ -93,7 +93,9 @@ def run_with_status(
     return found, samples.status | status
 
 
-def run_observers(observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+def run_observers(
+    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> Array:
     """Run observers of one and the same model, which differ in their corrections, side by side.
 
     Parameters
@@ -152,7 +154,9 @@ def run_some_at_a_time(
             yield _run(some, samples, parameters)
 
 
-def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False) -> tuple[Array, Array]:
+def started(
+    observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False
+) -> tuple[Array, Array]:
     """Return the first estimate, (batch, n), and what the start adds to later ones, (count, batch, n)."""
     samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
     batch, start, late = samples.starts.shape[1], observer.start_in_motion, observer.runtime.delay
@@ -171,7 +175,9 @@ def started(observer: ObserverData, y: Array, u: Array, parameters: Parameters |
     return first, added
 
 
-def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, status: Bits | None = None) -> Array:
+def _run(
+    observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, status: Bits | None = None
+) -> Array:
     """Run observers on screened samples, shape (observer, n_samples, batch, n); bits of those that start again go into `status`."""
     if len(observers) > 1 and library() is None:
         return np.concatenate([_run([o], samples, parameters) for o in observers])
@@ -191,7 +197,9 @@ def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Param
                 _predict(own, of_one, *before, samples, values)
         for i, machines in enumerate(np.flatnonzero(own) for own in steps.restart):
             if len(machines):
-                again = _restarting(observers[i], samples.of(machines), observers[i].values(_values_of(values, machines)))
+                again = _restarting(
+                    observers[i], samples.of(machines), observers[i].values(_values_of(values, machines))
+                )
                 found[i][:, machines] = again.estimates
                 if status is not None:
                     status[:, machines] = again.status
@@ -221,8 +229,15 @@ def _restarting(observer: ObserverData, samples: Screened, values: Parameters) -
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
     steps, restarts = Steps([observer], batch, values), Restarts(observer.guard, batch)
     x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
-    earlier, pending = np.empty((n_samples, batch, len(observer.lifting.window.earlier))), np.zeros((n_samples, batch), dtype=np.intp)
-    starts, moving, status = samples.starts.copy(), np.zeros((n_samples, batch), dtype=bool), np.zeros((n_samples, batch), np.uint8)
+    earlier, pending = (
+        np.empty((n_samples, batch, len(observer.lifting.window.earlier))),
+        np.zeros((n_samples, batch), dtype=np.intp),
+    )
+    starts, moving, status = (
+        samples.starts.copy(),
+        np.zeros((n_samples, batch), dtype=bool),
+        np.zeros((n_samples, batch), np.uint8),
+    )
     since, missing = np.zeros(batch, dtype=np.intp), ~np.isfinite(samples.y)
     steps.begin(samples.y[0])
     steps.begin(samples.y[0], starts[0], samples.u[0])
@@ -274,13 +289,18 @@ def _pending(starts: Flags, delay: int) -> Whole:
     return np.minimum(since, delay)
 
 
-def _predict(observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters) -> None:
+def _predict(
+    observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters
+) -> None:
     """Take states, shape (n_samples, batch, n), over the samples that lie between them and their rows, without correction."""
     batch, machines = x.shape[1], np.arange(x.shape[1])
     for start in range(0, len(x), _ROWS):
         rows = slice(start, min(start + _ROWS, len(x)))
         count, ahead = pending[rows], x[rows]
-        own = {name: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(count)) for name, v in values.items()}
+        own = {
+            name: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(count))
+            for name, v in values.items()
+        }
         steps = Steps([observer], count.size, own)
         steps.place(ahead.reshape(count.size, -1), earlier[rows].reshape(count.size, -1))
         j = np.arange(observer.runtime.delay)[:, None, None]

@@ -74,7 +74,11 @@ class Start:
     def times(self, x: Array, y: Array, u: Array) -> Start:
         """Return the start in other units of measure, by the factors of states, measurements and inputs."""
         both = np.concatenate([y, u])
-        return Start(self.gain * x[:, None] / both, self.corrections * x[:, None] / y, self.rest / both if len(self.rest) else self.rest)
+        return Start(
+            self.gain * x[:, None] / both,
+            self.corrections * x[:, None] / y,
+            self.rest / both if len(self.rest) else self.rest,
+        )
 
     def turned(self, turn: Array) -> Start:
         """Return the start for states ``turn @ x``, shape (n', n)."""

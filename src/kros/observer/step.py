@@ -46,8 +46,12 @@ class Steps:
         self._origins = Origins(observer, batch)
         self.correction: Array | None = None
         self.cut = np.zeros(self._next_x.shape)
-        self._low, self._high = (np.array(side) for side in zip(*(bounds(o.guard, n, order) for o in observers), strict=True))
-        self.waiting = np.zeros((len(observers), batch), dtype=bool)  # for a start: the next step would leave the bounds
+        self._low, self._high = (
+            np.array(side) for side in zip(*(bounds(o.guard, n, order) for o in observers), strict=True)
+        )
+        self.waiting = np.zeros(
+            (len(observers), batch), dtype=bool
+        )  # for a start: the next step would leave the bounds
         self.restart = np.zeros((len(observers), batch), dtype=bool)  # whether that ever happened
 
     @property
@@ -278,8 +282,14 @@ class Steps:
                 sides = ((limits.lower, -np.inf), (limits.upper, np.inf))
                 moved = 0.0 if self._origins.at is None else self._origins.states.T
                 sizes = (np.full(n, none) if side is None else side for side, none in sides)
-                job |= dict(zip(("lower", "upper"), (np.tile(side[:, None], batch) - moved for side in sizes), strict=True))
-        loops.call("kros_relift", formulas(lifting, tape_of(lifting, u.shape[2]), self.values, u.shape[2], batch), ("relift_job", job))
+                job |= dict(
+                    zip(("lower", "upper"), (np.tile(side[:, None], batch) - moved for side in sizes), strict=True)
+                )
+        loops.call(
+            "kros_relift",
+            formulas(lifting, tape_of(lifting, u.shape[2]), self.values, u.shape[2], batch),
+            ("relift_job", job),
+        )
         self._starting = self._start is not None and "starts" in job and bool(self._since.min() < len(self._start))
 
     def _begins(self, y: Array | None, u: Array, starts: Flags | None) -> dict[str, Any]:
@@ -291,7 +301,10 @@ class Steps:
         rows, machines = rows[rows > 0], machines[rows > 0]
         number = np.zeros(starts.shape, dtype=np.int32)
         number[rows, machines] = 1 + np.arange(len(rows))
-        own = {name: np.broadcast_to(np.asarray(v, dtype=float), starts.shape[1:])[machines] for name, v in self.values.items()}
+        own = {
+            name: np.broadcast_to(np.asarray(v, dtype=float), starts.shape[1:])[machines]
+            for name, v in self.values.items()
+        }
         first = y[rows, machines], u[rows, machines]
         begun = np.stack([self._first(o, *first, own, machines) for o in self.observers])
         since = np.zeros(len(rows), dtype=np.int64)

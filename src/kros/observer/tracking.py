@@ -94,7 +94,10 @@ class PhaseLockedLoop:
         """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
         x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C]
-        slopes, by_value = steps.lifting.slopes(x, values)[..., :n], steps.lifting.parameter_slopes(x, values, self.name)
+        slopes, by_value = (
+            steps.lifting.slopes(x, values)[..., :n],
+            steps.lifting.parameter_slopes(x, values, self.name),
+        )
         steps.step(y, u, missing)
         lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
         moved = lifted @ self._model.T + (self._s_c @ K.C.T - psi @ K.D.T) @ self._into.T
@@ -203,7 +206,9 @@ def least_innovation(
     values, batch, k = np.asarray(candidates, dtype=float), y.shape[1], np.arange(len(y))[:, None]
     counted = np.isfinite(y) & ((k >= lengths // 4) & (k < lengths))[..., None]
     y, u = (np.tile(signal, (1, len(values), 1)) for signal in (y, u))
-    own = {p: np.full(batch * len(values), v) for p, v in observer.own(parameters).items()} | {name: np.repeat(values, batch)}
+    own = {p: np.full(batch * len(values), v) for p, v in observer.own(parameters).items()} | {
+        name: np.repeat(values, batch)
+    }
     error = ((y - run_observer(observer, y, u, own)[..., list(observer.measured)]) / measurement_sizes(observer)) ** 2
     counted = np.tile(counted, (1, len(values), 1))
     return float(values[np.argmin(np.where(counted, error, 0.0).reshape(len(y), len(values), -1).sum(axis=(0, 2)))])

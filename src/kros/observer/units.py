@@ -51,5 +51,11 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
 
 def _runtime(runtime: Runtime, x: Array, y: Array, into: Array, u: Array) -> Runtime:
     by = {"lower": x, "upper": x, "correction": into}
-    by |= {name: u[: len(limit)] for name in ("input_lower", "input_upper") if (limit := getattr(runtime, name)) is not None}
-    return replace(runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None})
+    by |= {
+        name: u[: len(limit)]
+        for name in ("input_lower", "input_upper")
+        if (limit := getattr(runtime, name)) is not None
+    }
+    return replace(
+        runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None}
+    )

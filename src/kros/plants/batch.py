@@ -46,7 +46,9 @@ class Batch(ABC, Generic[T]):
     def __post_init__(self) -> None:
         for name, least in _LEAST.items():
             if not getattr(self, name) >= least:
-                raise ConfigError(f"Simulated {self.plant}: {name} = {getattr(self, name)} is out of range; use at least {least}.")
+                raise ConfigError(
+                    f"Simulated {self.plant}: {name} = {getattr(self, name)} is out of range; use at least {least}."
+                )
 
     @abstractmethod
     def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> T:
@@ -80,7 +82,9 @@ class Batch(ABC, Generic[T]):
                 for key, (u, e) in zip(keys, np.ndindex(len(units), self.n_episodes), strict=True)
             }
         )
-        population = Population(self.channels, self.sample_period_s, units, keys, source, {"plant": self.plant}, self.truths)
+        population = Population(
+            self.channels, self.sample_period_s, units, keys, source, {"plant": self.plant}, self.truths
+        )
         return SimulatedPopulation(population, population, truth)
 
     def _units(self) -> tuple[tuple[Unit, ...], T]:
@@ -89,18 +93,29 @@ class Batch(ABC, Generic[T]):
         if self.outlier:
             bad = self._draw(self._rng(OUTLIER_STREAM))
             units.insert(0, Unit("000", OUTLIERS))
-            drawn.insert(0, {n: v * np.exp(self.outlier_severity * self.outlier_log_factors.get(n, 0.0)) for n, v in bad.items()})
-        return tuple(units), self.truth(tuple(u.id for u in units), {n: np.array([d[n] for d in drawn]) for n in self.nominal})
+            drawn.insert(
+                0, {n: v * np.exp(self.outlier_severity * self.outlier_log_factors.get(n, 0.0)) for n, v in bad.items()}
+            )
+        return tuple(units), self.truth(
+            tuple(u.id for u in units), {n: np.array([d[n] for d in drawn]) for n in self.nominal}
+        )
 
     def _draw(self, rng: np.random.Generator) -> dict[str, float]:
-        return {n: v * float(np.exp(self.spread * self.deviation[n] * rng.standard_normal())) for n, v in self.nominal.items()}
+        return {
+            n: v * float(np.exp(self.spread * self.deviation[n] * rng.standard_normal()))
+            for n, v in self.nominal.items()
+        }
 
     def _rng(self, *stream: int) -> np.random.Generator:
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
 
 
 def runge_kutta(
-    rates: Callable[[Array, Array], Array], start: Array, inputs: Array, period_s: float, held: Callable[[Array], Array] = lambda x: x
+    rates: Callable[[Array, Array], Array],
+    start: Array,
+    inputs: Array,
+    period_s: float,
+    held: Callable[[Array], Array] = lambda x: x,
 ) -> Array:
     """Integrate by the method of order four, inputs held between samples, shape (n_states, n_units, n_episodes, n_samples)."""
     out = np.empty((inputs.shape[1], *start.shape))

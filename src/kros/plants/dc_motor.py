@@ -29,8 +29,22 @@ CURRENT_LIMIT_A = 8.0
 SLIP_RAD_S = 1.0  # w_s: below it friction is viscous
 HOLD_SAMPLES = (50, 200)  # shortest and longest level of the input
 VOLTAGE_V = 12.0
-NOMINAL = {"resistance": 1.0, "inductance": 5e-3, "torque_constant": 0.05, "inertia": 1e-4, "viscous": 1e-4, "coulomb": 1e-2}
-DEVIATION = {"resistance": 0.05, "inductance": 0.08, "torque_constant": 0.05, "inertia": 0.05, "viscous": 0.15, "coulomb": 0.15}
+NOMINAL = {
+    "resistance": 1.0,
+    "inductance": 5e-3,
+    "torque_constant": 0.05,
+    "inertia": 1e-4,
+    "viscous": 1e-4,
+    "coulomb": 1e-2,
+}
+DEVIATION = {
+    "resistance": 0.05,
+    "inductance": 0.08,
+    "torque_constant": 0.05,
+    "inertia": 0.05,
+    "viscous": 0.15,
+    "coulomb": 0.15,
+}
 OUTLIER_LOG_FACTORS = {"torque_constant": -0.25, "viscous": 0.8, "coulomb": 1.0}  # a tired magnet and a dry bearing
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
@@ -38,7 +52,9 @@ CHANNELS = (
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
-TRUTHS = tuple(TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3])  # what the noisy sensors see
+TRUTHS = tuple(
+    TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3]
+)  # what the noisy sensors see
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,11 +77,15 @@ class DcMotorTruth:
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters, ready for JSON: one entry per unit."""
         names = [f.name for f in fields(self) if f.name != "unit_ids"]
-        return {"plant": "dc-motor", "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)}}
+        return {
+            "plant": "dc-motor",
+            "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)},
+        }
 
     def _rates(self, x: Array, voltage: Array) -> Array:
         R, L, k, J, b, c = (
-            p[:, None] for p in (self.resistance, self.inductance, self.torque_constant, self.inertia, self.viscous, self.coulomb)
+            p[:, None]
+            for p in (self.resistance, self.inductance, self.torque_constant, self.inertia, self.viscous, self.coulomb)
         )
         _, w, i = x
         return np.stack([w, (k * i - b * w - c * np.tanh(w / SLIP_RAD_S)) / J, (voltage - R * i - k * w) / L])

@@ -49,7 +49,10 @@ class PendulumTruth:
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters, ready for JSON: one entry per unit."""
         names = [f.name for f in fields(self) if f.name != "unit_ids"]
-        return {"plant": "pendulum", "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)}}
+        return {
+            "plant": "pendulum",
+            "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)},
+        }
 
 
 class PendulumPopulation(Batch[PendulumTruth]):

@@ -46,7 +46,9 @@ def _undecided(metrics: Mapping[str, Any]) -> list[str]:
             f"({condition_label(most['condition'])}) needs about {number(most['needed_s'])} s and has {number(most['recorded_s'])} s."
         )
     if any(r.get("status") == "cannot tell" for r in rows):
-        texts.append("Score against more units: with these, only defects far beyond their differences would have been flagged.")
+        texts.append(
+            "Score against more units: with these, only defects far beyond their differences would have been flagged."
+        )
     return texts
 
 
@@ -72,7 +74,9 @@ def _observer(metrics: Mapping[str, Any], measured: tuple[str, ...]) -> list[str
             "observer.deployed names the one that is deployed."
         ]
     if hidden and not_improved(table, name, hidden) == hidden:
-        return ["The observer is no better than its model alone: measure something that tells more of what is hidden, or look at Models."]
+        return [
+            "The observer is no better than its model alone: measure something that tells more of what is hidden, or look at Models."
+        ]
     entry = metrics.get("observers", {}).get(name, {})
     text = "Try it on recordings with “kros estimate”, then hand observers/deployed.json over: “kros export” writes C99 or an FMU."
     if entry.get("relift_certified") is False:
@@ -89,7 +93,11 @@ def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> st
 def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
     """Return the channels in which an observer is no better than its model without correction."""
     other = f"{split_observer(name)[0]}/open_loop"
-    return [c for c in channels if not _smaller(table, name, other, [c], 0.99)] if name != other and other in table.cells else []
+    return (
+        [c for c in channels if not _smaller(table, name, other, [c], 0.99)]
+        if name != other and other in table.cells
+        else []
+    )
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

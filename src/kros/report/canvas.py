@@ -182,7 +182,9 @@ def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colo
     axes.plot(freqs, decibel(thin_log(freqs_hz, line)[1]), style, color=colour)
 
 
-def lines_of_units(axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str, units: Sequence[str] = ()) -> None:
+def lines_of_units(
+    axes: Axes, freqs_hz: Array, lines: Array, colour: str, label: str, units: Sequence[str] = ()
+) -> None:
     """Draw thin lines, shape (unit, frequency) in dB, a unit each, with their names; a unit without a residual is left out."""
     from matplotlib.collections import LineCollection
 
@@ -202,7 +204,9 @@ def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", m
     """Make the horizontal axis logarithmic over the frequencies, with at most `most` numbers."""
     positive = freqs_hz[freqs_hz > 0]
     limits = (float(positive[0]), float(positive[-1]))
-    if axes.get_xscale() != "log" or axes.get_xlim() != limits:  # once for shared axes: each call goes through all of them
+    if (
+        axes.get_xscale() != "log" or axes.get_xlim() != limits
+    ):  # once for shared axes: each call goes through all of them
         axes.set_xscale("log")
         axes.set_xlim(*limits)
         _powers_of_ten(axes.xaxis, "{x:g}", most)
@@ -265,7 +269,9 @@ def limit_decibels(axes: Axes, floor_db: float) -> None:
 def end_labels(axes: Axes, entries: Sequence[tuple[float, str, str]], spacing: float = 0.085) -> None:
     """Write labels at the right ends of lines, moved apart where they would overlap."""
     low, high = axes.get_ylim()
-    shown = sorted(((value - low) / (high - low), text, colour) for value, text, colour in entries if np.isfinite(value))
+    shown = sorted(
+        ((value - low) / (high - low), text, colour) for value, text, colour in entries if np.isfinite(value)
+    )
     for place, (_, text, colour) in zip(spread([s[0] for s in shown], spacing), shown, strict=True):
         note(axes, text, (1, place), (4, 0), va="center", color=colour, annotation_clip=False)
 

@@ -13,7 +13,9 @@ SMALLER = 5.0  # times: a free run that is off by this much more than the set al
 def conditions_apart(metrics: Mapping[str, Any]) -> bool:
     """Tell whether every unit was recorded in one of several conditions only, which confounds units and conditions."""
     recorded = [row["conditions"] for row in metrics.get("units", []) if row.get("conditions")]
-    return len({c for conditions in recorded for c in conditions}) > 1 and all(len(conditions) == 1 for conditions in recorded)
+    return len({c for conditions in recorded for c in conditions}) > 1 and all(
+        len(conditions) == 1 for conditions in recorded
+    )
 
 
 def confounded_text(metrics: Mapping[str, Any]) -> list[str]:

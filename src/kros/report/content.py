@@ -60,7 +60,9 @@ class Table:
     def labels(self) -> list[str]:
         """What every column is called where it stands alone: its group's title and its own."""
         titles = [title for title, span in self.groups for _ in range(span)] or [""] * len(self.head)
-        return [f"{title}: {own}" if title and own else title or own for title, own in zip(titles, self.head, strict=True)]
+        return [
+            f"{title}: {own}" if title and own else title or own for title, own in zip(titles, self.head, strict=True)
+        ]
 
 
 @dataclass(frozen=True)
@@ -72,9 +74,15 @@ class Section:
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
     figures: Sequence[str] = ()
-    folded: Sequence[tuple[str, str]] = ()  # sequence of (str, str); Titles and preformatted texts that the reader opens
-    lists: Sequence[tuple[str, Sequence[str]]] = ()  # sequence of (str, sequence of str); Titles and sentences, one below the other
-    card: Sequence[tuple[str, Sequence[str]]] = ()  # sequence of (str, sequence of str); Terms and what there is to say about them
+    folded: Sequence[
+        tuple[str, str]
+    ] = ()  # sequence of (str, str); Titles and preformatted texts that the reader opens
+    lists: Sequence[
+        tuple[str, Sequence[str]]
+    ] = ()  # sequence of (str, sequence of str); Titles and sentences, one below the other
+    card: Sequence[
+        tuple[str, Sequence[str]]
+    ] = ()  # sequence of (str, sequence of str); Terms and what there is to say about them
     notes: Sequence[str] = ()  # Paragraphs behind the tables
 
 

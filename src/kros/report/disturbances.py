@@ -101,7 +101,9 @@ def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str
     return severity_of_growth(hidden[0].severities, errors), float(hidden[0].severities[1])
 
 
-def needed(own: Mapping[Kind, Mapping[str, Curve]], measured: Sequence[str], kinds: Sequence[Kind], words: Mapping[Kind, str]) -> list[str]:
+def needed(
+    own: Mapping[Kind, Mapping[str, Curve]], measured: Sequence[str], kinds: Sequence[Kind], words: Mapping[Kind, str]
+) -> list[str]:
     """Return in words, with a place for the severity, where an observer's error doubles; kinds that do not double it are left out."""
     texts = []
     for kind in kinds:
@@ -122,7 +124,9 @@ def needed_sensor(metrics: Mapping[str, Any], measured: Sequence[str]) -> list[s
     parts = needed(own, measured, tuple(_NEEDS), _NEEDS)
     sensor = "sensor that is declared" if study.get("sensor") else "recordings' own sensor"
     if not parts:
-        return [f"No noise, resolution, bias, delay or loss of samples that was tried beyond the {sensor} doubles its error."]
+        return [
+            f"No noise, resolution, bias, delay or loss of samples that was tried beyond the {sensor} doubles its error."
+        ]
     listed = f"{', '.join(parts[:-1])} or {parts[-1]}" if parts[1:] else parts[0]
     return [f"Beyond the {sensor}, its error doubles with {listed}: this is the sensor and timing it needs."]
 

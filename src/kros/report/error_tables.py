@@ -86,7 +86,10 @@ def _tables(rows: Rows, identify_on: str, cell: Callable[[str, str, str, Rows, R
             if row["condition"] == condition:
                 grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
         papers = grouped.get(PAPER, {})
-        cells = {o: {c: cell(o, condition, c, found, papers.get(c, [])) for c, found in own.items()} for o, own in grouped.items()}
+        cells = {
+            o: {c: cell(o, condition, c, found, papers.get(c, [])) for c, found in own.items()}
+            for o, own in grouped.items()
+        }
         channels = tuple(dict.fromkeys(r["channel"] for r in rows if r["condition"] == condition))
         ranked = frozenset(c for c in channels if condition == identify_on or condition != "load" or c != "current")
         tables.append(ErrorTable(condition, channels, cells, ranked))

@@ -77,9 +77,15 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     from markupsafe import Markup
 
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+        loader=FileSystemLoader(_TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
     )
-    drawing = mapped(partial(encoded, RunFolder(run.folder)), ON_THE_PAGE)  # of its own: what is loaded here need not go to workers
+    drawing = mapped(
+        partial(encoded, RunFolder(run.folder)), ON_THE_PAGE
+    )  # of its own: what is loaded here need not go to workers
     sections, evidence = _made(SECTIONS, run, metrics), _made(EVIDENCE, run, metrics)
     figures = {}
     for found in drawing:
@@ -104,7 +110,9 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
 
 
 def _made(
-    makers: Sequence[Callable[[RunFolder, Mapping[str, Any]], Section | None]], run: RunFolder, metrics: Mapping[str, Any]
+    makers: Sequence[Callable[[RunFolder, Mapping[str, Any]], Section | None]],
+    run: RunFolder,
+    metrics: Mapping[str, Any],
 ) -> list[Section]:
     return [found for make in makers if (found := make(run, metrics)) is not None]
 

@@ -89,7 +89,9 @@ def observer_look(name: str) -> Look:
     if method in _METHOD_TONES:
         return Look(_METHOD_TONES[method].light, "-" if is_koopman(model) or not model else "--")
     if is_koopman(model):
-        return Look({"mixed": Tone.GREEN, "paper": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light)
+        return Look(
+            {"mixed": Tone.GREEN, "paper": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light
+        )
     return Look(Tone.ORANGE.light, "--" if method in ("mixed", "paper") else "-")
 
 
@@ -111,7 +113,9 @@ def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
     first = deployed if deployed is not None and deployed in names else (robust or list(names) or [""])[0]
     model, method = split_observer(first)
     other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
-    twin = next((n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in names), "")
+    twin = next(
+        (n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in names), ""
+    )
     pair = [n for n in dict.fromkeys((twin, first)) if n in robust]
     if len(pair) > 1:
         return pair
@@ -122,7 +126,9 @@ def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
 def paper_pair(names: Iterable[str]) -> list[str]:
     """Return the paper's linear and Koopman observer, or what there is of them: with its own entrywise weights where a study made these."""
     known = list(names)
-    pairs = [[n for n in (f"linear_edmd/{method}", f"koopman_edmd/{method}") if n in known] for method in ("paper", "mixed")]
+    pairs = [
+        [n for n in (f"linear_edmd/{method}", f"koopman_edmd/{method}") if n in known] for method in ("paper", "mixed")
+    ]
     return max(pairs, key=len)
 
 

@@ -61,15 +61,21 @@ def plot(result: Any, **options: Any) -> Figure:
     >>> len(figure.axes)
     2
     """
-    name = next((t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None)
+    name = next(
+        (t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None
+    )
     if name is None:
-        raise ConfigError(f"Plot: found a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder.")
+        raise ConfigError(
+            f"Plot: found a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
+        )
     module, _, function = PLOTS[name].partition(":")
     draw = getattr(import_module(f"{__package__}.figures.{module}"), function)
     known = list(signature(draw).parameters)[1:]
     unknown = sorted(set(options) - set(known))
     if unknown:
-        raise ConfigError(f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}.")
+        raise ConfigError(
+            f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}."
+        )
     with style():
         figure: Figure = draw({"": result} if name == "OutlierModel" else result, **options)
     return figure

@@ -89,7 +89,11 @@ class RunFolder:
     @cached_property
     def _described(self) -> ModelSet | Population:
         """What knows channels and sampling period: models, or the recordings where there are none yet."""
-        return next(iter(self.models.values())) if any(name.startswith("models/") for name in self.files) else self.population
+        return (
+            next(iter(self.models.values()))
+            if any(name.startswith("models/") for name in self.files)
+            else self.population
+        )
 
     @property
     def channels(self) -> tuple[Channel, ...]:
@@ -122,7 +126,9 @@ class RunFolder:
     @cached_property
     def calibration(self) -> PhaseCalibration:
         """The phase calibration."""
-        self._require("calibration/calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet")
+        self._require(
+            "calibration/calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet"
+        )
         return PhaseCalibration.load(self.folder / "calibration")
 
     @property
@@ -147,25 +153,34 @@ class RunFolder:
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that was identified on."""
-        return self._load("uncertainty", "*.json", UncertainModel.load, "the uncertainty has not been quantified yet", at_home=True)
+        return self._load(
+            "uncertainty", "*.json", UncertainModel.load, "the uncertainty has not been quantified yet", at_home=True
+        )
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units beside the weights, by kind of model."""
-        return _in_order(self._load("uncertainty", "units/*.json", UnitResiduals.load, "the residuals of the units were not kept"))
+        return _in_order(
+            self._load("uncertainty", "units/*.json", UnitResiduals.load, "the residuals of the units were not kept")
+        )
 
     @cached_property
     def others(self) -> tuple[str, dict[str, UnitResiduals]]:
         """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
         reason = "no unit was compared with the cover of the others; it takes two others in a condition"
         found = self._load("outliers", "others/*.json", UnitResiduals.load, reason)
-        return self._condition(next(iter(found))), _in_order({name.partition("@")[0]: one for name, one in found.items()})
+        return self._condition(next(iter(found))), _in_order(
+            {name.partition("@")[0]: one for name, one in found.items()}
+        )
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
         """Scores with all that is known about them, by condition."""
         reason = "outlier scores need at least three units in a condition"
-        return {self._condition(name): one for name, one in self._load("outliers", "outlier_model.json", OutlierModel.load, reason).items()}
+        return {
+            self._condition(name): one
+            for name, one in self._load("outliers", "outlier_model.json", OutlierModel.load, reason).items()
+        }
 
     def _condition(self, name: str) -> str:
         """Condition of a folder of models."""
@@ -232,8 +247,17 @@ class RunFolder:
     def _shown(self, number: int, key: EpisodeKey) -> Shown:
         start = f"shown{number}/"
         part = {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
-        observers, models = ({k.removeprefix(kind): v for k, v in part.items() if k.startswith(kind)} for kind in ("observer/", "model/"))
-        return Shown(key, np.arange(len(part["states"])) * self.sample_period_s, part["states"], part["inputs"], observers, models)
+        observers, models = (
+            {k.removeprefix(kind): v for k, v in part.items() if k.startswith(kind)} for kind in ("observer/", "model/")
+        )
+        return Shown(
+            key,
+            np.arange(len(part["states"])) * self.sample_period_s,
+            part["states"],
+            part["inputs"],
+            observers,
+            models,
+        )
 
     def _record(self, place: str, name: str, reason: str) -> dict[str, Any]:
         self._require(f"{place}/{name}.json", reason)
@@ -243,7 +267,9 @@ class RunFolder:
         self._require(f"{place}/arrays.npz", reason)
         return dict(read_arrays(self.folder / place / "arrays.npz"))
 
-    def _load(self, place: str, file: str, load: Callable[[Path], T], reason: str, at_home: bool = False) -> dict[str, T]:
+    def _load(
+        self, place: str, file: str, load: Callable[[Path], T], reason: str, at_home: bool = False
+    ) -> dict[str, T]:
         """Load what lies beside `file` in all folders `place`/*, by their names; both may be patterns."""
         pattern = f"{place}/*/{file}"
         depth, below = pattern.count("/"), file.count("/")
@@ -264,4 +290,6 @@ class RunFolder:
 
 def _in_order(found: dict[str, T]) -> dict[str, T]:
     """Linear before Koopman, kros's own before the paper's recipe."""
-    return dict(sorted(found.items(), key=lambda item: (item[0].endswith("_edmd"), item[0].startswith("koopman"), item[0])))
+    return dict(
+        sorted(found.items(), key=lambda item: (item[0].endswith("_edmd"), item[0].startswith("koopman"), item[0]))
+    )

@@ -54,7 +54,11 @@ def _sentence(metrics: Metrics, measured: Sequence[str], light: Level, alerts: S
     source = f"From {joined(measured)} alone it" if measured else "It"
     hidden = joined([c.replace("_", " ") for c in table.hidden(measured, name)])
     text = f"“{observer_label(name)}” can be deployed. {source} estimates {hidden} on machines like the {metrics['study']['units']} recorded ones."
-    return text if light is Level.GO else f"{text} {len(alerts)} {'point' if len(alerts) == 1 else 'points'} to look at first."
+    return (
+        text
+        if light is Level.GO
+        else f"{text} {len(alerts)} {'point' if len(alerts) == 1 else 'points'} to look at first."
+    )
 
 
 def _figures(metrics: Metrics, measured: Sequence[str]) -> list[Figure]:
@@ -70,13 +74,20 @@ def _figures(metrics: Metrics, measured: Sequence[str]) -> list[Figure]:
             if cell.rms is None:
                 found.append(Figure(number(cell.mean), "% of the largest value", title, worst))
             else:
-                found.append(Figure(number(cell.rms), readable_unit(units.get(channel, "")), title, f"{percent}; {worst}"))
+                found.append(
+                    Figure(number(cell.rms), readable_unit(units.get(channel, "")), title, f"{percent}; {worst}")
+                )
     if metrics.get("outliers"):
         flagged = [r for r in metrics["outliers"] if r["outlier"]]
         count = len({r["unit"] for r in flagged})
         every = len({r["unit"] for r in metrics["outliers"]})
         found.append(
-            Figure(str(count), f"of {every} units", "flagged as not belonging", flagged_text(flagged) if flagged else "none stands out")
+            Figure(
+                str(count),
+                f"of {every} units",
+                "flagged as not belonging",
+                flagged_text(flagged) if flagged else "none stands out",
+            )
         )
     return found
 
@@ -95,16 +106,25 @@ def _stops(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
         return [Alert(Level.STOP, "The run stopped before an observer was made.", "making")]
     if table is not None and any(table.cells[name][c].mean is None for c in table.hidden(measured, name)):
         texts.append(
-            (f"The estimates of “{observer_label(name)}” diverge on held-out episodes: do not use it. See Models first.", "models")
+            (
+                f"The estimates of “{observer_label(name)}” diverge on held-out episodes: do not use it. See Models first.",
+                "models",
+            )
         )
     elif table is not None and (hidden := table.hidden(measured, name)) and not_improved(table, name, hidden) == hidden:
         texts.append(
-            ("The observer is no better than its model alone: correction from these measurements brings nothing here.", "observers")
+            (
+                "The observer is no better than its model alone: correction from these measurements brings nothing here.",
+                "observers",
+            )
         )
     left = left_out_tables(metrics.get("left_out", {}).get("rows", []), study["identify_on"])
     if left and any(cell.mean is None for c, cell in left[0].cells.get(name, {}).items() if c not in measured):
         texts.append(
-            ("Designed without the unit it runs on, this kind of observer diverges on some units: do not use it on new ones.", "left-out")
+            (
+                "Designed without the unit it runs on, this kind of observer diverges on some units: do not use it on new ones.",
+                "left-out",
+            )
         )
     return [Alert(Level.STOP, *text) for text in texts]
 
@@ -120,16 +140,27 @@ def _looks(metrics: Metrics, measured: Sequence[str]) -> list[Alert]:
     texts += [(f"Units with a remark: {'; '.join(remarks)}.", "units")] if remarks else []
     if name is None:
         return [Alert(Level.LOOK, *text) for text in texts]
-    model, trust, table = split_observer(name)[0], trust_of(metrics.get("observers", {}).get(name, {})), home_table(metrics)
+    model, trust, table = (
+        split_observer(name)[0],
+        trust_of(metrics.get("observers", {}).get(name, {})),
+        home_table(metrics),
+    )
     if table is not None and (better := better_observer(table, name, table.hidden(measured, name))):
         texts.append((f"“{observer_label(better)}” is more accurate in all that is not measured.", "observers"))
-    if table is not None and 0 < len(same := not_improved(table, name, hidden := table.hidden(measured, name))) < len(hidden):
+    if table is not None and 0 < len(same := not_improved(table, name, hidden := table.hidden(measured, name))) < len(
+        hidden
+    ):
         channels = joined([c.replace("_", " ") for c in same])
         texts.append((f"Correction brings nothing for {channels}: the model alone does as well there.", "observers"))
     if trust.running is False:
         texts.append(("No certificate covers the observer as it runs.", "trust"))
     if trust.outside:
-        texts.append((f"Outside the set of recorded signals that the observer is certified for: {joined(trust.outside)}.", "trust"))
+        texts.append(
+            (
+                f"Outside the set of recorded signals that the observer is certified for: {joined(trust.outside)}.",
+                "trust",
+            )
+        )
     if (observers := metrics.get("observers")) and all(split_observer(n)[1] in BASELINES for n in observers):
         texts.append(("No robust observer could be designed for this population; Synthesis says why.", "synthesis"))
     weight = metrics.get("uncertainty", {}).get(model, {}).get("weight", {})

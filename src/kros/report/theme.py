@@ -44,7 +44,16 @@ class Tone(Enum):
         return f"--{self.name.lower()}"
 
 
-HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)  # of lines that stand side by side
+HUES = (
+    Tone.BLUE,
+    Tone.ORANGE,
+    Tone.GREEN,
+    Tone.PURPLE,
+    Tone.GOLD,
+    Tone.SKY,
+    Tone.GREY,
+    Tone.INK,
+)  # of lines that stand side by side
 
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",

@@ -33,7 +33,9 @@ class Trust:
     @property
     def by_set(self) -> str:
         """For which sets it is certified, in words."""
-        found = [name for name, known in (("plants", self.plants is not None), ("signals", bool(self.signals))) if known]
+        found = [
+            name for name, known in (("plants", self.plants is not None), ("signals", bool(self.signals))) if known
+        ]
         return " and ".join(found) or "no"
 
     @property
@@ -45,7 +47,11 @@ class Trust:
 def trust_of(facts: Facts) -> Trust:
     """Return what an entry of ``observers`` in ``metrics.json`` says."""
     signals = facts.get("set_bound_percent") if facts.get("set_certified") else None
-    lost = None if facts.get("dropout_rate") is None else (float(facts["dropout_rate"]), bool(facts.get("dropout_certified")))
+    lost = (
+        None
+        if facts.get("dropout_rate") is None
+        else (float(facts["dropout_rate"]), bool(facts.get("dropout_certified")))
+    )
     return Trust(
         facts.get("worst_case_h2"),
         signals,
@@ -78,18 +84,30 @@ def mean_error(table: ErrorTable, name: str, channels: Sequence[str]) -> float:
     """Return the geometric mean of an observer's errors in some channels, percent of the largest value; infinite where one is not known."""
     values = [table.cells[name][c].mean if c in table.cells[name] else None for c in channels]
     known = [v for v in values if v is not None]
-    return float(np.exp(np.mean(np.log(np.maximum(known, 1e-300))))) if known and len(known) == len(values) else float("inf")
+    return (
+        float(np.exp(np.mean(np.log(np.maximum(known, 1e-300)))))
+        if known and len(known) == len(values)
+        else float("inf")
+    )
 
 
 def sensor_text(metrics: Facts, name: str, measured: Sequence[str]) -> str:
     """Return what sensor and timing an observer needs, short."""
     own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
-    return "not tried" if own is None else "; ".join(needed(own, measured, tuple(_SENSOR), _SENSOR)) or "any that was tried"
+    return (
+        "not tried"
+        if own is None
+        else "; ".join(needed(own, measured, tuple(_SENSOR), _SENSOR)) or "any that was tried"
+    )
 
 
 def dropout_text(metrics: Facts, name: str, trust: Trust, measured: Sequence[str]) -> str:
     """Return which losses an observer tolerates: certified where a rate is declared, and as tried."""
-    told = [] if trust.dropouts is None else [f"{'certified' if trust.dropouts[1] else 'not certified'} at {100 * trust.dropouts[0]:g} %"]
+    told = (
+        []
+        if trust.dropouts is None
+        else [f"{'certified' if trust.dropouts[1] else 'not certified'} at {100 * trust.dropouts[0]:g} %"]
+    )
     own = curves(metrics.get("robustness", []), metrics["study"]["identify_on"]).get(name)
     if own is not None:
         told += needed(own, measured, tuple(_LOSSES), _LOSSES) or ["none that was tried doubles the error"]

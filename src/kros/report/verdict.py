@@ -9,7 +9,17 @@ from ..data.population import DEFAULT_CONDITION
 from .caveats import conditions_apart, confounded_text
 from .disturbances import needed_sensor
 from .error_tables import ErrorTable, home_table, left_out_tables
-from .names import BASELINES, channel_units, condition_label, form_label, joined, minus, number, observer_label, split_observer
+from .names import (
+    BASELINES,
+    channel_units,
+    condition_label,
+    form_label,
+    joined,
+    minus,
+    number,
+    observer_label,
+    split_observer,
+)
 from .trust import trust_of
 
 Metrics = Mapping[str, Any]
@@ -52,7 +62,9 @@ def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
     units = channel_units(metrics)
     parts = [_channel(table, name, c, units.get(c, "")) for c in known]
     shown = ", as the declared sensor shows them," if metrics["study"].get("sensor") else ""
-    sentences.append(f"{source} estimates {joined(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean.")
+    sentences.append(
+        f"{source} estimates {joined(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean."
+    )
     return [*sentences, *_open_loop(table, name, known), *_rivals(table, name, known)]
 
 
@@ -64,9 +76,12 @@ def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
         return []
     cells = {c: cell for c, cell in tables[0].cells[name].items() if c not in measured}
     if any(cell.mean is None for cell in cells.values()):
-        return ["Designed without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."]
+        return [
+            "Designed without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."
+        ]
     parts = [
-        f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})" for c, v in cells.items()
+        f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})"
+        for c, v in cells.items()
     ]
     if not parts:
         return []
@@ -82,7 +97,9 @@ def _next_unit(metrics: Metrics) -> list[str]:
     if found["bounds"] is None:
         return [f"Nothing is known with confidence about the next unit: {found['reason']}."]
     parts = [
-        f"{c.replace('_', ' ')} to {number(b['error_percent'])} %" for c, b in found["bounds"].items() if b["error_percent"] is not None
+        f"{c.replace('_', ' ')} to {number(b['error_percent'])} %"
+        for c, b in found["bounds"].items()
+        if b["error_percent"] is not None
     ]
     home = "" if found["condition"] == DEFAULT_CONDITION else f" ({condition_label(found['condition'])})"
     level, n = f"{100 * found['confidence']:g}", found["reserve"]
@@ -95,7 +112,9 @@ def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
     cell = table.cells[name][channel]
     more = [f"RMS {number(cell.rms)}{' ' + unit if unit not in ('', '1') else ''}"] if cell.rms is not None else []
     more += [f"{number(cell.worst)} % on the worst unit, {cell.worst_unit}"] if cell.worst is not None else []
-    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value" + (f" ({'; '.join(more)})" if more else "")
+    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value" + (
+        f" ({'; '.join(more)})" if more else ""
+    )
 
 
 def _open_loop(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
@@ -106,7 +125,11 @@ def _open_loop(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     theirs = {c: table.cells[other][c].mean for c in channels if c in table.cells[other]}
     if any(value is None for value in theirs.values()):
         return ["Open loop, the nominal model alone, diverges on some units."]
-    parts = [f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}" for c, v in theirs.items() if v is not None]
+    parts = [
+        f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}"
+        for c, v in theirs.items()
+        if v is not None
+    ]
     return [f"Open loop, the nominal model alone, gives {joined(parts)}."]
 
 
@@ -114,7 +137,11 @@ def _rivals(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
     """The best of all baselines in every channel, whichever it is, with its name."""
     parts = []
     for channel in channels:
-        means = {o: cells[channel].mean for o, cells in table.cells.items() if channel in cells and split_observer(o)[1] in BASELINES}
+        means = {
+            o: cells[channel].mean
+            for o, cells in table.cells.items()
+            if channel in cells and split_observer(o)[1] in BASELINES
+        }
         theirs = {o: mean for o, mean in means.items() if mean is not None and o != name}
         if theirs and channel in table.ranked:
             best = min(theirs, key=lambda o: theirs[o])
@@ -160,7 +187,9 @@ def _certificate(metrics: Metrics) -> list[str]:
     trust = trust_of(entry)
     if trust.signals:
         bounds = joined([f"{number(value)} % in {state.replace('_', ' ')}" for state, value in trust.signals.items()])
-        sentences.append(f"For all signals with the power that was recorded its RMS errors are at most {bounds} (of the largest value).")
+        sentences.append(
+            f"For all signals with the power that was recorded its RMS errors are at most {bounds} (of the largest value)."
+        )
     if entry.get("relift_certified") is not None:
         which = "Another certificate" if sentences else "A certificate"
         sentences.append(

@@ -47,9 +47,12 @@ class DataConfig(Settings):
     reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv or parquet")
     exclude: tuple[str, ...] = Field((), description="units that take no part in anything")
     identify_on: str | None = Field(
-        None, description="condition that models, uncertainty and synthesis are made of; noload where there is one, else the first"
+        None,
+        description="condition that models, uncertainty and synthesis are made of; noload where there is one, else the first",
     )
-    on_nan: Literal["error", "drop_episode"] = Field("error", description="what an episode with a missing value is: an error, or left out")
+    on_nan: Literal["error", "drop_episode"] = Field(
+        "error", description="what an episode with a missing value is: an error, or left out"
+    )
     prepare: tuple[dict[str, Any], ...] = Field((), description="preparation steps, in order")
     csv: dict[str, Any] | None = Field(None, description="the mapping, for the reader csv")
 
@@ -65,7 +68,8 @@ class SplitConfig(Settings):
     """Which episodes are held out."""
 
     test: tuple[str, ...] | None = Field(
-        None, description="names of the episodes held out; by default the last tenth of every unit and condition, at least one"
+        None,
+        description="names of the episodes held out; by default the last tenth of every unit and condition, at least one",
     )
 
 
@@ -78,9 +82,13 @@ class EvaluateConfig(Settings):
     """
 
     folds: int = Field(
-        0, ge=0, description="folds of units that are left out in turn, the whole study being made on all others; 0 for none"
+        0,
+        ge=0,
+        description="folds of units that are left out in turn, the whole study being made on all others; 0 for none",
     )
-    reserve: int = Field(0, ge=0, description="units that take part in nothing; their errors bound those of the next unit")
+    reserve: int = Field(
+        0, ge=0, description="units that take part in nothing; their errors bound those of the next unit"
+    )
     confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
     robustness: bool = Field(
         True, description="whether observers of the deployed kind of model run on disturbed measurements of a few units"
@@ -102,12 +110,15 @@ class LoadConfig(Settings):
     """
 
     moment: float | None = Field(
-        None, description="of the mounted mass over the torque constant, in units of current; without it nothing is done about load"
+        None,
+        description="of the mounted mass over the torque constant, in units of current; without it nothing is done about load",
     )
     inertia: float = Field(0.0, ge=0, description="of the mounted mass over the torque constant")
     angle_rad: float = Field(0.0, description="angle at which the moment is zero")
     condition: str = Field("load", description="in which the load is mounted")
-    units: tuple[str, ...] = Field((), description="on which the load is known; by default the first two recorded in the condition")
+    units: tuple[str, ...] = Field(
+        (), description="on which the load is known; by default the first two recorded in the condition"
+    )
     angle: str = Field("position", description="state that is the angle")
     current: str = Field("current", description="state that is the current")
     limit: float | None = Field(None, gt=0, description="of the current, in its unit of measure")
@@ -180,7 +191,9 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
     return validate_config(raw, path.parent, str(path), overrides)
 
 
-def validate_config(raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()) -> StudyConfig:
+def validate_config(
+    raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()
+) -> StudyConfig:
     """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`.
 
     Examples

@@ -51,7 +51,9 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if context.config.sensor:
         study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
     if limits := limits_of(context.config.limits, facts.limits, context.population.states):
-        study["limits"] = {name: _limit(own, facts.limits.get(name), name in context.config.limits) for name, own in limits.items()}
+        study["limits"] = {
+            name: _limit(own, facts.limits.get(name), name in context.config.limits) for name, own in limits.items()
+        }
     if facts.alerts:
         study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
@@ -79,11 +81,18 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     rows = []
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: dict[str, Any] = {"unit": unit, "group": group, "conditions": list(dict.fromkeys(k.condition for k in keys))}
+        row: dict[str, Any] = {
+            "unit": unit,
+            "group": group,
+            "conditions": list(dict.fromkeys(k.condition for k in keys)),
+        }
         status = "ok"
         if calibration is not None:
             phase = calibration.units.get(unit)
-            row |= {"phase_rad": phase.phase_rad if phase else None, "concentration": phase.concentration if phase else None}
+            row |= {
+                "phase_rad": phase.phase_rad if phase else None,
+                "concentration": phase.concentration if phase else None,
+            }
             status = status if phase else "not calibrated"
         if models is not None and unit in models.unit_ids:
             status = models.status[models.index(unit)]
@@ -110,7 +119,10 @@ def _pooled_radius(context: Context, name: str) -> float:
 def _uncertainty(context: Context) -> dict[str, Any]:
     store = context.store
     found = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
-    return {name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name) for name in found}
+    return {
+        name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name)
+        for name in found
+    }
 
 
 def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
@@ -137,7 +149,11 @@ def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
     if store.holds("uncertainty", name, "noise"):
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
-        shares = {"median": np.median(noise.noise_share), "at_peak": noise.noise_share[place], "peak_hz": noise.freqs_hz[place]}
+        shares = {
+            "median": np.median(noise.noise_share),
+            "at_peak": noise.noise_share[place],
+            "peak_hz": noise.freqs_hz[place],
+        }
         entry["noise_share"] = shares
     return entry
 

@@ -161,7 +161,9 @@ def run(
     if isinstance(tables.get("lifting"), list | tuple):
         tables["lifting"] = {"functions": tables["lifting"]}
     if not isinstance(source, Population | StudyConfig | str | Path):
-        raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays.")
+        raise ConfigError(
+            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays."
+        )
     raw: dict[str, Any]
     if isinstance(source, Population):
         raw, base = {"name": Path(out).name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}, Path(out)
@@ -169,14 +171,19 @@ def run(
         raw, base = source.dump(), Path()
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
-        raw, base = {"name": Path(out).name, "data": {"source": str(source), **({} if reader is None else {"reader": reader})}}, Path()
+        raw, base = (
+            {"name": Path(out).name, "data": {"source": str(source), **({} if reader is None else {"reader": reader})}},
+            Path(),
+        )
     else:
         raw, base = load_config(source).dump(), Path(source).parent
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
     given = source if isinstance(source, Population) else None
     if given is not None and set(tables.get("data", ())) & {"source", "reader"}:
-        raise ConfigError("Run: data.source and data.reader name recordings, and a population is given already; leave them out.")
+        raise ConfigError(
+            "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
+        )
     origin = str(source) if given is None else "of arrays"
     return run_study(validate_config(raw, base, origin), out, until, workers, None, progress, given)
 
@@ -221,7 +228,9 @@ def stage_of(name: Stage | str) -> Stage:
     try:
         return Stage(name)
     except ValueError as error:
-        raise ConfigError(f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}.") from error
+        raise ConfigError(
+            f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}."
+        ) from error
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -230,7 +239,9 @@ def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
     if config.require.robust and (deployed.get("status") == "failed" or not is_robust(deployed)):
         reason = deployed.get("reason", "none was computed")
-        found.append(f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})")
+        found.append(
+            f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})"
+        )
     flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]
     if config.require.no_outliers and flagged:
         found.append(f"require.no_outliers: flagged are {', '.join(flagged)}")

@@ -87,8 +87,14 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
 
 def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> list[Violation]:
     """Check every assumption of H2 synthesis and return those that fail."""
-    found = [Violation(Assumption.STABILISABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]]
-    found += [Violation(Assumption.DETECTABLE, f"mode {mode:.6g}") for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]]
+    found = [
+        Violation(Assumption.STABILISABLE, f"mode {mode:.6g}")
+        for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]
+    ]
+    found += [
+        Violation(Assumption.DETECTABLE, f"mode {mode:.6g}")
+        for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]
+    ]
     n, _, n_u, _, n_y = plant.sizes
     rank12, rank21 = _rank(plant.D12), _rank(plant.D21)
     if rank12 < n_u:
@@ -118,7 +124,9 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
     require_plant(plant, method)
     found = h2_violations(plant, proper)
     if found:
-        raise SynthesisError(f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + ".")
+        raise SynthesisError(
+            f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + "."
+        )
 
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:

@@ -92,7 +92,13 @@ class GeneralizedPlant:
         for name in _MATRICES:
             object.__setattr__(self, name, np.atleast_2d(real_array(f"Generalized plant: {name}", getattr(self, name))))
         object.__setattr__(self, "dt", sampling_period("Generalized plant", self.dt))
-        n, n_w, n_u, n_z, n_y = self.A.shape[-1], self.B1.shape[-1], self.B2.shape[-1], self.C1.shape[0], self.C2.shape[0]
+        n, n_w, n_u, n_z, n_y = (
+            self.A.shape[-1],
+            self.B1.shape[-1],
+            self.B2.shape[-1],
+            self.C1.shape[0],
+            self.C2.shape[0],
+        )
         expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
         expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
         for name, shape in expected.items():
@@ -102,13 +108,17 @@ class GeneralizedPlant:
                     f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix."
                 )
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
-            raise DimensionError("Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it.")
+            raise DimensionError(
+                "Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it."
+            )
         for name, part, whole in (("n_w1", self.n_w1, n_w), ("n_z1", self.n_z1, n_z)):
             if part is not None and not 0 <= part <= whole:
                 raise DimensionError(f"Generalized plant: {name} = {part} should lie between 0 and {whole}.")
         for name, parts, whole in (("w", self.w_parts, n_w), ("z", self.z_parts, n_z)):
             if parts and sum(parts.values()) != whole:
-                raise DimensionError(f"Generalized plant: the parts of {name} should have {whole} signals together, found {parts}.")
+                raise DimensionError(
+                    f"Generalized plant: the parts of {name} should have {whole} signals together, found {parts}."
+                )
 
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
@@ -146,7 +156,16 @@ class GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
         D11 = self.D11[rows][:, columns]
         return GeneralizedPlant(
-            self.A, self.B1[:, columns], self.B2, self.C1[rows], self.C2, D11, self.D12[rows], self.D21[:, columns], self.D22, self.dt
+            self.A,
+            self.B1[:, columns],
+            self.B2,
+            self.C1[rows],
+            self.C2,
+            D11,
+            self.D12[rows],
+            self.D21[:, columns],
+            self.D22,
+            self.dt,
         )
 
     def open_loop(self) -> StateSpace:
@@ -193,7 +212,17 @@ class GeneralizedPlant:
 def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:
     """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` as in `GeneralizedPlant`."""
     B, C, D = system.B, system.C, system.D
-    matrices = (system.A, B[:, :n_w], B[:, n_w:], C[:n_z], C[n_z:], D[:n_z, :n_w], D[:n_z, n_w:], D[n_z:, :n_w], D[n_z:, n_w:])
+    matrices = (
+        system.A,
+        B[:, :n_w],
+        B[:, n_w:],
+        C[:n_z],
+        C[n_z:],
+        D[:n_z, :n_w],
+        D[:n_z, n_w:],
+        D[n_z:, :n_w],
+        D[n_z:, n_w:],
+    )
     return GeneralizedPlant(*matrices, system.dt, **parts)
 
 

@@ -138,7 +138,11 @@ class Synthesis:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "synthesis")
         values: dict[str, Any] = {name: content.get(name) for name in _PLAIN}
-        values |= {"status": Status(content["status"]), "injection": Injection(content["injection"]), "notes": tuple(content["notes"])}
+        values |= {
+            "status": Status(content["status"]),
+            "injection": Injection(content["injection"]),
+            "notes": tuple(content["notes"]),
+        }
         return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
 
 
@@ -153,7 +157,9 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
         return (
             None,
             None,
-            (f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",),
+            (
+                f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",
+            ),
         )
     lower = min(lower, value)
     return lower, 100 * (value / lower - 1), ()

@@ -30,7 +30,14 @@ import numpy.typing as npt
 
 from ..core.choices import member
 from ..core.errors import DimensionError
-from ..core.small_matrices import condition_number, entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
+from ..core.small_matrices import (
+    condition_number,
+    entries_first,
+    entries_last,
+    multiply,
+    pseudo_inverse_first,
+    sigma_max,
+)
 
 Array = npt.NDArray[Any]
 
@@ -129,7 +136,9 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     other = (first if form.inverse else second) if paper else difference
     product = multiply(inverse, other) if left else multiply(other, inverse)
     if paper:
-        product = (product - np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))) * (-1 if form.inverse else 1)
+        product = (product - np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))) * (
+            -1 if form.inverse else 1
+        )
     return entries_last(product)
 
 
@@ -191,7 +200,12 @@ def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals:
     form, G = as_form(form), check_responses(responses)
     rows = range(len(G)) if nominals is None else nominals
     others = (np.delete(G, j, axis=0) for j in rows)
-    return np.array([sigma_max(residual(form, G[j], Gp, paper=paper)).max(axis=0, initial=0.0) for j, Gp in zip(rows, others, strict=True)])
+    return np.array(
+        [
+            sigma_max(residual(form, G[j], Gp, paper=paper)).max(axis=0, initial=0.0)
+            for j, Gp in zip(rows, others, strict=True)
+        ]
+    )
 
 
 def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None = None) -> Array:
@@ -228,7 +242,9 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     return ratio
 
 
-def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None) -> tuple[Array, Array]:
+def completion(
+    form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None
+) -> tuple[Array, Array]:
     """Return residuals, zero where an inverse form is near singular, and the remainder: `Gp = rebuild(form, G, E) + R` everywhere."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
@@ -242,7 +258,9 @@ def check_responses(responses: npt.ArrayLike) -> Array:
     """Return responses as an array, or say which axes are missing."""
     G = np.asarray(responses)
     if G.ndim != 4 or 0 in G.shape:
-        raise DimensionError(f"Responses: need the axes (unit, frequency, output, input), none of them empty; found shape {G.shape}.")
+        raise DimensionError(
+            f"Responses: need the axes (unit, frequency, output, input), none of them empty; found shape {G.shape}."
+        )
     return G
 
 

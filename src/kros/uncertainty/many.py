@@ -94,7 +94,11 @@ class _Many:
         G, kept = self.base.frequency_response(self.freqs_hz), dict[int, tuple[Array, Array]]()
         for block in self.blocks():
             parts = completion(self.asked.form, G, self.units[block].frequency_response(self.freqs_hz))
-            sizes = [size for E in parts for size in (sigma_max(E), *np.moveaxis(np.abs(E), (2, 3), (0, 1)).reshape(-1, *E.shape[:2]))]
+            sizes = [
+                size
+                for E in parts
+                for size in (sigma_max(E), *np.moveaxis(np.abs(E), (2, 3), (0, 1)).reshape(-1, *E.shape[:2]))
+            ]
             for k, size in enumerate(sizes):
                 largest, who = kept.get(k, (np.full(size.shape[1], -1.0), np.zeros(size.shape[1], int)))
                 here, worst = size.max(axis=0), size.argmax(axis=0) + block.start
@@ -128,7 +132,9 @@ class _Many:
                 if proving:
                     found[part].append(self._proof(part, weight, own, claimed, known, block.start))
                 else:
-                    found[part].append(_Proof(float(known.max()), float(known.max()), Method.GRID, _beyond(known) + block.start))
+                    found[part].append(
+                        _Proof(float(known.max()), float(known.max()), Method.GRID, _beyond(known) + block.start)
+                    )
         return {part: _Proof.together(of_blocks) for part, of_blocks in found.items()}
 
     def _proof(self, part: Part, weight: Weight, units: StateSpace, claimed: Array, known: Array, start: int) -> _Proof:
@@ -137,9 +143,15 @@ class _Many:
         def ratio(freqs_hz: Array) -> Array:
             if freqs_hz is claimed:
                 return known
-            return _ratio(weight, self._of(part, self.base.frequency_response(freqs_hz), units.frequency_response(freqs_hz)), freqs_hz)
+            return _ratio(
+                weight,
+                self._of(part, self.base.frequency_response(freqs_hz), units.frequency_response(freqs_hz)),
+                freqs_hz,
+            )
 
-        found = certify(ratio, claimed, weight.left, weight.right, ResidualSystems(self.asked.form, self.base, units, part=part))
+        found = certify(
+            ratio, claimed, weight.left, weight.right, ResidualSystems(self.asked.form, self.base, units, part=part)
+        )
         bound = found.peak * (1 + found.margin) if found.method is Method.LEVEL_SETS else found.peak
         beyond = _beyond(known)
         if bound > 1:
@@ -156,7 +168,9 @@ class _Many:
             return replace(found, bound=bound, cover=cover, weight=weight, misfit=ratio)
         rest = self._sound(Part.REMAINDER, found.remainder_cover)
         remainder = _lifted(found.remainder, proofs[Part.REMAINDER])
-        remainder = replace(remainder.measured(self.freqs_hz, rest, tolerance), within_tolerance=found.remainder.within_tolerance)
+        remainder = replace(
+            remainder.measured(self.freqs_hz, rest, tolerance), within_tolerance=found.remainder.within_tolerance
+        )
         return Bounded(bound, cover, weight, ratio, remainder, rest)
 
     def _sound(self, part: Part, cover: Cover) -> Cover:

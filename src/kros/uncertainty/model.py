@@ -196,7 +196,9 @@ class UncertainModel(Uncertainty):
         dt = content["sample_period_s"]
         weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
         remainder, remainder_cover = (
-            _unpack_weight("remainder", content["remainder"], arrays, dt) if content["remainder"] is not None else (None, None)
+            _unpack_weight("remainder", content["remainder"], arrays, dt)
+            if content["remainder"] is not None
+            else (None, None)
         )
         return cls(
             form=Form(content["form"]),

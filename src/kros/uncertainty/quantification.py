@@ -70,7 +70,9 @@ class Quantification:
                 f"Quantify: max_order = {max_order!r} should be a whole number from 0, tolerance_db = {tolerance_db} not negative."
             )
         if structure not in (AUTO, ENTRYWISE):
-            raise ConfigError(f"Weight structure {structure!r} is unknown; choose {AUTO!r}, or {ENTRYWISE!r} for the paper's.")
+            raise ConfigError(
+                f"Weight structure {structure!r} is unknown; choose {AUTO!r}, or {ENTRYWISE!r} for the paper's."
+            )
         return cls(as_form(form), structure == ENTRYWISE, max_order, tolerance_db)
 
     def bound(
@@ -95,7 +97,13 @@ class Quantification:
         return self._bound(_Residuals(self.form, nominal, units), freqs_hz, time, systems, also_hz, sampled)
 
     def _bound(
-        self, residuals: _Residuals, freqs_hz: Array, dt: float, systems: ResidualSystems | None, also_hz: Array | None, sampled: bool
+        self,
+        residuals: _Residuals,
+        freqs_hz: Array,
+        dt: float,
+        systems: ResidualSystems | None,
+        also_hz: Array | None,
+        sampled: bool,
     ) -> Bounded:
         G, Gp = residuals.responses(freqs_hz)
         E = residuals.of_form(freqs_hz)
@@ -103,17 +111,23 @@ class Quantification:
 
         def fit(structure: Structure) -> tuple[Weight, Cover]:
             of_form: Residuals = between_points(E, freqs_hz) if sampled else residuals.of_form
-            return fit_weight(of_form, freqs_hz, dt, structure=structure, tolerance_db=self.tolerance_db, systems=systems, **options)
+            return fit_weight(
+                of_form, freqs_hz, dt, structure=structure, tolerance_db=self.tolerance_db, systems=systems, **options
+            )
 
         weight, cover = fit(Structure.ENTRYWISE) if self.entrywise else self._automatic(fit)
         ratio, bound = misfit(self.form, G, Gp, E), sigma_max(E).max(axis=0)
         if not _leaves_out(self.form, ratio):
             return Bounded(bound, cover, weight, ratio)
-        left_over: Residuals = between_points(residuals.left_over(freqs_hz), freqs_hz) if sampled else residuals.left_over
+        left_over: Residuals = (
+            between_points(residuals.left_over(freqs_hz), freqs_hz) if sampled else residuals.left_over
+        )
         rest = None if systems is None else replace(systems, part=Part.REMAINDER)
         structure = Structure.DIAGONAL if weight.structure is Structure.ENTRYWISE else weight.structure
         looser = _REMAINDER_TOLERANCE * self.tolerance_db
-        remainder = fit_weight(left_over, freqs_hz, dt, structure=structure, tolerance_db=looser, systems=rest, **options)
+        remainder = fit_weight(
+            left_over, freqs_hz, dt, structure=structure, tolerance_db=looser, systems=rest, **options
+        )
         return Bounded(bound, cover, weight, ratio, *remainder)
 
     def _automatic(self, fit: Callable[[Structure], tuple[Weight, Cover]]) -> tuple[Weight, Cover]:
@@ -127,7 +141,11 @@ class Quantification:
         scalar = fit(Structure.SCALAR)
         if not amplified and weight.overbound_db_max <= scalar[0].overbound_db_max:
             return diagonal
-        reason = "come close to an ill-posed set" if amplified else f"exceed the optimal ones by {weight.overbound_db_max:.1f} dB"
+        reason = (
+            "come close to an ill-posed set"
+            if amplified
+            else f"exceed the optimal ones by {weight.overbound_db_max:.1f} dB"
+        )
         _LOG.info("Diagonal weights %s; scalar ones are taken.", reason)
         return scalar
 
@@ -177,7 +195,9 @@ class _Residuals:
 
     def responses(self, freqs_hz: Array) -> tuple[Array, Array]:
         """Responses of the nominal and the units."""
-        found: tuple[Array, Array] = self._once("responses", freqs_hz, lambda: (self.nominal(freqs_hz), self.units(freqs_hz)))
+        found: tuple[Array, Array] = self._once(
+            "responses", freqs_hz, lambda: (self.nominal(freqs_hz), self.units(freqs_hz))
+        )
         return found
 
     def of_form(self, freqs_hz: Array) -> Array:

@@ -78,9 +78,7 @@ class UncertainModels:
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
-        return (
-            f"<UncertainModels: {', '.join(self.sets)} around unit {self.nominal}, {flagged} of {len(self.scores)} outlier scores flagged>"
-        )
+        return f"<UncertainModels: {', '.join(self.sets)} around unit {self.nominal}, {flagged} of {len(self.scores)} outlier scores flagged>"
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""
@@ -94,8 +92,17 @@ class UncertainModels:
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content: dict[str, Any] = {"nominal": self.nominal, "worst_off_nominal": self.worst_off_nominal, "dropped": self.dropped}
-        content |= {"kinds": list(self.sets), "outliers": list(self.outliers), "max_order": self.max_order, "pooled": self.pooled}
+        content: dict[str, Any] = {
+            "nominal": self.nominal,
+            "worst_off_nominal": self.worst_off_nominal,
+            "dropped": self.dropped,
+        }
+        content |= {
+            "kinds": list(self.sets),
+            "outliers": list(self.outliers),
+            "max_order": self.max_order,
+            "pooled": self.pooled,
+        }
         save_artifact(folder / "uncertainty", _KIND, content)
 
     @classmethod
@@ -113,7 +120,15 @@ class UncertainModels:
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
         dropped, order = tuple(content["dropped"]), content["max_order"]
         return cls(
-            models, content["nominal"], content["worst_off_nominal"], dropped, sets, scores, outliers, order, content.get("pooled", True)
+            models,
+            content["nominal"],
+            content["worst_off_nominal"],
+            dropped,
+            sets,
+            scores,
+            outliers,
+            order,
+            content.get("pooled", True),
         )
 
 
@@ -121,7 +136,9 @@ class UncertainModels:
 def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels: ...
 @overload
 def quantify(models: StateSpace | Sequence[Any], *arguments: Any, **settings: Any) -> UncertainModel: ...
-def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: Any, work: Work | None = None, **settings: Any) -> Any:
+def quantify(
+    models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: Any, work: Work | None = None, **settings: Any
+) -> Any:
     """Quantify how the units of a population differ.
 
     Parameters
@@ -156,7 +173,9 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     """
     if isinstance(models, StateSpace | list | tuple):
         return quantify_systems(models, *arguments, **settings)
-    models = require_kind(models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)")
+    models = require_kind(
+        models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)"
+    )
     asked = UncertaintySettings.of(settings, "Quantify")
     outliers, scores = score_population(models, asked, work)
     dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
@@ -173,7 +192,15 @@ def quantify(models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: 
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
     farthest = worst_off_nominal(first, sets[models.kinds[0]])
     return UncertainModels(
-        models, nominal, farthest, tuple(sorted(dropped)), sets, tuple(scores), outliers, asked.max_order, asked.nominal is None
+        models,
+        nominal,
+        farthest,
+        tuple(sorted(dropped)),
+        sets,
+        tuple(scores),
+        outliers,
+        asked.max_order,
+        asked.nominal is None,
     )
 
 

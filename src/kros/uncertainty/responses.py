@@ -86,7 +86,9 @@ def quantify_responses(
     G = check_responses(responses)
     freqs = check_grid(freqs_hz, sample_period_s or None)
     if G.shape[1] != len(freqs):
-        raise DimensionError(f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}.")
+        raise DimensionError(
+            f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}."
+        )
     ids = check_ids(unit_ids, len(G))
     own = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
     for name, value in zip((*ids, "the nominal"), [*G, np.asarray(nominal)] if own else G, strict=False):
@@ -98,12 +100,18 @@ def quantify_responses(
     chosen = np.asarray(nominal) if own else G[index]
     base = chosen / scales[0][:, None] * scales[1]
     time = sample_period_s if sample_period_s > 0 else BilinearAxis.over(freqs)
-    found = asked.bound(lambda f: base[nearest(freqs, f)], lambda f: units[:, nearest(freqs, f)], freqs, time, sampled=True)
+    found = asked.bound(
+        lambda f: base[nearest(freqs, f)], lambda f: units[:, nearest(freqs, f)], freqs, time, sampled=True
+    )
     unresolved = freqs[unresolved_peaks(found.bound)]
-    certificate = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
+    certificate = (
+        f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
+    )
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5]) + (" ..." if unresolved.size > 5 else "")
-        certificate += f"; they do not resolve {unresolved.size} peak{'s' * (unresolved.size > 1)} of the residuals, at {some} Hz"
+        certificate += (
+            f"; they do not resolve {unresolved.size} peak{'s' * (unresolved.size > 1)} of the residuals, at {some} Hz"
+        )
         _LOG.warning(
             "Weights of responses: the residuals peak within less than a step of the frequencies given, at %s Hz, and may be larger beside them; "
             "measure more densely there.",
@@ -121,15 +129,23 @@ def quantify_responses(
 def unresolved_peaks(bound: Array) -> npt.NDArray[np.intp]:
     """Return the indices of inner local maxima from which a bound, shape (frequency,), falls by more than 3 dB to a neighbour."""
     middle, before, after = bound[1:-1], bound[:-2], bound[2:]
-    peaks = (middle >= before) & (middle >= after) & (middle > np.maximum(_RESOLVED * np.minimum(before, after), _ROUNDING * bound.max()))
+    peaks = (
+        (middle >= before)
+        & (middle >= after)
+        & (middle > np.maximum(_RESOLVED * np.minimum(before, after), _ROUNDING * bound.max()))
+    )
     return np.flatnonzero(peaks) + 1
 
 
 def _check(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
     """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
     if response.shape != shape:
-        raise DimensionError(f"Quantify: the response of {name!r} should have the shape {shape}, found {response.shape}.")
+        raise DimensionError(
+            f"Quantify: the response of {name!r} should have the shape {shape}, found {response.shape}."
+        )
     finite = np.isfinite(response).all(axis=(1, 2))
     if not finite.all():
         at = freqs[int(np.argmin(finite))]
-        raise DataError(f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out.")
+        raise DataError(
+            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out."
+        )

@@ -102,17 +102,25 @@ def quantify_systems(
         index = find_nominal(nominal, ids, choices[asked.form].index)
         chosen = system[index]
     base = scale_system(chosen, *scales)
-    found = bound_many(asked, base, units, freqs) if is_many(asked, len(ids), time) else _bound_all(asked, base, units, freqs, time)
+    found = (
+        bound_many(asked, base, units, freqs)
+        if is_many(asked, len(ids), time)
+        else _bound_all(asked, base, units, freqs, time)
+    )
     return UncertainModel(nominal_system=chosen, **asked.fields(ids, index, freqs, scales, choices, found))
 
 
-def _bound_all(asked: Quantification, base: StateSpace, units: StateSpace, freqs: Array, time: float | BilinearAxis) -> Bounded:
+def _bound_all(
+    asked: Quantification, base: StateSpace, units: StateSpace, freqs: Array, time: float | BilinearAxis
+) -> Bounded:
     """Return weights from the residuals of all units at once."""
     if isinstance(time, BilinearAxis):
         residuals = ResidualSystems(asked.form, time.discrete(base), time.discrete(units))
         grid, dt = dense_grid(time.discrete_hz(freqs), time.period_s, DENSITY), time.period_s
         grid = grid[grid <= time.discrete_hz(freqs[-1])]
-        exact = None  # beyond the end of the grid residuals count as constant, which those of the mapped systems are not
+        exact = (
+            None  # beyond the end of the grid residuals count as constant, which those of the mapped systems are not
+        )
     else:
         residuals, dt = ResidualSystems(asked.form, base, units), time
         grid, exact = checking_grid(freqs, dt, DENSITY, filled=True), residuals
@@ -120,9 +128,13 @@ def _bound_all(asked: Quantification, base: StateSpace, units: StateSpace, freqs
     return asked.bound(base.frequency_response, units.frequency_response, freqs, time, systems=exact, also_hz=also)
 
 
-def _axis(system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None) -> tuple[Array, float | BilinearAxis]:
+def _axis(
+    system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None
+) -> tuple[Array, float | BilinearAxis]:
     """Grid, and the sampling period or the map of the imaginary axis to a unit circle."""
     if system.dt > 0:
-        return log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt), system.dt
+        return log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(
+            freqs_hz, system.dt
+        ), system.dt
     wide = beyond(continuous_grid(system) if freqs_hz is None else check_grid(freqs_hz, None))
     return wide, BilinearAxis.over(wide)

@@ -61,7 +61,14 @@ class UnitResiduals:
     def load(cls, folder: Path) -> UnitResiduals:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "unit_residuals")
-        axes = {"freqs_hz": "f", "entries": "ufpm", "ratio": "uf", "largest": "fpm", "entry_weights": "fpm", "entry_orders": "pm"}
+        axes = {
+            "freqs_hz": "f",
+            "entries": "ufpm",
+            "ratio": "uf",
+            "largest": "fpm",
+            "entry_weights": "fpm",
+            "entry_orders": "pm",
+        }
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             form=Form(content["form"]),
@@ -99,7 +106,9 @@ def unit_residuals(
     largest = sizes[inside].max(axis=0)
     fitted, orders = np.empty_like(largest, dtype=complex), np.zeros(largest.shape[1:], dtype=int)
     for i, j in np.ndindex(*largest.shape[1:]):
-        found = fit_magnitude(freqs_hz, largest[:, i, j], sample_period_s, max_order=max_order, tolerance_db=tolerance_db)
+        found = fit_magnitude(
+            freqs_hz, largest[:, i, j], sample_period_s, max_order=max_order, tolerance_db=tolerance_db
+        )
         fitted[:, i, j] = found.system.frequency_response(freqs_hz)[:, 0, 0]
         orders[i, j] = found.order
     kept = shown_rows(inside)

@@ -26,7 +26,11 @@ def read_models(
     system = stack_systems(models)
     ids = check_ids(unit_ids, system.batch_shape[0])
     _check(system, tuple(f"unit {name}" for name in ids))
-    return system, ids, (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs))
+    return (
+        system,
+        ids,
+        (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs)),
+    )
 
 
 def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
@@ -77,7 +81,9 @@ def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
         return names.index(nominal)
     index = best if nominal is None else nominal
     if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
-        raise ConfigError(f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}.")
+        raise ConfigError(
+            f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}."
+        )
     return int(index)
 
 
@@ -85,13 +91,19 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     """Return ranges as an array, ones by default, or say what is wrong with them."""
     scale = np.ones(size) if values is None else np.asarray(values, float)
     if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
-        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {np.array2string(scale, threshold=10)}.")
+        raise DimensionError(
+            f"Uncertainty: {side}_scale needs {size} positive numbers, found {np.array2string(scale, threshold=10)}."
+        )
     return scale
 
 
 def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> None:
     """Raise a `DimensionError` or `DataError` when a candidate for the nominal is not one stable system like the units."""
-    if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (system.n_outputs, system.n_inputs, system.dt):
+    if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (
+        system.n_outputs,
+        system.n_inputs,
+        system.dt,
+    ):
         raise DimensionError(
             f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
             f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
@@ -106,12 +118,18 @@ def _check(system: StateSpace, names: tuple[str, ...]) -> None:
     for name in "ABCD":
         finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
     if not finite.all():
-        raise DataError(f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again.")
+        raise DataError(
+            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again."
+        )
     stable = np.broadcast_to(system.is_stable(), count)
     if not stable.all():
         first = int(np.argmin(stable))
         poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
-        worst = f"spectral radius {np.abs(poles).max():.6f}" if system.dt > 0 else f"largest real part of a pole {poles.real.max():.6g}"
+        worst = (
+            f"spectral radius {np.abs(poles).max():.6f}"
+            if system.dt > 0
+            else f"largest real part of a pole {poles.real.max():.6g}"
+        )
         raise DataError(
             f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
             "identify with more regularisation or leave it out."

@@ -204,7 +204,9 @@ def _mean_square(E: Array) -> Array:
 def _require(models: ModelSamples, nominal: int) -> tuple[int, int, int, int]:
     units, draws, n, m = *models.samples.A.shape[:2], models.samples.A.shape[-1], models.samples.B.shape[-1]
     if units < 2 or draws < 2:
-        raise DataError(f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}.")
+        raise DataError(
+            f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}."
+        )
     for unit, parts in zip(models.unit_ids, zip(*_matrices(models), strict=True), strict=True):
         if not all(np.isfinite(p).all() for p in parts):
             raise DataError(

@@ -17,7 +17,21 @@ from .measures import is_unit_row
 HEAD_BYTES, ROWS, SPREAD = 1 << 18, 60, 200
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
-_NO_NUMBER = {"", "nan", "+nan", "-nan", "null", "none", "na", "n/a", "inf", "-inf", "+inf", "#n/a", *(a.lower() for a in ABSENT)}
+_NO_NUMBER = {
+    "",
+    "nan",
+    "+nan",
+    "-nan",
+    "null",
+    "none",
+    "na",
+    "n/a",
+    "inf",
+    "-inf",
+    "+inf",
+    "#n/a",
+    *(a.lower() for a in ABSENT),
+}
 _TIME = re.compile(
     rf"^\s*(?:(?:{'|'.join(re.sub(r'[?]P<[a-z]+>', '?:', d) for d in DATES.values())})[T ]\s*)?{re.sub(r'[?]P<[a-z]+>', '?:', CLOCK)}\s*$"
 )
@@ -40,7 +54,9 @@ class TableHead:
         """Tell whether a column holds numbers."""
         cells = self.cells(column)
         decimal = self.dialect.decimal
-        return any(_is_number(c, decimal) for c in cells) and all(_is_number(c, decimal) or c.lower() in _NO_NUMBER for c in cells)
+        return any(_is_number(c, decimal) for c in cells) and all(
+            _is_number(c, decimal) or c.lower() in _NO_NUMBER for c in cells
+        )
 
     def timestamp(self, column: int) -> str | None:
         """Return the order of the date where a column holds timestamps, or None."""
@@ -65,7 +81,9 @@ def look_at(path: Path) -> TableHead:
         if best is None or score > best[0]:
             best = score, delimiter, decimal, rows
     if best is None or best[0][0] < 2:
-        raise DataError(f"Reading {path}: no rows of numbers were found in its first {len(lines)} lines; is it a recording?")
+        raise DataError(
+            f"Reading {path}: no rows of numbers were found in its first {len(lines)} lines; is it a recording?"
+        )
     _, delimiter, decimal, rows = best
     return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding))
 
@@ -99,7 +117,10 @@ def _head(path: Path) -> bytes:
 def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:
     rows = []
     first, rest = lines[: 20 + ROWS], lines[20 + ROWS :]
-    for line in [*first, *rest[:: max(1, len(rest) // SPREAD)]]:  # machines rest at first, and zeros have no decimal point
+    for line in [
+        *first,
+        *rest[:: max(1, len(rest) // SPREAD)],
+    ]:  # machines rest at first, and zeros have no decimal point
         try:
             rows.append([c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])])
         except csv.Error:
@@ -138,14 +159,26 @@ def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
     first = next(i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data))
     cells = tuple(tuple(rows[i]) for i in data if i >= first)[:ROWS]
     above = [
-        i for i in range(first) if 2 * sum(bool(c) for c in rows[i]) >= sum(bool(c) for c in cells[0]) and abs(len(rows[i]) - width) <= 1
+        i
+        for i in range(first)
+        if 2 * sum(bool(c) for c in rows[i]) >= sum(bool(c) for c in cells[0]) and abs(len(rows[i]) - width) <= 1
     ]
     if not above:
-        return TableHead(replace(dialect, header=False, skip_rows=first), tuple(str(i + 1) for i in range(width)), ("",) * width, cells)
+        return TableHead(
+            replace(dialect, header=False, skip_rows=first),
+            tuple(str(i + 1) for i in range(width)),
+            ("",) * width,
+            cells,
+        )
     header, units = above[-1], [""] * width
     unit_rows = [i for i in above[1:] if is_unit_row(rows[i])]
     if unit_rows:
         header = above[above.index(unit_rows[0]) - 1]
         units = rows[unit_rows[0]]
     fields = tuple((rows[header] + [""] * width)[:width])
-    return TableHead(replace(dialect, skip_rows=header, unit_rows=first - header - 1), fields, tuple((units + [""] * width)[:width]), cells)
+    return TableHead(
+        replace(dialect, skip_rows=header, unit_rows=first - header - 1),
+        fields,
+        tuple((units + [""] * width)[:width]),
+        cells,
+    )

@@ -66,7 +66,9 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     if wanted.files is not None:
         files = {relative: path for relative, path in files.items() if _expression(wanted.files).search(relative)}
     if not files and wanted.files is not None:
-        raise DataError(f"Looking at {source}: no file matches --files {wanted.files!r}; correct the expression, or leave it out.")
+        raise DataError(
+            f"Looking at {source}: no file matches --files {wanted.files!r}; correct the expression, or leave it out."
+        )
     if not files:
         others = Counter(p.suffix.lower() for p in source.rglob("*") if p.is_file() and p.suffix).most_common(1)
         instead = f"save its {others[0][1]} {others[0][0]} files as CSV or Parquet" if others else "check the folder"
@@ -89,9 +91,13 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     mapping |= timing[0]
     notes |= timing[1]
     columns = _decided(columns, wanted, ask)
-    mapping["channel"] = [_channel(c) for c in columns if c.part in (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)]
+    mapping["channel"] = [
+        _channel(c) for c in columns if c.part in (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
+    ]
     excluded = {
-        relative: f"its columns are others than those of {next(iter(own))}" for relative in strange if re.search(mapping["files"], relative)
+        relative: f"its columns are others than those of {next(iter(own))}"
+        for relative in strange
+        if re.search(mapping["files"], relative)
     }
     return _examined(source, mapping, notes, columns, excluded, strange, work)
 
@@ -113,7 +119,9 @@ def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str
         except DataError:
             continue
     if not heads:
-        raise DataError(f"Looking at {paths[0][1].parent}: none of the files looked at holds rows of numbers; check the folder.")
+        raise DataError(
+            f"Looking at {paths[0][1].parent}: none of the files looked at holds rows of numbers; check the folder."
+        )
     commonest = Counter((h.dialect, h.fields) for h in heads).most_common(1)[0][0]
     head = next(h for h in heads if (h.dialect, h.fields) == commonest)
     own, strange = {}, []
@@ -170,7 +178,9 @@ def _columns(
     samples = [s for s in samples if s.shape[1] > 2]
     if not samples:
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
-        raise DataError(f"Looking at {source}: the files looked at have fewer than three rows of numbers; check the folder.")
+        raise DataError(
+            f"Looking at {source}: the files looked at have fewer than three rows of numbers; check the folder."
+        )
     chosen = [described[i] for i in numeric]
     keys: dict[str, Any] = {}
     notes: dict[str, str] = {}
@@ -193,14 +203,21 @@ def _columns(
         found = ", ".join(repr(c.header) for c in described)
         called = next((c.header for c in described if c.kind == "time"), None)
         problem = (
-            "no column increases like time" if called is None else f"{called!r} stands still or runs back in places, as rounded times do"
+            "no column increases like time"
+            if called is None
+            else f"{called!r} stands still or runs back in places, as rounded times do"
         )
-        raise DataError(f"Looking at {source}: {problem}, found the columns {found}; give the sampling period, --period SECONDS.")
+        raise DataError(
+            f"Looking at {source}: {problem}, found the columns {found}; give the sampling period, --period SECONDS."
+        )
     proposed = propose(chosen, samples)
     for place, column in zip(numeric, proposed, strict=True):
         described[place] = column
     rest = {i for i in range(len(described)) if i not in numeric and described[i].part is not ColumnPart.TIME}
-    return [replace(c, why="no numbers") if i in rest else c for i, c in enumerate(described) if head.fields[i]], (keys, notes)
+    return [replace(c, why="no numbers") if i in rest else c for i, c in enumerate(described) if head.fields[i]], (
+        keys,
+        notes,
+    )
 
 
 def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
@@ -238,15 +255,24 @@ def _decided(columns: Sequence[TableColumn], wanted: Wanted, ask: Ask | None) ->
     decided = assign(columns, wanted.measured, wanted.inputs)
     if ask is not None and not (wanted.measured and wanted.inputs):
         decided = list(ask(decided))
-    for part, option, what in ((ColumnPart.MEASURED, "--measured", "a measured state"), (ColumnPart.INPUT, "--input", "an input")):
+    for part, option, what in (
+        (ColumnPart.MEASURED, "--measured", "a measured state"),
+        (ColumnPart.INPUT, "--input", "an input"),
+    ):
         if not any(c.part is part for c in decided):
             names = ", ".join(
-                c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in decided if c.part is not ColumnPart.TIME
+                c.name if c.name == c.header else f"{c.name} ({c.header!r})"
+                for c in decided
+                if c.part is not ColumnPart.TIME
             )
-            raise ConfigError(f"Roles: no column is {what} by its name; name it, {option} NAME. The columns are {names}.")
+            raise ConfigError(
+                f"Roles: no column is {what} by its name; name it, {option} NAME. The columns are {names}."
+            )
     if any(c.part is ColumnPart.STATE for c in decided):
         return decided
-    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # an observer is for what is not measured
+    return [
+        replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided
+    ]  # an observer is for what is not measured
 
 
 def assign(columns: Sequence[TableColumn], measured: Sequence[str], inputs: Sequence[str]) -> list[TableColumn]:
@@ -260,7 +286,9 @@ def assign(columns: Sequence[TableColumn], measured: Sequence[str], inputs: Sequ
             if i in places:
                 decided[i] = replace(column, part=part, why="as you said")
             elif column.part is part:
-                decided[i] = replace(column, part=ColumnPart.STATE if part is ColumnPart.MEASURED else ColumnPart.LEFT_OUT)
+                decided[i] = replace(
+                    column, part=ColumnPart.STATE if part is ColumnPart.MEASURED else ColumnPart.LEFT_OUT
+                )
     return decided
 
 
@@ -270,7 +298,9 @@ def _place(columns: Sequence[TableColumn], name: str) -> int:
             if getattr(column, attribute) == name:
                 return i
     known = [c.name for c in columns]
-    raise ConfigError(f"Roles: there is no column {name!r}{did_you_mean(name, known) or ';'} The columns are {', '.join(known)}.")
+    raise ConfigError(
+        f"Roles: there is no column {name!r}{did_you_mean(name, known) or ';'} The columns are {', '.join(known)}."
+    )
 
 
 def _examined(
@@ -318,7 +348,9 @@ def _examined(
         findings.append(
             f"time is uneven: everything is brought to a period of {found.resample_s:g} s (recorded at about {period:.4g} s){where}"
         )
-    return Discovery(mapping, prepare, tuple(columns), kept, notes, tuple(findings), bool(found.nan), _reading(kept, source))
+    return Discovery(
+        mapping, prepare, tuple(columns), kept, notes, tuple(findings), bool(found.nan), _reading(kept, source)
+    )
 
 
 def _reading(population: Population, source: Path) -> str:
@@ -350,7 +382,9 @@ def _too_few(population: Population, found: Examined) -> list[str]:
             f"one unit ({units[0]}): models can be identified (kros run ... --until identify), and a population takes at least two"
         )
     elif len(units) < 4:
-        texts.append(f"{len(units)} units: what differs between units is hardly known from so few, and no outlier can be told")
+        texts.append(
+            f"{len(units)} units: what differs between units is hardly known from so few, and no outlier can be told"
+        )
     if counts and min(counts.values()) < 4:
         (unit, condition), n = min(counts.items(), key=lambda item: item[1])
         texts.append(f"few episodes: unit {unit} ({condition}) has {n}, one of them for testing")

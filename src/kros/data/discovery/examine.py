@@ -21,7 +21,10 @@ from ..recording import TIME_TOLERANCE, title, usable
 
 Array = npt.NDArray[np.float64]
 GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
-MANY, BRIDGED = 5, 50.0  # where a fifth of the episodes or more have gaps, those of up to so many median steps are bridged
+MANY, BRIDGED = (
+    5,
+    50.0,
+)  # where a fifth of the episodes or more have gaps, those of up to so many median steps are bridged
 _LONG_REST = 0.2  # of an episode, from which on a signal that stands still while others move is worth a word
 _SLOWER = 1.5
 
@@ -35,9 +38,13 @@ class EpisodeLook:
     doubts: tuple[str, ...] = ()  # what is odd about it
     n_samples: int = 0
     period_s: float = np.nan  # median step of time; NaN where there is no column of time
-    uneven: tuple[float, int] | None = None  # largest relative deviation of a step of time, and the sample before it, where time is uneven
+    uneven: tuple[float, int] | None = (
+        None  # largest relative deviation of a step of time, and the sample before it, where time is uneven
+    )
     nan: bool = False
-    gap: tuple[float, int] | None = None  # or None; Longest step of time, s, where it is a gap, and the sample before it
+    gap: tuple[float, int] | None = (
+        None  # or None; Longest step of time, s, where it is a gap, and the sample before it
+    )
     digest: str = ""
     alerts: tuple[str, ...] = ()
 
@@ -50,7 +57,9 @@ class Examined:
     doubts: tuple[str, ...]  # what else looks wrong
     resample_s: float | None  # period to resample to, where time is uneven
     nan: tuple[EpisodeKey, ...]  # episodes with NaN or infinity
-    counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # episodes that can be used, by unit and condition
+    counts: Counter[tuple[str, str]] = field(
+        default_factory=Counter
+    )  # episodes that can be used, by unit and condition
     shortest: int = 0  # samples of the shortest of them
     max_gap_s: float | None = None  # longest gap to bridge, where many episodes have gaps
     uneven: tuple[EpisodeKey, int] | None = None  # where time is most uneven
@@ -63,10 +72,18 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     wrong = {s.key: s.wrong for s in seen if s.wrong}
     good = [s for s in seen if not s.wrong]
     median = float(np.median([s.period_s for s in good])) if good else np.nan
-    slow = {s.key: f"sampled every {s.period_s:.3g} s, the others every {median:.3g} s" for s in good if s.period_s > _SLOWER * median}
+    slow = {
+        s.key: f"sampled every {s.period_s:.3g} s, the others every {median:.3g} s"
+        for s in good
+        if s.period_s > _SLOWER * median
+    }
     wrong |= slow
     broken = {s.key: s.gap for s in good if s.gap is not None and s.key not in wrong}
-    bridged = max((g for g, _ in broken.values() if g <= BRIDGED * median), default=0.0) if MANY * len(broken) > len(good) else 0.0
+    bridged = (
+        max((g for g, _ in broken.values() if g <= BRIDGED * median), default=0.0)
+        if MANY * len(broken) > len(good)
+        else 0.0
+    )
     wrong |= {key: f"a gap of {g:.3g} s after sample {k}" for key, (g, k) in broken.items() if g > bridged}
     good = [s for s in good if s.key not in wrong]
     for key, other in copies_among((s.key, s.digest) for s in good if s.digest):
@@ -76,7 +93,9 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     resample = float(f"{median:.3g}") if any(s.uneven is not None for s in good) or different else None
     n_bridged = sum(s.gap is not None for s in good)
     told = (
-        [f"{n_bridged} episodes have gaps, of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"] if n_bridged else []
+        [f"{n_bridged} episodes have gaps, of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"]
+        if n_bridged
+        else []
     )
     doubts = told + [d for s in good for d in s.doubts] + list(dict.fromkeys(a for s in good for a in s.alerts))
     max_gap = float(f"{1.01 * bridged:.3g}") if n_bridged else None
@@ -84,7 +103,9 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     shortest = min((s.n_samples for s in good), default=0)
     worst = max((s for s in good if s.uneven is not None), key=lambda s: s.uneven or (0.0, 0), default=None)
     uneven = None if worst is None or worst.uneven is None else (worst.key, worst.uneven[1])
-    return Examined(wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap, uneven)
+    return Examined(
+        wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap, uneven
+    )
 
 
 def _look(population: Population) -> list[EpisodeLook]:
@@ -95,16 +116,24 @@ def _look(population: Population) -> list[EpisodeLook]:
     for i, key in enumerate(population.episodes):
         try:
             if recordings is None:
-                found.append(_looked(key, population.source(key), None, population.columns, population.sample_period_s, i == 0))
+                found.append(
+                    _looked(key, population.source(key), None, population.columns, population.sample_period_s, i == 0)
+                )
             else:
                 recording = recordings(key)
-                found.append(_looked(key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0))
+                found.append(
+                    _looked(
+                        key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0
+                    )
+                )
         except DataError as error:
             found.append(EpisodeLook(key, str(error)))
     return found
 
 
-def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool) -> EpisodeLook:
+def _looked(
+    key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool
+) -> EpisodeLook:
     n = len(values)
     if n < MIN_SAMPLES:
         return EpisodeLook(key, f"has {n} samples", n_samples=n)
@@ -128,16 +157,22 @@ def _looked(key: EpisodeKey, values: Array, time: Array | None, channels: Sequen
     if not usable(values).all():
         bad = np.count_nonzero(~usable(values), axis=0)
         names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
-        return EpisodeLook(key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap)
+        return EpisodeLook(
+            key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap
+        )
     check_range(values, key, channels)
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
         stuck = channels[still[0]].name
         return EpisodeLook(
-            key, f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor", n_samples=n
+            key,
+            f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor",
+            n_samples=n,
         )
     alerts = period_alerts(values, channels, period) if first else ()
-    return EpisodeLook(key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, digest_of(values), alerts)
+    return EpisodeLook(
+        key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, digest_of(values), alerts
+    )
 
 
 def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:

@@ -26,7 +26,9 @@ load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet 
 belastet unbelastet mitlast charge vide froid chaud forward reverse
 """
 _CONDITIONS = set(_STATES.split())
-_MEASURE = re.compile(r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE)
+_MEASURE = re.compile(
+    r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE
+)
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 
 
@@ -50,7 +52,10 @@ def infer_names(paths: Sequence[str]) -> FileNames:
         pattern = _pattern(rows, marks, roles, ending)
         if _tells_apart(pattern, paths):
             numbered = (
-                not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles) and _counts([r[roles.index(UNIT)] for r in rows])
+                not sure
+                and roles.count(UNIT) == 1
+                and not {EPISODE, GROUP} & set(roles)
+                and _counts([r[roles.index(UNIT)] for r in rows])
             )
             other = [EPISODE if r == UNIT else r for r in roles]
             return FileNames(pattern, sure, _pattern(rows, marks, other, ending) if numbered else None)
@@ -125,20 +130,29 @@ def _roles(rows: list[list[str]], marks: list[list[str]]) -> tuple[list[str | No
     for i in varying:
         roles[i] = _told(columns, i)
     for i in range(len(columns) - 2):  # 2024-05-31
-        if all(all(re.fullmatch(p, v) for v in columns[i + k]) for k, p in enumerate((r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*"))):
+        if all(
+            all(re.fullmatch(p, v) for v in columns[i + k])
+            for k, p in enumerate((r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*"))
+        ):
             for k in set(varying) & {i, i + 1, i + 2}:
                 roles[k] = EPISODE
     for i in varying:  # box1/box1_03
         if roles[i] is None and any(j < i and columns[i] == columns[j] for j in varying):
             roles[i] = "other"
     if UNIT not in roles:  # motor00_01 and motor00_02 are two episodes
-        named = [i for i, c in enumerate(columns) if len(set(c)) == 1 and re.search(r"\d", c[0]) and _told(columns, i) == UNIT]
+        named = [
+            i
+            for i, c in enumerate(columns)
+            if len(set(c)) == 1 and re.search(r"\d", c[0]) and _told(columns, i) == UNIT
+        ]
         for i in named[:1] if varying else ():
             roles[i] = UNIT
     left = [i for i in varying if roles[i] is None]
     units = [i for i in varying if roles[i] is UNIT] or [i for i in left if len(set(columns[i])) < len(rows)]
     for i in left:
-        if any(j > i and _nested(columns, i, j) for j in units):  # good/act1, faulty/act3: two labels, and not two units
+        if any(
+            j > i and _nested(columns, i, j) for j in units
+        ):  # good/act1, faulty/act3: two labels, and not two units
             roles[i] = GROUP
     left = [i for i in left if roles[i] is None]
     if left:

@@ -116,7 +116,14 @@ def to_radians(unit: str) -> tuple[float, str] | None:
 
 def unit_of_factor(factor: float, unit: str) -> str:
     """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
-    return next((name for name, (size, base) in _TO_RADIANS.items() if base == unit and math.isclose(size, factor, rel_tol=1e-6)), "")
+    return next(
+        (
+            name
+            for name, (size, base) in _TO_RADIANS.items()
+            if base == unit and math.isclose(size, factor, rel_tol=1e-6)
+        ),
+        "",
+    )
 
 
 def identifier(text: str, taken: Sequence[str] = ()) -> str:
@@ -125,7 +132,9 @@ def identifier(text: str, taken: Sequence[str] = ()) -> str:
         return text
     spelled = text
     for letter, plain in zip(
-        "äöüßÄÖÜΔωφθατ", ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "d", "omega", "phi", "theta", "alpha", "tau"), strict=True
+        "äöüßÄÖÜΔωφθατ",
+        ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "d", "omega", "phi", "theta", "alpha", "tau"),
+        strict=True,
     ):
         spelled = spelled.replace(letter, plain)
     ascii_text = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode().lower()

@@ -97,14 +97,20 @@ def kind_of(name: str, unit: str = "") -> str:
 
 def is_commanded(name: str) -> bool:
     """Tell whether a name speaks of a command."""
-    return any(_OF_WORD.get(w) == "input" for w in _words_of(name)) or any(w.startswith("soll") for w in _words_of(name))
+    return any(_OF_WORD.get(w) == "input" for w in _words_of(name)) or any(
+        w.startswith("soll") for w in _words_of(name)
+    )
 
 
 def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
     rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
     called = [i for i in rising if columns[i].kind == "time"]
-    even = [i for i in rising if i not in called and all(_is_even(s[i]) for s in samples) and not all(_counts(s[i]) for s in samples)]
+    even = [
+        i
+        for i in rising
+        if i not in called and all(_is_even(s[i]) for s in samples) and not all(_counts(s[i]) for s in samples)
+    ]
     return called + even
 
 
@@ -171,4 +177,6 @@ def _by_name(column: TableColumn) -> TableColumn:
         return replace(column, part=ColumnPart.INPUT, why="a command or a voltage, by name and unit")
     if column.kind in ("angle", "position", *_HIDDEN):
         return replace(column, part=ColumnPart.STATE, why=f"{column.kind}, by name or unit")
-    return replace(column, part=ColumnPart.LEFT_OUT, why="a second column of time" if column.kind == "time" else UNKNOWN)
+    return replace(
+        column, part=ColumnPart.LEFT_OUT, why="a second column of time" if column.kind == "time" else UNKNOWN
+    )

@@ -50,7 +50,10 @@ def declare_channels(
             f"{what}: measured should name the states that a running observer will be given, found {list(measured)} for the states "
             f"{list(states)}; name one of them at least."
         )
-    return (*(Channel(s, Role.STATE, measured=s in measured) for s in states), *(Channel(u, Role.INPUT) for u in inputs))
+    return (
+        *(Channel(s, Role.STATE, measured=s in measured) for s in states),
+        *(Channel(u, Role.INPUT) for u in inputs),
+    )
 
 
 def from_arrays(
@@ -109,7 +112,8 @@ def from_arrays(
     columns = columns_in_order(declared)
     order = [declared.index(c) for c in columns]
     found = {
-        key: (np.ascontiguousarray(_samples(key, e, declared)[:, order]), None) for key, e in _episodes(data, {c.name for c in declared})
+        key: (np.ascontiguousarray(_samples(key, e, declared)[:, order]), None)
+        for key, e in _episodes(data, {c.name for c in declared})
     }
     return assemble(ArrayRecordings(found), columns, units, sample_period_s, metadata)
 
@@ -118,7 +122,9 @@ def as_numbers(values: Any) -> npt.NDArray[np.float64]:
     """Return an array of doubles; text, complex numbers and dates are refused rather than converted."""
     found = np.asarray(values)
     kind = found.dtype.kind
-    if kind not in "biufO" or (kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in found.ravel().tolist())):
+    if kind not in "biufO" or (
+        kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in found.ravel().tolist())
+    ):
         raise TypeError(f"{'text or complex numbers' if kind == 'O' else found.dtype} cannot be used as real numbers")
     return np.asarray(found, dtype=float)
 
@@ -129,7 +135,9 @@ def _named(items: Any) -> Iterator[tuple[Any, Any]]:
     elif isinstance(items, Iterable) and not isinstance(items, str | bytes) and getattr(items, "shape", True):
         yield from ((str(i), item) for i, item in enumerate(items))
     else:
-        raise DataError(f"from_arrays needs mappings or lists of episodes, found {shortened(repr(items))}; see its documentation.")
+        raise DataError(
+            f"from_arrays needs mappings or lists of episodes, found {shortened(repr(items))}; see its documentation."
+        )
 
 
 def _episodes(data: Any, channels: set[str]) -> Iterator[tuple[EpisodeKey, Any]]:
@@ -143,9 +151,13 @@ def _episodes(data: Any, channels: set[str]) -> Iterator[tuple[EpisodeKey, Any]]
             yield unit, of_unit
         elif isinstance(of_unit, Mapping) and any(holds_episodes(v) for v in of_unit.values()):
             for condition, episodes in of_unit.items():
-                yield from ((EpisodeKey(str(unit), str(condition), str(name)), episode) for name, episode in _named(episodes))
+                yield from (
+                    (EpisodeKey(str(unit), str(condition), str(name)), episode) for name, episode in _named(episodes)
+                )
         else:
-            yield from ((EpisodeKey(str(unit), DEFAULT_CONDITION, str(name)), episode) for name, episode in _named(of_unit))
+            yield from (
+                (EpisodeKey(str(unit), DEFAULT_CONDITION, str(name)), episode) for name, episode in _named(of_unit)
+            )
 
 
 def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> npt.NDArray[np.float64]:
@@ -153,7 +165,9 @@ def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> npt.
     if isinstance(episode, Mapping):
         missing = [name for name in names if name not in episode]
         if missing:
-            raise DataError(f"{title(key)}: channel {missing[0]!r} is missing, found {list(episode)}; add it, or correct the names.")
+            raise DataError(
+                f"{title(key)}: channel {missing[0]!r} is missing, found {list(episode)}; add it, or correct the names."
+            )
         episode = tuple(episode[name] for name in names)
     try:
         parts = [as_numbers(part) for part in (episode if isinstance(episode, tuple) else (episode,))]

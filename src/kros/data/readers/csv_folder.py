@@ -87,7 +87,9 @@ def _latest(recordings: CsvRecordings, place: FilePlace, *version: int) -> npt.N
     return _kept["latest"][1]
 
 
-def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()) -> Population:
+def read_csv_folder(
+    source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()
+) -> Population:
     """Read a folder of CSV files (also gzip-compressed), or of anybody's Parquet files."""
     chosen, source = load_mapping(mapping), Path(source)
     dialect = chosen.dialect
@@ -113,20 +115,28 @@ def read_csv_folder(source: Path | str, mapping: CsvMapping | Mapping[str, Any] 
                 check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
                 places[key] = replace(place, piece=(i, chosen.pieces))
             if groups.setdefault(key.unit, group) != group:
-                raise DataError(f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}); a unit has one group.")
+                raise DataError(
+                    f"Unit {key.unit} is in both groups {groups[key.unit]!r} and {group!r} ({path}); a unit has one group."
+                )
     if not places:
-        raise DataError(f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression.")
+        raise DataError(
+            f"Reading {source} as csv: no file matches files = {chosen.files!r}{_sample(source)}; correct the expression."
+        )
     recordings = CsvRecordings(places, dialect, None if chosen.time is None else chosen.time_scale, chosen.timestamp)
     units = [Unit(unit, group) for unit, group in groups.items()]
     period = chosen.sample_period_s
-    return assemble(recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, scaling=chosen.scaling)
+    return assemble(
+        recordings, chosen.channels, units, period, chosen.metadata, steps=chosen.steps, scaling=chosen.scaling
+    )
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     columns = {(c.name, mapping.column(c, unit)) for c in spared for unit in mapping.units}
-    absent = {name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)}
+    absent = {
+        name for name, column in columns if (column > len(fields) if isinstance(column, int) else column not in fields)
+    }
     return absent | {c.name for c in mapping.channel if c.of in absent}
 
 
@@ -151,7 +161,13 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         else:
             other.append(relative)
     if other:
-        log.warning("%d files in %s do not match files = %r and are left alone: %s.", len(other), source, mapping.files, some(other))
+        log.warning(
+            "%d files in %s do not match files = %r and are left alone: %s.",
+            len(other),
+            source,
+            mapping.files,
+            some(other),
+        )
 
 
 def _sample(source: Path) -> str:
@@ -176,11 +192,15 @@ def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping
 def _position(path: Path, fields: list[str], column: Column | None) -> int:
     if isinstance(column, int):
         if column > len(fields):
-            raise DataError(f"Reading {path}: column {column} is asked for, found {len(fields)} columns; correct the mapping or the file.")
+            raise DataError(
+                f"Reading {path}: column {column} is asked for, found {len(fields)} columns; correct the mapping or the file."
+            )
         return column - 1
     if fields.count(str(column)) != 1:
         problem = (
-            f"is missing{did_you_mean(column, fields) or ','}" if column not in fields else f"occurs {fields.count(str(column))} times,"
+            f"is missing{did_you_mean(column, fields) or ','}"
+            if column not in fields
+            else f"occurs {fields.count(str(column))} times,"
         )
         raise DataError(f"Reading {path}: column {column!r} {problem} found {fields}; correct the mapping or the file.")
     return fields.index(str(column))

@@ -151,7 +151,9 @@ class CsvMapping:
             raise ConfigError(f"CSV mapping: delimiter and decimal should be {wanted}, found {found}; correct them.")
         for name, least in (("skip_rows", 0), ("unit_rows", 0), ("pieces", 1)):
             if getattr(self, name) < least:
-                raise ConfigError(f"CSV mapping: {name} should be at least {least}, found {getattr(self, name)}; correct it.")
+                raise ConfigError(
+                    f"CSV mapping: {name} should be at least {least}, found {getattr(self, name)}; correct it."
+                )
         _check_encoding(self.encoding)
         if not self.channel:
             raise ConfigError("CSV mapping: there is no [[channel]]; declare each channel with name, column and role.")
@@ -180,14 +182,18 @@ class CsvMapping:
             ) from error
         unknown = sorted(set(found) - set(GROUPS))
         if unknown:
-            raise ConfigError(f"CSV mapping: {name} names the group {unknown[0]!r}; known groups are {', '.join(GROUPS)}.")
+            raise ConfigError(
+                f"CSV mapping: {name} names the group {unknown[0]!r}; known groups are {', '.join(GROUPS)}."
+            )
 
     def _check_columns(self) -> None:
         names = [c.name for c in self.channel]
         for unit in self.units:
             unknown = sorted(set(unit.columns) - set(names))
             if unknown:
-                raise ConfigError(f"CSV mapping: [[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; the channels are {names}.")
+                raise ConfigError(
+                    f"CSV mapping: [[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; the channels are {names}."
+                )
         used = [self.time, *(self.column(c, u) for u in self.units for c in self.channel)]
         for column in used:
             if isinstance(column, int) and column < 1:
@@ -215,7 +221,10 @@ class CsvMapping:
     @property
     def steps(self) -> tuple[Step, ...]:
         """Scaling as declared per channel, then the mapping's own steps."""
-        return (*(Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1), *parse_steps(self.prepare, "CSV mapping: prepare"))
+        return (
+            *(Scale((c.name,), c.scale) for c in self.ordered if c.scale != 1),
+            *parse_steps(self.prepare, "CSV mapping: prepare"),
+        )
 
     @property
     def scaling(self) -> dict[str, Scaling]:
@@ -226,7 +235,9 @@ class CsvMapping:
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
         units = tuple(replace(u, columns={k: v for k, v in u.columns.items() if k not in names}) for u in self.unit)
-        steps = tuple(step for s in parse_steps(self.prepare, "CSV mapping: prepare") if (step := s.without(names)) is not None)
+        steps = tuple(
+            step for s in parse_steps(self.prepare, "CSV mapping: prepare") if (step := s.without(names)) is not None
+        )
         return replace(self, channel=tuple(c for c in self.channel if c.name not in names), unit=units, prepare=steps)
 
     def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:

@@ -75,9 +75,13 @@ class LimitedFile:
                 "the file and its line ends."
             )
         if b"\r" in line.removesuffix(b"\r\n").removesuffix(b"\r"):
-            raise DataError(f"Reading {self._path}: lines end with CR alone, as on old systems; convert the line ends to LF or CR LF.")
+            raise DataError(
+                f"Reading {self._path}: lines end with CR alone, as on old systems; convert the line ends to LF or CR LF."
+            )
         if b"\0" in line:
-            raise DataError(f"Reading {self._path}: holds NUL bytes, so it is binary or UTF-16; convert it to text in UTF-8.")
+            raise DataError(
+                f"Reading {self._path}: holds NUL bytes, so it is binary or UTF-16; convert it to text in UTF-8."
+            )
         return line
 
     def close(self) -> None:
@@ -135,7 +139,9 @@ def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
 
 def _fields(line: str, path: Path, dialect: Dialect) -> list[str]:
     try:
-        return [part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True), [])]
+        return [
+            part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True), [])
+        ]
     except csv.Error as error:
         raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
 
@@ -190,7 +196,11 @@ def _skip(file: LimitedFile, lines: int, path: Path) -> None:
 def _text(line: bytes, path: Path, encoding: str) -> str:
     named = encoding if _has_ascii(encoding) else "utf-8"
     try:
-        return line.decode("utf-8-sig" if codecs.lookup(named).name == "utf-8" else named).rstrip("\r\n").removeprefix("\ufeff")
+        return (
+            line.decode("utf-8-sig" if codecs.lookup(named).name == "utf-8" else named)
+            .rstrip("\r\n")
+            .removeprefix("\ufeff")
+        )
     except UnicodeDecodeError as error:
         raise DataError(
             f"Reading {path}: its first line is not {encoding.upper()} ({error}); name the encoding, such as cp1252."

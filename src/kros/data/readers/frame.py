@@ -73,16 +73,22 @@ def from_frame(
     """
     _require_frame(frame)
     if (time is None) == (sample_period_s is None):
-        raise DataError(f"from_frame needs one of time and sample_period_s, found time = {time!r}, sample_period_s = {sample_period_s!r}.")
+        raise DataError(
+            f"from_frame needs one of time and sample_period_s, found time = {time!r}, sample_period_s = {sample_period_s!r}."
+        )
     ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
     required = [unit, *([] if time is None else [time]), *(c.name for c in ordered)]
     columns = list(frame.columns)
     missing = [name for name in required if name not in columns]
     if missing:
-        raise DataError(f"from_frame: column {missing[0]!r} is missing, found {columns}; rename a column or correct the channels.")
+        raise DataError(
+            f"from_frame: column {missing[0]!r} is missing, found {columns}; rename a column or correct the channels."
+        )
     twice = [name for name in (*required, condition, episode) if name is not None and columns.count(name) > 1]
     if twice:
-        raise DataError(f"from_frame: column {twice[0]!r} occurs {columns.count(twice[0])} times in {columns}; rename or drop the others.")
+        raise DataError(
+            f"from_frame: column {twice[0]!r} occurs {columns.count(twice[0])} times in {columns}; rename or drop the others."
+        )
     ids = zip(_ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0"), strict=True)
     numbers = _numbers(frame, [c.name for c in ordered])
     times = None if time is None else _numbers(frame, [time])[:, 0]
@@ -107,7 +113,9 @@ def _require_frame(frame: Any) -> None:
             "from_frame needs pandas, which is not installed; install it (pip install pandas), or use from_arrays."
         ) from error
     if not isinstance(frame, pd.DataFrame):
-        raise DataError(f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays for arrays.")
+        raise DataError(
+            f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays for arrays."
+        )
 
 
 def _ids(frame: Any, column: str | None, default: str) -> list[str]:

@@ -68,7 +68,9 @@ class RawRecordings(Recordings):
     def read(self, key: EpisodeKey, place: str) -> Recording:
         """Return one episode as recorded."""
         columns = read_columns(Path(place), COLUMNS, COLUMNS)
-        return Recording(key, np.ascontiguousarray(columns[1:].T), np.where(usable(columns[0]), columns[0], np.nan) * self.time_scale)
+        return Recording(
+            key, np.ascontiguousarray(columns[1:].T), np.where(usable(columns[0]), columns[0], np.nan) * self.time_scale
+        )
 
 
 def find_root(source: Path) -> Path | None:
@@ -82,7 +84,9 @@ def find_root(source: Path) -> Path | None:
 def is_raw_layout(source: Path) -> bool:
     """Tell whether some folder in ``population`` or ``outliers`` is named as a recording of the raw layout: other layouts use these words too."""
     root = find_root(source)
-    folders = (path for group in GROUPS if root is not None and (root / group).is_dir() for path in (root / group).iterdir())
+    folders = (
+        path for group in GROUPS if root is not None and (root / group).is_dir() for path in (root / group).iterdir()
+    )
     return any(path.is_dir() and FOLDER.fullmatch(path.name) is not None for path in folders)
 
 
@@ -99,17 +103,23 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     for group, path, match in _folders(root):
         unit = match["unit"]
         if groups.setdefault(unit, group) != group:
-            raise DataError(f"Unit {unit} is in both groups {groups[unit]!r} and {group!r} of {root}; move its folders to one of them.")
+            raise DataError(
+                f"Unit {unit} is in both groups {groups[unit]!r} and {group!r} of {root}; move its folders to one of them."
+            )
         for episode, file in _episodes(path):
             key = EpisodeKey(unit, match["condition"], episode)
             if key in files:
-                raise DataError(f"Duplicate episodes: {key} is in {files[key]} and in {file}; remove or renumber one of them.")
+                raise DataError(
+                    f"Duplicate episodes: {key} is in {files[key]} and in {file}; remove or renumber one of them."
+                )
             files[key] = file
     for file in files.values():
         _check_header(Path(file))
     units = [Unit(unit, group) for unit, group in groups.items()]
     if not files:
-        raise DataError(f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path.")
+        raise DataError(
+            f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path."
+        )
     recordings = RawRecordings(files, _time_scale(RawRecordings(files)(min(files, key=episode_order))))
     scaling = {name: Scaling(number + 1) for number, name in enumerate(COLUMNS) if number}
     return assemble(recordings, CHANNELS, units, metadata=METADATA, steps=STEPS, scaling=scaling)
@@ -122,7 +132,9 @@ def _time_scale(first: Recording) -> float:
         if math.isclose(period * scale, PERIOD_S, rel_tol=0.01):
             return scale
     logger.warning(
-        "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples.", period, first.key
+        "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples.",
+        period,
+        first.key,
     )
     return 1.0
 

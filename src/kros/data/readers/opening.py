@@ -102,7 +102,9 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
     if not source.exists():
         raise DataError(f"Reading {source}: there is no such folder; check data.source (relative to the study file).")
     if not source.is_dir():
-        raise DataError(f"Reading {source}: this is a file, and recordings are a folder; give the folder that holds it.")
+        raise DataError(
+            f"Reading {source}: this is a file, and recordings are a folder; give the folder that holds it."
+        )
     if not any(source.iterdir()):
         raise DataError(f"Reading {source}: the folder is empty; check data.source or record something.")
     if reader == "csv" or (reader is None and with_mapping):

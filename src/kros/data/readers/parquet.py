@@ -80,10 +80,15 @@ class ParquetRecordings(Recordings):
         version = (file.st_ino, file.st_size, file.st_mtime_ns)  # a file written anew is read anew
         return Recording(
             key,
-            _KEPT.take((str(path), version, group, samples, key, self.columns), lambda: self._values(key, path, version, group, samples)),
+            _KEPT.take(
+                (str(path), version, group, samples, key, self.columns),
+                lambda: self._values(key, path, version, group, samples),
+            ),
         )
 
-    def _values(self, key: EpisodeKey, path: Path, version: Version, group: int, samples: int) -> npt.NDArray[np.float64]:
+    def _values(
+        self, key: EpisodeKey, path: Path, version: Version, group: int, samples: int
+    ) -> npt.NDArray[np.float64]:
         """Return the samples of an episode from its file."""
         try:
             table = _read_group(path, version, group, samples, [*KEYS, *self.columns])
@@ -95,9 +100,19 @@ class ParquetRecordings(Recordings):
                 _check_label(table.column(label), label, expected, path)
         except DataError:
             raise
-        except (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError) as error:  # and Arrow's own
+        except (
+            OSError,
+            ValueError,
+            LookupError,
+            TypeError,
+            ArithmeticError,
+            NotImplementedError,
+            MemoryError,
+        ) as error:  # and Arrow's own
             pass_on_shortage(error, path)
-            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again.") from error
+            raise DataError(
+                f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again."
+            ) from error
         return values
 
 
@@ -114,20 +129,26 @@ def _read_group(path: Path, version: Version, group: int, samples: int, columns:
     from pyarrow import parquet
 
     about = _metadata(path, version)
-    with parquet.ParquetFile(path, metadata=about, memory_map=True, pre_buffer=False, page_checksum_verification=True) as file:
+    with parquet.ParquetFile(
+        path, metadata=about, memory_map=True, pre_buffer=False, page_checksum_verification=True
+    ) as file:
         found = file.metadata.row_group(group).num_rows
         if found != samples:
             raise DataError(
                 f"Reading {path}: {samples} samples are expected in row group {group}, found {found}; convert the recordings again."
             )
         if samples > limits.MAX_SAMPLES:
-            raise DataError(f"Reading {path}: an episode has {samples} samples; cut it, or raise MAX_SAMPLES in kros.core.limits.")
+            raise DataError(
+                f"Reading {path}: an episode has {samples} samples; cut it, or raise MAX_SAMPLES in kros.core.limits."
+            )
         schema = file.schema_arrow
         for name in columns:
             kind = str(schema.field(name).type)
             if (name in KEYS and "string" not in kind) or (name not in KEYS and kind != "double"):
                 wanted = "text" if name in KEYS else "numbers of type double"
-                raise DataError(f"Reading {path}: column {name!r} should hold {wanted}, found {kind}; convert the recordings again.")
+                raise DataError(
+                    f"Reading {path}: column {name!r} should hold {wanted}, found {kind}; convert the recordings again."
+                )
         return file.read_row_group(group, columns=columns, use_threads=False)
 
 
@@ -172,8 +193,12 @@ def read_parquet(folder: Path | str) -> Population:
     """
     content, _ = load_artifact(Path(folder), INDEX)
     try:
-        channels = tuple(Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"])
-        channels += tuple(TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ()))
+        channels = tuple(
+            Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"]
+        )
+        channels += tuple(
+            TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ())
+        )
         channels = columns_in_order(channels)
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
@@ -188,7 +213,9 @@ def read_parquet(folder: Path | str) -> Population:
         ) from error
     missing = sorted({name for name, _, _ in places.values() if not (Path(folder) / name).is_file()})
     if missing:
-        raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; convert the recordings again.")
+        raise DataError(
+            f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; convert the recordings again."
+        )
     recordings = ParquetRecordings(places, str(folder), tuple(c.name for c in channels))
     return assemble(recordings, channels, units, period, metadata, scaling=scaling)
 

@@ -25,7 +25,9 @@ def parquet_fields(path: Path) -> list[str]:
     try:
         return list(parquet.read_schema(path).names)
     except (OSError, ValueError) as error:
-        raise DataError(f"Reading {path}: no Parquet file that can be read ({shortened(str(error))}); check the file.") from error
+        raise DataError(
+            f"Reading {path}: no Parquet file that can be read ({shortened(str(error))}); check the file."
+        ) from error
 
 
 def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) -> npt.NDArray[np.float64]:
@@ -36,7 +38,9 @@ def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) 
     require_regular(path, sys.maxsize)
     try:
         if parquet.read_metadata(path).num_rows > limits.MAX_SAMPLES:
-            raise DataError(f"Reading {path}: has more than {limits.MAX_SAMPLES} rows; cut it, or raise MAX_SAMPLES in kros.core.limits.")
+            raise DataError(
+                f"Reading {path}: has more than {limits.MAX_SAMPLES} rows; cut it, or raise MAX_SAMPLES in kros.core.limits."
+            )
         table = parquet.ParquetFile(path).read(columns=list(wanted), use_threads=False)
         values = np.empty((len(wanted), table.num_rows))
         for i, name in enumerate(wanted):
@@ -65,5 +69,7 @@ def parquet_head(path: Path) -> tuple[list[str], list[tuple[str, ...]]]:
 
     fields = parquet_fields(path)
     batch = next(parquet.ParquetFile(path).iter_batches(batch_size=60), None)
-    columns = [] if batch is None else [["" if v is None else str(v) for v in column.to_pylist()] for column in batch.columns]
+    columns = (
+        [] if batch is None else [["" if v is None else str(v) for v in column.to_pylist()] for column in batch.columns]
+    )
     return fields, list(zip(*columns, strict=True))

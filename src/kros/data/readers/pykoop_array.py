@@ -68,8 +68,12 @@ def from_pykoop(
     n_columns = widths[0] - 1
     if len(widths) > 1 or n_columns < 1 or not 0 <= n_inputs < n_columns:
         shapes = [x.shape for x in arrays.values()]
-        raise DataError(f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found {shapes[:5]}; check n_inputs.")
-    states, inputs = ([f"{letter}{i}" for i in range(count)] for letter, count in (("x", n_columns - n_inputs), ("u", n_inputs)))
+        raise DataError(
+            f"from_pykoop: needs arrays (n_samples, 1 + states + {n_inputs}) of one width, found {shapes[:5]}; check n_inputs."
+        )
+    states, inputs = (
+        [f"{letter}{i}" for i in range(count)] for letter, count in (("x", n_columns - n_inputs), ("u", n_inputs))
+    )
     named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
     episodes = {EpisodeKey(u, DEFAULT_CONDITION, name): part for u, x in arrays.items() for name, part in _split(u, x)}
     return from_arrays(episodes, named, sample_period_s)
@@ -106,7 +110,11 @@ def _split(unit: str, x: npt.NDArray[Any]) -> Iterable[tuple[str, npt.NDArray[np
     starts = [name for i, name in enumerate(ids) if i == 0 or name != ids[i - 1]]
     if len(starts) > len(set(starts)):
         again = next(name for i, name in enumerate(starts) if name in starts[:i])
-        log.warning("from_pykoop: rows of episode %s of unit %s do not stand together; they are joined in their order", again, unit)
+        log.warning(
+            "from_pykoop: rows of episode %s of unit %s do not stand together; they are joined in their order",
+            again,
+            unit,
+        )
     column = np.array(ids, dtype=object)
     for name in dict.fromkeys(ids):
         yield name, values[column == name]
@@ -134,4 +142,6 @@ def _numbers(unit: str, x: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
     try:
         return as_numbers(x)
     except (TypeError, ValueError, OverflowError) as error:
-        raise DataError(f"from_pykoop: states and inputs of unit {unit} should be numbers ({error}); convert them.") from error
+        raise DataError(
+            f"from_pykoop: states and inputs of unit {unit} should be numbers ({error}); convert them."
+        ) from error

@@ -34,10 +34,14 @@ def seconds_of(column: Any, order: str) -> npt.NDArray[np.float64]:
         numbers = pc.cast(pc.if_else(pc.equal(cells, ""), default, cells), pa.int64()).to_numpy(zero_copy_only=False)
         return np.asarray(numbers, dtype=np.int64)
 
-    months = (number("year", "1970") - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (number("month", "1") - 1)
+    months = (number("year", "1970") - 1970).astype("datetime64[Y]").astype("datetime64[M]") + (
+        number("month", "1") - 1
+    )
     days = (months.astype("datetime64[D]") + (number("day", "1") - 1)).astype(np.int64)
     fraction = pc.fill_null(pc.struct_field(parts, "fraction"), "")
-    nanoseconds = np.asarray(pc.cast(pc.utf8_rpad(fraction, 9, "0"), pa.int64()).to_numpy(zero_copy_only=False), dtype=np.int64)
+    nanoseconds = np.asarray(
+        pc.cast(pc.utf8_rpad(fraction, 9, "0"), pa.int64()).to_numpy(zero_copy_only=False), dtype=np.int64
+    )
     whole = ((days * 24 + number("hour")) * 60 + number("minute")) * 60 + number("second")
     good = np.flatnonzero(~bad)
     since = 10**9 * (whole - (whole[good[0]] if good.size else 0)) + nanoseconds

@@ -85,7 +85,11 @@ class Resample(Step):
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the recording on the new grid, which starts at its first sample."""
-        time: Float = np.arange(len(recording.values), dtype=np.float64) * period_s if recording.time_s is None else recording.time_s
+        time: Float = (
+            np.arange(len(recording.values), dtype=np.float64) * period_s
+            if recording.time_s is None
+            else recording.time_s
+        )
         timed = replace(recording, time_s=time)
         check_increasing(timed)
         median = estimate_period(timed)
@@ -133,7 +137,9 @@ class Differentiate(Step):
         """Return the channels with the new state after the other states."""
         self.columns((self.channel,), channels)
         if self.name in [c.name for c in channels]:
-            raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another name.")
+            raise ConfigError(
+                f"Step 'differentiate' would add {self.name!r}, which is there already; choose another name."
+            )
         at = self._position(channels)
         return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
 
@@ -154,7 +160,10 @@ class Differentiate(Step):
         """Return the recording with one more column."""
         (column,) = self.columns((self.channel,), channels)
         smooth = lowpass(recording.values[:, [column]], self.cutoff_hz * period_s)[:, 0]
-        return replace(recording, values=np.insert(recording.values, self._position(channels), np.gradient(smooth, period_s), axis=1))
+        return replace(
+            recording,
+            values=np.insert(recording.values, self._position(channels), np.gradient(smooth, period_s), axis=1),
+        )
 
     @staticmethod
     def _position(channels: tuple[Channel, ...]) -> int:

@@ -35,7 +35,9 @@ def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.p
     >>> parse_steps([{"step": "trim", "start": 1000}])
     (Trim(start=1000, stop=None, tail=0),)
     """
-    return tuple(table if isinstance(table, Step) else _parse_step(table, f"{where}[{i}]") for i, table in enumerate(tables))
+    return tuple(
+        table if isinstance(table, Step) else _parse_step(table, f"{where}[{i}]") for i, table in enumerate(tables)
+    )
 
 
 def _parse_step(table: Mapping[str, Any], where: str) -> Step:

@@ -41,7 +41,11 @@ class Scale(Step):
         if not math.isfinite(self.factor) or self.factor == 0:
             raise ConfigError(f"Step 'scale' needs a finite factor other than zero, found {self.factor}; correct it.")
         self.columns(self.channels, channels)
-        return channels if self.unit is None else tuple(replace(c, unit=self.unit) if c.name in self.channels else c for c in channels)
+        return (
+            channels
+            if self.unit is None
+            else tuple(replace(c, unit=self.unit) if c.name in self.channels else c for c in channels)
+        )
 
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, multiplied."""
@@ -88,19 +92,28 @@ class Shift(Step):
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, moved."""
         before = {name: scaling_of(scaling, name) for name in self.channels}
-        return {**scaling, **{name: replace(own, lag_samples=own.lag_samples + self.lag) for name, own in before.items()}}
+        return {
+            **scaling,
+            **{name: replace(own, lag_samples=own.lag_samples + self.lag) for name, own in before.items()},
+        }
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
         """Return the aligned recording, `abs(lag)` samples shorter."""
         n, lag = len(recording.values), self.lag
         if n <= abs(lag):
-            raise DataError(f"{title(recording.key)}: shifting by {lag} samples leaves nothing of {n}; leave the episode out.")
+            raise DataError(
+                f"{title(recording.key)}: shifting by {lag} samples leaves nothing of {n}; leave the episode out."
+            )
         length = n - abs(lag)
         fixed, moved = max(0, -lag), max(0, lag)
         values = recording.values[fixed : fixed + length].copy()
         for column in self.columns(self.channels, channels):
             values[:, column] = recording.values[moved : moved + length, column]
-        return replace(recording, values=values, time_s=None if recording.time_s is None else recording.time_s[fixed : fixed + length])
+        return replace(
+            recording,
+            values=values,
+            time_s=None if recording.time_s is None else recording.time_s[fixed : fixed + length],
+        )
 
 
 @dataclass(frozen=True)
@@ -130,12 +143,16 @@ class Offset(Step):
         """Return the channels, unchanged."""
         self.columns((self.channel, self.reference), channels)
         if not 0 <= self.start < self.stop:
-            raise ConfigError(f"Step 'offset' needs 0 <= start < stop, found start = {self.start}, stop = {self.stop}; correct the window.")
+            raise ConfigError(
+                f"Step 'offset' needs 0 <= start < stop, found start = {self.start}, stop = {self.stop}; correct the window."
+            )
         return channels
 
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, with the offset in words."""
-        said = f"mean of {self.reference} - {self.channel} over samples {self.start} to {self.stop - 1} of every episode"
+        said = (
+            f"mean of {self.reference} - {self.channel} over samples {self.start} to {self.stop - 1} of every episode"
+        )
         return {**scaling, self.channel: replace(scaling_of(scaling, self.channel), offset=said)}
 
     def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
@@ -191,4 +208,8 @@ class Trim(Step):
                 "leave the episode out or trim less."
             )
         keep = slice(self.start, stop)
-        return replace(recording, values=recording.values[keep], time_s=None if recording.time_s is None else recording.time_s[keep])
+        return replace(
+            recording,
+            values=recording.values[keep],
+            time_s=None if recording.time_s is None else recording.time_s[keep],
+        )

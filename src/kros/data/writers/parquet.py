@@ -65,7 +65,12 @@ def group_file(unit: str, condition: str) -> str:
 
 
 def write_group(
-    population: Population, unit: str, condition: str, folder: Path | str, on_nan: str = "error", look: Look | None = None
+    population: Population,
+    unit: str,
+    condition: str,
+    folder: Path | str,
+    on_nan: str = "error",
+    look: Look | None = None,
 ) -> GroupRecord:
     """Read, prepare, check and write all episodes of one unit and condition."""
     keys = population.keys(unit, condition)
@@ -76,7 +81,12 @@ def write_group(
     try:
         written = list(_write_episodes(population, keys, temporary, on_nan, look))
         if not written:
-            logger.warning("Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.", unit, condition, len(keys))
+            logger.warning(
+                "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.",
+                unit,
+                condition,
+                len(keys),
+            )
             return GroupRecord(unit, condition, "", (), ())
         temporary.replace(path)
     finally:
@@ -85,13 +95,17 @@ def write_group(
     return GroupRecord(unit, condition, path.name, episodes, samples, digests)
 
 
-def write_index(population: Population, records: Iterable[GroupRecord], folder: Path | str, converted: bool = True) -> None:
+def write_index(
+    population: Population, records: Iterable[GroupRecord], folder: Path | str, converted: bool = True
+) -> None:
     """Write `population.json` for groups that were written, with it the folder is a population; where they are `converted`, they are new recordings."""
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
     refuse_copies(pair for g in groups for pair in g.recognised)
-    scaling = {name: replace(own, converted=own.factor) if converted else own for name, own in population.scaling.items()}
+    scaling = {
+        name: replace(own, converted=own.factor) if converted else own for name, own in population.scaling.items()
+    }
     content = {
         "sample_period_s": population.sample_period_s,
         "channels": population.channels,
@@ -163,7 +177,9 @@ def _schema(names: Sequence[str]) -> Any:
 
     clash = sorted({*KEYS, "k"} & set(names))
     if clash:
-        raise DataError(f"Writing Parquet: channels {clash} have the name of a key column ({', '.join(KEYS)}, k); rename them.")
+        raise DataError(
+            f"Writing Parquet: channels {clash} have the name of a key column ({', '.join(KEYS)}, k); rename them."
+        )
     text = pa.dictionary(pa.int32(), pa.string())
     return pa.schema([*((name, text) for name in KEYS), ("k", pa.int64()), *((name, pa.float64()) for name in names)])
 

@@ -55,7 +55,9 @@ def write_raw(population: Population, out: Path | str) -> None:
     names = tuple(c.name for c in population.channels)
     expected = tuple(c.name for c in CHANNELS)
     if names != expected:
-        raise DataError(f"Writing the raw layout of motor drives needs the channels {expected}, found {names}; write Parquet instead.")
+        raise DataError(
+            f"Writing the raw layout of motor drives needs the channels {expected}, found {names}; write Parquet instead."
+        )
     groups = list(population.groups())
     for _, _, keys in groups:
         for key in keys:
@@ -65,7 +67,11 @@ def write_raw(population: Population, out: Path | str) -> None:
 
 
 def _check_names(key: EpisodeKey) -> None:
-    if not re.fullmatch("[0-9]{6}", key.unit) or key.condition not in ("load", "noload") or not re.fullmatch("[0-9]{1,3}", key.episode):
+    if (
+        not re.fullmatch("[0-9]{6}", key.unit)
+        or key.condition not in ("load", "noload")
+        or not re.fullmatch("[0-9]{1,3}", key.episode)
+    ):
         raise DataError(
             "Writing the raw layout: needs a unit of six digits, a condition load or noload and an episode below 1000, "
             f"found {key}; rename it or write Parquet instead."
@@ -80,7 +86,9 @@ def _write_folder(population: Population, keys: tuple[EpisodeKey, ...], folder: 
     target.mkdir(parents=True)
     for key in keys:
         values = population.read(key)
-        (target / f"{stamp}_{unit}_{condition}_{int(key.episode):03d}.csv").write_bytes(raw_csv(values, population.sample_period_s))
+        (target / f"{stamp}_{unit}_{condition}_{int(key.episode):03d}.csv").write_bytes(
+            raw_csv(values, population.sample_period_s)
+        )
 
 
 def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
@@ -97,6 +105,8 @@ def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
     buffer = io.BytesIO(HEADER)
     buffer.seek(len(HEADER))
     csv.write_csv(
-        pa.Table.from_arrays(rounded, names=[c.name for c in CHANNELS] + ["time"]), buffer, csv.WriteOptions(include_header=False)
+        pa.Table.from_arrays(rounded, names=[c.name for c in CHANNELS] + ["time"]),
+        buffer,
+        csv.WriteOptions(include_header=False),
     )
     return buffer.getvalue()

@@ -19,7 +19,9 @@ _NOISES = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))  # process, measure
 class DisturbanceModel:
     """Disturbances of an observer problem."""
 
-    input_weight: float | str = IDENTITY  # corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper
+    input_weight: float | str = (
+        IDENTITY  # corner of the low-pass spectrum of the scaled inputs in Hz, or white inputs as in the paper
+    )
     process_noise: float = 0.0
     measurement_noise: float = 0.0
 
@@ -38,7 +40,11 @@ class DisturbanceModel:
     def facts(self) -> dict[str, Any]:
         """Return it for the records."""
         corner = None if self.input_weight == IDENTITY else float(self.input_weight)
-        return {"input_weight_hz": corner, "process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
+        return {
+            "input_weight_hz": corner,
+            "process_noise": self.process_noise,
+            "measurement_noise": self.measurement_noise,
+        }
 
     @classmethod
     def recorded(cls, facts: dict[str, Any]) -> DisturbanceModel | None:

@@ -36,7 +36,9 @@ def design_kalman_tuned(task: DesignTask) -> DesignResult:
     tried, slopes = [], mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
     for model in refitted:
         dynamics = mean_error_dynamics(model.A, slopes)
-        shapes = {RESIDUAL: covariance[np.ix_(model.columns, model.columns)]} | ({} if model.rows else {EQUAL: models.output_scale[:n]})
+        shapes = {RESIDUAL: covariance[np.ix_(model.columns, model.columns)]} | (
+            {} if model.rows else {EQUAL: models.output_scale[:n]}
+        )
         for name, shape in shapes.items():
             for level, found in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):
                 facts = {"process_noise_level": level, "process_noise_shape": name}
@@ -61,10 +63,16 @@ def best_of(task: DesignTask, tried: Sequence[Tried], data: ValidationSet, **off
     errors = hidden_mean(data.percent_of_all(observers), task.models.measured)
     first = int(np.argmin(errors))
     if not np.isfinite(errors[first]):
-        raise SynthesisError("Every candidate diverges on the training episodes, and so does the model alone; look at Models first.")
+        raise SynthesisError(
+            "Every candidate diverges on the training episodes, and so does the model alone; look at Models first."
+        )
     best = candidates[first]
     rows = best.model.rows if best.model else ()
-    facts = {**best.facts, "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in rows], "correction_off": first == 0}
+    facts = {
+        **best.facts,
+        "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in rows],
+        "correction_off": first == 0,
+    }
     if np.isfinite(errors[0]):
         facts["training_error_to_open_loop"] = float(errors[first] / errors[0])
     return DesignResult(task.name, observers[first], best.synthesis, facts, task.problem, FITTED if rows else "")

@@ -38,7 +38,9 @@ from .tuned import held_out, tuned_where_better
 _PARTS = ((25.0,), (60.0, 12.0), (60.0, 12.0, 2.4))  # of an episode: sets of time constants of slow lags
 _TUNED = 6000  # samples
 _RIDGES = (1e-6, 1e-5, 1e-7, 1e-8)  # of what predicts measurements that are missing
-UNCOVERED = "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
+UNCOVERED = (
+    "the observer has states of its own, identified from recordings; the uncertain set surrounds the nominal model"
+)
 log = logging.getLogger(__name__)
 _SAMPLES, _EPISODES = 6000, 12  # that an observer is conditioned on, at most
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.1)  # of the gain that is best, until a certificate covers it
@@ -92,16 +94,22 @@ def design_predictor(task: DesignTask) -> DesignResult:
             f"Subspace-identified predictor: it diverges on training episodes (error {percent:.3g} % of the largest value); "
             "lifted functions that say nearly the same as the measurement do that, take them out of the lifting."
         )
-    synthesis = Synthesis("memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=time.perf_counter() - began)
+    synthesis = Synthesis(
+        "memory", kept.controller, Status.CERTIFIED, kept.injection, solve_s=time.perf_counter() - began
+    )
     nominal = {name: float(values[task.models.index(task.unit)]) for name, values in task.models.parameters.items()}
     observer = replace(kept, parameters=nominal, seen=task.training.seen)
     return DesignResult(task.name, observer, synthesis, {**plan.facts(task), **facts}, task.problem, UNCOVERED)
 
 
-def errors_beside_learned(task: DesignTask, unseen: ValidationSet) -> Callable[[Observer], tuple[npt.NDArray[np.float64], float]]:
+def errors_beside_learned(
+    task: DesignTask, unseen: ValidationSet
+) -> Callable[[Observer], tuple[npt.NDArray[np.float64], float]]:
     """Return what gives an observer's errors of hidden states by condition, in percent, and how many times those of the learned estimator they are at most."""
     conditions = [key.condition for key in unseen.batch.keys]
-    parts = [unseen.part([i for i, c in enumerate(conditions) if c == condition]) for condition in dict.fromkeys(conditions)]
+    parts = [
+        unseen.part([i for i, c in enumerate(conditions) if c == condition]) for condition in dict.fromkeys(conditions)
+    ]
     learned = make_learned(task.recordings or task.training, task.models.lifting, task.models.measured)
     hidden = list(learned.estimated)
     rival = np.array([part.compare([learned.run(part.batch, part.parameters)])[0][hidden] for part in parts])
@@ -117,7 +125,9 @@ def recordings(task: DesignTask, effort: Effort) -> TrainingSet:
     """Return the training episodes that a predictor is made from."""
     whole = task.recordings or task.training
     if not task.predictor.others:
-        whole = replace(whole, keys=tuple(key for key in whole.keys if key.condition == task.training.keys[0].condition))
+        whole = replace(
+            whole, keys=tuple(key for key in whole.keys if key.condition == task.training.keys[0].condition)
+        )
     return whole.within(effort.samples, effort.groups)
 
 
@@ -144,36 +154,58 @@ class Plan:
         past = PastMoments.of(on_the_circle(models.lifting), models.measured, batch, every, until)
         moved = {key.unit for key in batch.keys if key.condition == first}
         judged = {unit for unit, condition in zip(past.units, past.conditions, strict=True) if condition == first}
-        if not whole and len(judged) < min(2, len(moved)):  # the others start at a limit, and none is left to judge by another one
+        if not whole and len(judged) < min(
+            2, len(moved)
+        ):  # the others start at a limit, and none is left to judge by another one
             return cls.of(task, effort, batch, whole=True)
         if whole:
             past, fill = filled_in(past, batch, *sides(task.limits, models.lifting.states[: batch.states.shape[-1]]))
             batch = fill(batch)
         internal = effort.internal if asked.states is None else (asked.states,)
         counts = {first: 1.0, **dict.fromkeys(others, asked.others)}
-        free = np.array([name not in task.limits for i, name in enumerate(models.lifting.states) if i not in models.measured])
+        free = np.array(
+            [name not in task.limits for i, name in enumerate(models.lifting.states) if i not in models.measured]
+        )
         beyond = {limited(c): AT_LIMITS * count * free for c, count in counts.items() if limited(c) in past.conditions}
         rows = firsts(batch)
         recipe = choose(
-            past, batch.take(rows), {**counts, **beyond}, importance, delays, lags, internal, None if until is None else until[rows]
+            past,
+            batch.take(rows),
+            {**counts, **beyond},
+            importance,
+            delays,
+            lags,
+            internal,
+            None if until is None else until[rows],
         )
         tuned = {c: tuple(count if share > 0 else 0.0 for share in recipe.weights[c]) for c, count in counts.items()}
         return cls(past.restricted(recipe.basis), recipe, importance, tuned, fill)
 
-    def made(self, task: DesignTask, data: ValidationSet, settle: Settle, steps: int) -> tuple[Observer, dict[str, Any]]:
+    def made(
+        self, task: DesignTask, data: ValidationSet, settle: Settle, steps: int
+    ) -> tuple[Observer, dict[str, Any]]:
         """Return the observer as it is deployed, tuned where that is better, with what the records say of that."""
         start = self.observer(task, data)
         if steps:
-            return tuned_where_better(task, data, start, lambda seen, _: self.observer(task, seen, steps), settle, self.score)
+            return tuned_where_better(
+                task, data, start, lambda seen, _: self.observer(task, seen, steps), settle, self.score
+            )
         return settle(data.part(firsts(data.batch)), start), {}
 
     def observer(self, task: DesignTask, data: ValidationSet, steps: int = 0) -> Observer:
         """Return the observer, tuned by some steps on recordings, that of the moments without any."""
-        batch, model, asked, models = data.on_time.batch, self.recipe.model(self.past, self.importance), task.predictor, task.models
+        batch, model, asked, models = (
+            data.on_time.batch,
+            self.recipe.model(self.past, self.importance),
+            task.predictor,
+            task.models,
+        )
         few = some(batch if self.fill is None else self.fill(batch), asked.episodes if steps else 1)
         if steps:
             slowest, recipe = max(self.recipe.basis.poles), self.recipe
-            model, _ = tune_predictor(model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis)
+            model, _ = tune_predictor(
+                model, self.past, few, self.importance, recipe.deviation, slowest, steps, weights=self.emphasis
+            )
         # Rows of measured states count where measurements are missing. Fitted to all conditions they are those of none, and drift.
         home = few.take([i for i, key in enumerate(few.keys) if key.condition == task.training.keys[0].condition])
         made = embedded_with(task.name, self.past, model, models.recorded_inputs, home, _RIDGES)
@@ -181,7 +213,9 @@ class Plan:
         if task.limits:
             made = [with_limits(one, *sides(task.limits, one.recorded)) for one in made]
         without = dropout_error_percent(made, task.training.first_of_units().read())
-        return self._started(task, replace(data, batch=some(data.batch, asked.episodes)), few, made[int(np.argmin(without))])
+        return self._started(
+            task, replace(data, batch=some(data.batch, asked.episodes)), few, made[int(np.argmin(without))]
+        )
 
     def _started(self, task: DesignTask, data: ValidationSet, few: EpisodeBatch, observer: Observer) -> Observer:
         """Return the observer with a start in motion, unless recordings start better without."""
@@ -189,20 +223,28 @@ class Plan:
         parts = [few] if len(first) == len(few.keys) else [few, few.take(first)]
         tried = [*(with_start(observer, part, self.past.static, self.past.free) for part in parts), observer]
         errors = self.score(data, tried)
-        return tried[int(np.flatnonzero(errors <= _AS_GOOD * errors.min())[0])] if np.isfinite(errors).any() else observer
+        return (
+            tried[int(np.flatnonzero(errors <= _AS_GOOD * errors.min())[0])] if np.isfinite(errors).any() else observer
+        )
 
     def score(self, data: ValidationSet, observers: Sequence[Observer]) -> npt.NDArray[np.float64]:
         """Return errors of observers in percent of the range as the recipe counts them: geometric means over hidden states, units and conditions."""
         keys, measured, found = data.batch.keys, observers[0].measured, []
         hidden = [i for i in range(data.batch.states.shape[-1]) if i not in measured]
         nothing, conditions = (0.0,) * len(hidden), [key.condition for key in keys]
-        weights = np.array([np.multiply(self.emphasis.get(c, nothing), self.importance) / conditions.count(c) for c in conditions])
+        weights = np.array(
+            [np.multiply(self.emphasis.get(c, nothing), self.importance) / conditions.count(c) for c in conditions]
+        )
         for observer in observers:
             values = data.parameters if observer.lifting.parameters else None
             estimate = run_observer(observer, data.measurements(measured), data.batch.inputs, values)
             rms = error_rms(estimate[..., hidden], data.batch.states[..., hidden], data.batch.lengths)
-            with np.errstate(invalid="ignore"):  # not a number where it diverges in what does not count: refused as well
-                found.append(np.sum(weights * np.log(np.maximum(np.where(np.isfinite(rms), rms, np.inf), _TINY))) / weights.sum())
+            with np.errstate(
+                invalid="ignore"
+            ):  # not a number where it diverges in what does not count: refused as well
+                found.append(
+                    np.sum(weights * np.log(np.maximum(np.where(np.isfinite(rms), rms, np.inf), _TINY))) / weights.sum()
+                )
         return 100 * np.exp(found)
 
     def facts(self, task: DesignTask) -> dict[str, Any]:
@@ -216,7 +258,9 @@ class Plan:
                 "delays": recipe.basis.delays,
                 "lags_s": [dt / (1 - pole) for pole in recipe.basis.poles],
                 "deviation": recipe.deviation,
-                "conditions": {condition: dict(zip(hidden, shares, strict=True)) for condition, shares in recipe.weights.items()},
+                "conditions": {
+                    condition: dict(zip(hidden, shares, strict=True)) for condition, shares in recipe.weights.items()
+                },
                 "left_out_percent": {name: 100 * error for name, error in zip(hidden, recipe.held_out, strict=True)},
             },
         }
@@ -237,7 +281,11 @@ def some(batch: EpisodeBatch, count: int) -> EpisodeBatch:
     for i, key in enumerate(batch.keys):
         groups.setdefault((key.unit, key.condition), []).append(i)
     wanted = -(-count * _TUNED // length)
-    rows = [own[j] for own in groups.values() for j in np.unique(np.linspace(0, len(own) - 1, min(wanted, len(own))).round().astype(int))]
+    rows = [
+        own[j]
+        for own in groups.values()
+        for j in np.unique(np.linspace(0, len(own) - 1, min(wanted, len(own))).round().astype(int))
+    ]
     return batch.take(sorted(rows)).head(length)
 
 
@@ -250,7 +298,11 @@ def before_limits(task: DesignTask, batch: EpisodeBatch) -> npt.NDArray[np.int64
 
 def importance_of(task: DesignTask) -> list[float]:
     """Return the weights of the hidden states' logarithmic errors."""
-    return [task.predictor.importance.get(name, 1.0) for i, name in enumerate(task.models.lifting.states) if i not in task.models.measured]
+    return [
+        task.predictor.importance.get(name, 1.0)
+        for i, name in enumerate(task.models.lifting.states)
+        if i not in task.models.measured
+    ]
 
 
 def on_the_circle(lifting: Lifting) -> Lifting:

@@ -56,7 +56,9 @@ def promising(task: DesignTask) -> list[ResidualModel]:
     )
     usable = [model for model in found if np.isfinite(model.promised).all()]
     if not usable:
-        raise SynthesisError("Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings.")
+        raise SynthesisError(
+            "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
+        )
     return usable
 
 
@@ -64,7 +66,14 @@ def gains_for(task: DesignTask, model: ResidualModel) -> Synthesis:
     """Return the synthesis for a model."""
     models, n = task.models, task.models.lifting.n_states
     return residual_h2(
-        ResidualProblem(model.dynamics, task.selector[:, :n], model.spectra, task.noise, models.output_scale[:n], models.sample_period_s),
+        ResidualProblem(
+            model.dynamics,
+            task.selector[:, :n],
+            model.spectra,
+            task.noise,
+            models.output_scale[:n],
+            models.sample_period_s,
+        ),
         n_lifted=models.lifting.n_lifted,
         max_order=MAX_ORDER,
     )

@@ -41,7 +41,9 @@ def design_worst_case_h2(task: DesignTask) -> DesignResult:
     return task.designed(synthesis, assumed, **model.facts())
 
 
-def best_model(task: DesignTask, problem: ObserverProblem, design: Callable[[ObserverProblem], Synthesis]) -> DisturbanceModel:
+def best_model(
+    task: DesignTask, problem: ObserverProblem, design: Callable[[ObserverProblem], Synthesis]
+) -> DisturbanceModel:
     """Return the disturbance model whose observer does best on training episodes, as the process noise of the tuned Kalman filter is chosen."""
     tried = candidates(task.models.sample_period_s)
     return tried[best_design(task, [partial(design, model.of(problem)) for model in tried])[0]]

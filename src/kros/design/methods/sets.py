@@ -39,5 +39,9 @@ def design_worst_case(task: DesignTask) -> DesignResult:
     judged = data.part([i for i, unseen in enumerate(held) if unseen])
     errors = np.array([judged.percent(found.observer) for found in made if found.observer is not None])
     best, form = made[int(np.argmin(hidden_mean(errors, task.models.measured)))], made[-1]
-    assumed = DisturbanceModel.recorded(form.facts)  # all observers are certified on the form's set with its model, whichever is taken
-    return replace(best, problem=form.problem, facts={"set": "form"} | (assumed.facts() if assumed else {}) | best.facts)
+    assumed = DisturbanceModel.recorded(
+        form.facts
+    )  # all observers are certified on the form's set with its model, whichever is taken
+    return replace(
+        best, problem=form.problem, facts={"set": "form"} | (assumed.facts() if assumed else {}) | best.facts
+    )

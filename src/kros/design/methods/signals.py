@@ -36,7 +36,9 @@ from .tuned import held_out
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 SIGNALS = "signals"
-UNCOVERED = "the observer is certified for the signals that a model of its own leaves, not for the set around the nominal unit"
+UNCOVERED = (
+    "the observer is certified for the signals that a model of its own leaves, not for the set around the nominal unit"
+)
 _STEPS, _ROUNDS, _EPISODES = 8, 2, 12
 _UNKNOWN: dict[str, Any] = {"h2_norm": None, "lower_bound": None, "gap_percent": None}  # of tuned gains
 
@@ -65,8 +67,12 @@ class Judge:
 
     def __call__(self, nominal: str, observer: Observer, synthesis: Synthesis) -> Candidate:
         """Return an observer with what it is certified to stay below."""
-        certificate = relift_certificate(observer, scales=scales_of([observer], self.data, self.task)[0], mismatch=False)
-        return Candidate(nominal, observer, synthesis, signal_bound(certificate, observer, self.data.batch, known=self._energies))
+        certificate = relift_certificate(
+            observer, scales=scales_of([observer], self.data, self.task)[0], mismatch=False
+        )
+        return Candidate(
+            nominal, observer, synthesis, signal_bound(certificate, observer, self.data.batch, known=self._energies)
+        )
 
 
 def design_for_signals(task: DesignTask) -> DesignResult:
@@ -77,7 +83,9 @@ def design_for_signals(task: DesignTask) -> DesignResult:
         *best.synthesis.notes,
         "The set: signals with energies in bands below the cover of all units' residuals, of the observer's own model.",
     )
-    synthesis = replace(best.synthesis, method=task.method, status=Status.CERTIFIED, solve_s=time.perf_counter() - began, notes=notes)
+    synthesis = replace(
+        best.synthesis, method=task.method, status=Status.CERTIFIED, solve_s=time.perf_counter() - began, notes=notes
+    )
     return DesignResult(task.name, best.observer, synthesis, facts, task.problem, UNCOVERED)
 
 
@@ -107,7 +115,9 @@ def chosen(task: DesignTask, data: ValidationSet) -> tuple[Candidate, dict[str, 
 def lower_bounds(task: DesignTask, data: ValidationSet, observer: Observer) -> Array:
     """Return the errors that no other correction of an observer's model is certified to stay below, over the ranges."""
     batch, models = data.batch, task.models
-    dynamics = mean_error_dynamics(observer.A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters))
+    dynamics = mean_error_dynamics(
+        observer.A, mean_slopes(models.lifting, batch.states, batch.inputs, batch.parameters)
+    )
     C = task.selector[:, : models.lifting.n_states]
     return signal_lower_bounds(dynamics, C, task.noise, signals_of(data, observer), models.sample_period_s)
 
@@ -134,7 +144,9 @@ def candidates(task: DesignTask, data: ValidationSet) -> Iterator[Candidate]:
             yield from attempts(task, data, "single steps", model.A, model.B, judge, _ROUNDS)
 
 
-def attempts(task: DesignTask, data: ValidationSet, name: str, A: Array, B: Array, judge: Judge, rounds: int) -> Iterator[Candidate]:
+def attempts(
+    task: DesignTask, data: ValidationSet, name: str, A: Array, B: Array, judge: Judge, rounds: int
+) -> Iterator[Candidate]:
     """Yield the observer of a nominal, and what becomes of it when rows and gains are fitted in turn; those that fail end it."""
     seen, what = fitting(data), name
     try:

@@ -16,7 +16,9 @@ class Method:
     """One way to an observer."""
 
     name: str
-    seconds: float  # roughly what it takes: those that take longest start first, so that no worker waits for them in the end
+    seconds: (
+        float  # roughly what it takes: those that take longest start first, so that no worker waits for them in the end
+    )
     rank: int  # the observer of the lowest rank is deployed where none is named and others are no better
     not_refined: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all
     refined_only: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all

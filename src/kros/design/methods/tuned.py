@@ -31,7 +31,9 @@ def tuned_where_better(
     """Tune an observer on most training episodes, and return what is better on the others."""
     held = held_out(data.batch.keys)
     unseen = data.part([i for i in range(len(held)) if held[i]])
-    first = data.part([i for i, key in enumerate(data.batch.keys) if key.unit not in {k.unit for k in data.batch.keys[:i]}])
+    first = data.part(
+        [i for i, key in enumerate(data.batch.keys) if key.unit not in {k.unit for k in data.batch.keys[:i]}]
+    )
     try:
         if all(held):
             raise DataError("tuning needs a second training episode, to be judged on.")

@@ -57,11 +57,17 @@ class Accuracy:
     def of(cls, files: Mapping[str, str], observer: Observer, held_out: HeldOut, track: str | None) -> Accuracy:
         """Compile the files of an export and run both."""
         y, u, own = held_out.y, held_out.u, observer.own(held_out.parameters)
-        wanted = run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
+        wanted = (
+            run_observer(observer, y, u, own)
+            if track is None
+            else track_parameter(observer, y, u, own, track).estimates
+        )
         wanted, found = wanted[..., : len(observer.recorded)], np.empty((*y.shape[:2], len(observer.recorded)))
         found[0] = wanted[0]
         measured = [observer.lifting.states[i] for i in observer.measured]
-        y_factor, u_factor, x_factor = (recorded_factors(observer, names) for names in (measured, observer.inputs, observer.recorded))
+        y_factor, u_factor, x_factor = (
+            recorded_factors(observer, names) for names in (measured, observer.inputs, observer.recorded)
+        )
         with tempfile.TemporaryDirectory() as name:
             for file, text in files.items():
                 Path(name, file).write_text(text)
@@ -73,12 +79,16 @@ class Accuracy:
         errors = _rms(wanted - held_out.states), _rms(found - held_out.states)
         loss = 100 * (errors[1] / np.maximum(errors[0], 1e-300) - 1)
         return cls(
-            y[..., 0].size, float(np.max(apart / np.maximum(size, 1e-300))), dict(zip(observer.recorded, loss.tolist(), strict=True))
+            y[..., 0].size,
+            float(np.max(apart / np.maximum(size, 1e-300))),
+            dict(zip(observer.recorded, loss.tolist(), strict=True)),
         )
 
     def content(self) -> dict[str, Any]:
         """Return what a manifest holds of it, rounded: compilers differ in the last digits."""
-        loss = {name: round(value, 3) + 0.0 if np.isfinite(value) else None for name, value in self.loss_percent.items()}
+        loss = {
+            name: round(value, 3) + 0.0 if np.isfinite(value) else None for name, value in self.loss_percent.items()
+        }
         return {"samples": self.samples, "difference": float(f"{self.difference:.0e}"), "loss_percent": loss}
 
 

@@ -57,7 +57,11 @@ class CompiledObserver:
 
     def __init__(self, folder: Path, library: Path) -> None:
         manifest = json.loads((Path(folder) / "manifest.json").read_text())
-        self.name, self.states, self.conditions = manifest["name"], tuple(manifest["states"]), tuple(manifest.get("conditions", ()))
+        self.name, self.states, self.conditions = (
+            manifest["name"],
+            tuple(manifest["states"]),
+            tuple(manifest.get("conditions", ())),
+        )
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
         self._real = np.float32 if manifest["precision"] == "float" else np.float64
@@ -76,9 +80,14 @@ class CompiledObserver:
         """
         folder, compiler = Path(folder), compiler or find_compiler()
         if compiler is None:
-            raise ConfigError(f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one.")
+            raise ConfigError(
+                f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one."
+            )
         manifest = json.loads((folder / "manifest.json").read_text())
-        name, sizes = manifest["name"], {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
+        name, sizes = (
+            manifest["name"],
+            {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])},
+        )
         library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
         sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
         try:
@@ -126,16 +135,23 @@ class CompiledObserver:
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
 
-    def start(self, y: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None) -> npt.NDArray[np.uint8]:
+    def start(
+        self, y: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None
+    ) -> npt.NDArray[np.uint8]:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
-        machine, real = np.zeros(self.state_bytes, dtype=np.uint8), ctypes.c_float if self._real is np.float32 else ctypes.c_double
+        machine, real = (
+            np.zeros(self.state_bytes, dtype=np.uint8),
+            ctypes.c_float if self._real is np.float32 else ctypes.c_double,
+        )
         self._c[f"{self.name}_init"](_at(machine))
         for name, value in (parameters or {}).items():
             self._c[f"{self.name}_set_{name}"](_at(machine), real(value))
         self._reset(_at(machine), _at(np.ascontiguousarray(y, dtype=float)))
         if condition is not None:
             if condition not in self.conditions:
-                raise ConfigError(f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}.")
+                raise ConfigError(
+                    f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}."
+                )
             self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
         return machine
 

@@ -25,7 +25,9 @@ class Golden:
     size: Array  # (n_recorded,)
     passes: int
     last_status: npt.NDArray[Any]  # (n_samples,)
-    sure: npt.NDArray[Any]  # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
+    sure: npt.NDArray[
+        Any
+    ]  # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES, tolerance: float = 0.0) -> Golden:
@@ -51,9 +53,13 @@ class Golden:
                 for _ in range(passes)
                 for sample in zip(factor * y, factor * u, strict=True)
             ]
-            return np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array([s for _, s in found], np.uint32)
+            return np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array(
+                [s for _, s in found], np.uint32
+            )
 
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
         sure = ~np.stack([turned[:count], turned[-count:]])
-        return cls(y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:], sure)
+        return cls(
+            y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:], sure
+        )

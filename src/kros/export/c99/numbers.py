@@ -62,10 +62,14 @@ class Source:
     load: LoadOutput | None = None
 
     @classmethod
-    def of(cls, observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None) -> Source:
+    def of(
+        cls, observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
+    ) -> Source:
         """Look at an observer; refuse what it cannot give."""
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
-            raise ConfigError(f"Export: load torque needs the states {', '.join(missing)}, found {', '.join(observer.recorded)}.")
+            raise ConfigError(
+                f"Export: load torque needs the states {', '.join(missing)}, found {', '.join(observer.recorded)}."
+            )
         realised = Realised.of(observer)
         observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
@@ -120,7 +124,9 @@ class Source:
             "window_shift": [int(i) for i in lifting.window.shift] if lifting.history else [],
             "window_present": [int(i) for i in lifting.window.present] if lifting.history else [],
             "model": self.sums(self.realised.model),
-            "less": [(j, i, None if factor == 1 else self.precision.literal(factor)) for j, i, factor in self.realised.less],
+            "less": [
+                (j, i, None if factor == 1 else self.precision.literal(factor)) for j, i, factor in self.realised.less
+            ],
             "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
             "into": self.sums(o.into[:n]) if limited else [],
             "controller": self.sums(np.hstack([K.A, K.B])),
@@ -200,7 +206,12 @@ class Source:
         slopes = []
         for f in o.lifting.formulas:
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used}
-            slopes.append({"by_value": code(f.derivative(name)), "by_state": [(j, code(d)) for j, d in by_state.items() if d != 0]})
+            slopes.append(
+                {
+                    "by_value": code(f.derivative(name)),
+                    "by_state": [(j, code(d)) for j, d in by_state.items() if d != 0],
+                }
+            )
         return {
             "name": name,
             "place": o.lifting.parameters.index(name),
@@ -270,7 +281,12 @@ class Source:
             "conditions": [plain(c) for c in own.bounds],
             "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
-            "rates": {"percent": f"{100 * own.false_alarm_rate:g}", "units": own.units, "alarms": own.alarms, "hours": f"{own.hours:.3g}"}
+            "rates": {
+                "percent": f"{100 * own.false_alarm_rate:g}",
+                "units": own.units,
+                "alarms": own.alarms,
+                "hours": f"{own.hours:.3g}",
+            }
             | {"interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None},
         }
 
@@ -287,9 +303,15 @@ class Source:
         start, q = self.observer.start_in_motion, len(self.observer.measured)
         if start is None or not len(start):
             return None
-        rows, places = np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2))), self.observer.measured
+        rows, places = (
+            np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2))),
+            self.observer.measured,
+        )
         assert self.realised.start_gain is not None
-        gain, less = self.realised.start_gain[rows], [(j, places.index(i), factor) for j, i, factor in self.realised.less]
+        gain, less = (
+            self.realised.start_gain[rows],
+            [(j, places.index(i), factor) for j, i, factor in self.realised.less],
+        )
         rest = start.rest.reshape(-1, gain.shape[1]).copy()
         for j, i, factor in less:
             rest[:, i] += factor * rest[:, q + j]
@@ -338,7 +360,9 @@ class Source:
             wide = {"lower": lower, "upper": upper, "least": least, "most": furthest}
             inner = np.clip([max(lower, least), min(upper, furthest)], *(np.finfo(np.float32).max * np.array([-1, 1])))
             texts = {name: Precision().literal(v) for name, v in wide.items()}
-            found.append(texts | {name: Precision("float").literal(v) for name, v in zip(("low", "high"), inner, strict=True)})
+            found.append(
+                texts | {name: Precision("float").literal(v) for name, v in zip(("low", "high"), inner, strict=True)}
+            )
         return found
 
 

@@ -132,9 +132,14 @@ def c_files(
 
     for parameter in observer.lifting.parameters:
         require_identifier(parameter, "parameter")
-    source, golden = Source.of(observer, name, precision, track, load), Golden.of(observer, track, tolerance=_TOLERANCE[precision])
+    source, golden = (
+        Source.of(observer, name, precision, track, load),
+        Golden.of(observer, track, tolerance=_TOLERANCE[precision]),
+    )
     context = source.context() | {"version": version("kros")}
-    context["sigma_uses_parameters"] = any(set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas)
+    context["sigma_uses_parameters"] = any(
+        set(f.used) & set(observer.lifting.parameters) for f in observer.lifting.formulas
+    )
     tolerance, measured = _TOLERANCE[precision], [observer.lifting.states[i] for i in observer.measured]
     y_factor, u_factor, x_factor = (
         np.array([source.factors()[n] for n in names]) for names in (measured, observer.inputs, observer.recorded)
@@ -150,25 +155,40 @@ def c_files(
         "tolerance": [f"{tolerance * v:.9g}" for v in golden.size / np.abs(x_factor)],
     }
     state_bytes = _state_bytes(context)
-    numbers = sum(len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ())
-    numbers += 0 if context["tracked"] is None else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
+    numbers = sum(
+        len(row) for key in ("model", "correction", "into", "controller", "filter_gain") for row in context[key] or ()
+    )
+    numbers += (
+        0
+        if context["tracked"] is None
+        else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
+    )
     begins = (
         0
         if observer.start_in_motion is None
         else sum(getattr(observer.start_in_motion, part).size for part in ("gain", "corrections", "rest"))
     )
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
-    largest = None if observer.seen is None else ", ".join(f"{v:.6g}" for v in 1.5 * observer.seen.measured / np.abs(y_factor))
+    largest = (
+        None
+        if observer.seen is None
+        else ", ".join(f"{v:.6g}" for v in 1.5 * observer.seen.measured / np.abs(y_factor))
+    )
     context |= {
         "state_bytes": state_bytes,
         "constant_bytes": (numbers + begins + 4 * watched) * (4 if precision == "float" else 8),
-        "operations": numbers - sum(map(len, context["filter_gain"])) + context["delay"] * sum(map(len, context["model"])) + 7 * watched,
+        "operations": numbers
+        - sum(map(len, context["filter_gain"]))
+        + context["delay"] * sum(map(len, context["model"]))
+        + 7 * watched,
         "largest_angle": largest,
         "tolerance": tolerance,
         "accuracy": None if accuracy is None else accuracy.content(),
         "board": None if board is None else asdict(board),
     }
-    environment = Environment(loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True)
+    environment = Environment(
+        loader=PackageLoader("kros.export.c99"), undefined=StrictUndefined, keep_trailing_newline=True
+    )
     texts = {
         f"{name}.h": "observer.h",
         f"{name}.c": "observer.c",
@@ -178,9 +198,17 @@ def c_files(
         "README.md": "README.md",
     }
     code = environment.get_template("observer.c.jinja").render(context)
-    functions = sorted(set(re.findall(r"\b(?:floor|sin|cos|tan|a?(?:sin|cos|tan)h?|exp|log|sqrt|pow|atan2|fabs|fmin|fmax)f?(?=\()", code)))
+    functions = sorted(
+        set(
+            re.findall(
+                r"\b(?:floor|sin|cos|tan|a?(?:sin|cos|tan)h?|exp|log|sqrt|pow|atan2|fabs|fmin|fmax)f?(?=\()", code
+            )
+        )
+    )
     context["library"] = (
-        " and ".join(f"`{f}`" for f in functions) + " (link with `-lm` where it is a library of its own)" if functions else "nothing"
+        " and ".join(f"`{f}`" for f in functions) + " (link with `-lm` where it is a library of its own)"
+        if functions
+        else "nothing"
     )
     files = {file: environment.get_template(f"{template}.jinja").render(context) for file, template in texts.items()}
     deployed = json_bytes(with_checksum(observer_content(observer)))
@@ -197,7 +225,11 @@ def c_files(
         "state_bytes": state_bytes,
         "numerical_error": context["accuracy"],
         "cortex_m4f": context["board"],
-        **({"conditions": list(observer.monitor.bounds)} if observer.monitor is not None and observer.monitor.bounds else {}),
+        **(
+            {"conditions": list(observer.monitor.bounds)}
+            if observer.monitor is not None and observer.monitor.bounds
+            else {}
+        ),
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
@@ -213,7 +245,13 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     """Return the size of the state: doubles first, then numbers of the build's precision, then words of four bytes."""
     real = 4 if context["single"] else 8
     doubles = context["m"] + (1 + context["m"] + len(context["shift_others"]) if context["shift"] else 0)
-    reals = context["n"] + context["order"] + context["history"] + len(context["parameters"]) + context["delay"] * context["m"]
+    reals = (
+        context["n"]
+        + context["order"]
+        + context["history"]
+        + len(context["parameters"])
+        + context["delay"] * context["m"]
+    )
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 + 1 if context["monitor"] else 0
     words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 2

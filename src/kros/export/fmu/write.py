@@ -88,7 +88,8 @@ def export_fmu(
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
     texts = rendered(Source.of(observer, name, precision, track), fmi, guid)
     packed: dict[str, bytes] = {
-        file: text.encode() for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
+        file: text.encode()
+        for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
     }
     write_bytes(out, _archive(packed | compiled(packed, name, fmi)))
     return out
@@ -111,7 +112,9 @@ def rendered(source: Source, fmi: int, guid: str) -> dict[str, str]:
     context["variables"] = variables(observer, units, estimates)
     context["conditions"] = conditions(observer)
     context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
-    environment = Environment(loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True)
+    environment = Environment(
+        loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True
+    )
     chosen = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
     if fmi == 3:
         chosen["sources/buildDescription.xml"] = "build.xml"
@@ -122,7 +125,9 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status, condition."""
     measured = [observer.lifting.states[i] for i in observer.measured]
 
-    def rows(names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = "") -> list[dict[str, Any]]:
+    def rows(
+        names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = ""
+    ) -> list[dict[str, Any]]:
         return [
             {
                 "name": plain(n) + suffix,
@@ -138,15 +143,33 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
     found = rows(measured, "input", "discrete", "measured {}", lambda _: "0.0")
     found += rows(observer.inputs, "input", "discrete", "input {}", lambda _: "0.0")
     found += rows(
-        observer.lifting.parameters, "parameter", "tunable", "this machine's {}", lambda n: f"{observer.parameters.get(n, 0.0):.17g}"
+        observer.lifting.parameters,
+        "parameter",
+        "tunable",
+        "this machine's {}",
+        lambda n: f"{observer.parameters.get(n, 0.0):.17g}",
     )
     found += rows(estimates, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
     found.append(
-        {"name": "status", "causality": "output", "variability": "discrete", "description": bits, "unit": "", "start": None, "kind": "bits"}
+        {
+            "name": "status",
+            "causality": "output",
+            "variability": "discrete",
+            "description": bits,
+            "unit": "",
+            "start": None,
+            "kind": "bits",
+        }
     )
     if conditions(observer):
-        told = rows(["condition"], "parameter", "tunable", "{} that the machine is in, as far as the monitor knows it", lambda _: "0")
+        told = rows(
+            ["condition"],
+            "parameter",
+            "tunable",
+            "{} that the machine is in, as far as the monitor knows it",
+            lambda _: "0",
+        )
         found.append(told[0] | {"kind": "choice"})
     return [{**variable, "index": i} for i, variable in enumerate(found)]
 

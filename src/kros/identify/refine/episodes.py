@@ -82,7 +82,9 @@ def _free_runs(V: Array, problem: RefinementProblem) -> tuple[Array, Array]:
     for rows in (np.arange(units)[start : start + step] for start in range(0, units, step)):
         alone = _one_by_one(problem.segments.units(rows))
         each = {name: np.repeat(values[rows], count) for name, values in problem.parameters.items()}
-        normal = normal_equations(np.repeat(V[rows], count, axis=0), problem.T, problem.lifting, each, alone, problem.sigma, problem.stride)
+        normal = normal_equations(
+            np.repeat(V[rows], count, axis=0), problem.T, problem.lifting, each, alone, problem.sigma, problem.stride
+        )
         found[rows] = normal.matrix.reshape(len(rows), count, width, width)
         counts[rows] = normal.counts.reshape(len(rows), count).sum(axis=1)
     return found, counts
@@ -101,7 +103,10 @@ def _add_one_step(total: Array, V: Array, factors: Factor, problem: RefinementPr
     by_episode = np.swapaxes(white, -1, -2) @ white  # [psi sigma+]^T [psi sigma+], (unit, episode, p + f, p + f)
     for row in range(n, nl):
         columns = np.r_[0:p, p + row - n]
-        M = by_episode[..., columns[:, None], columns] * (_ROW_WEIGHT * share / problem.one_step.variance[row - n])[:, None, None, None]
+        M = (
+            by_episode[..., columns[:, None], columns]
+            * (_ROW_WEIGHT * share / problem.one_step.variance[row - n])[:, None, None, None]
+        )
         rest = np.concatenate([-V[:, row], np.ones((len(V), 1))], axis=1)  # r = [psi sigma+] rest
         pull = np.einsum("ueij,uj->uei", M, rest)
         place = slice(row * p, (row + 1) * p)

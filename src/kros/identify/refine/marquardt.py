@@ -60,7 +60,10 @@ def minimise(
         better = allowed & (cost < last)
         small = cost >= (1 - least_gain) * last
         done[rows] |= (better & small & (damping <= _START)) | (~better & (damping >= _MOST)) | (last == 0)
-        V[rows], matrix[rows] = np.where(better[:, None, None], trial, now), np.where(better[:, None, None], found, before)
+        V[rows], matrix[rows] = (
+            np.where(better[:, None, None], trial, now),
+            np.where(better[:, None, None], found, before),
+        )
         mu[rows] = np.clip(np.where(better, damping / 10, damping * 10), _LEAST, _MOST)
         used += 1
     return Solution(V, matrix, used, done)
@@ -72,6 +75,8 @@ def _step(matrix: Array, mu: Array) -> Array:
     H = np.where(fine[:, None, None], matrix[:, :-1, :-1], np.eye(matrix.shape[-1] - 1))
     g = np.where(fine[:, None], matrix[:, :-1, -1], 0.0)
     diagonal = np.diagonal(H, axis1=1, axis2=2)
-    scale = 1 / np.sqrt(np.maximum(diagonal, np.finfo(float).eps ** 2 * diagonal.max(axis=1, keepdims=True) + np.finfo(float).tiny))
+    scale = 1 / np.sqrt(
+        np.maximum(diagonal, np.finfo(float).eps ** 2 * diagonal.max(axis=1, keepdims=True) + np.finfo(float).tiny)
+    )
     scaled = H * scale[:, :, None] * scale[:, None, :] + mu[:, None, None] * np.eye(H.shape[-1])
     return np.asarray(np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale)

@@ -69,7 +69,11 @@ class ResponsePrior:
         form = (
             by_row.reshape(*size.shape, -1).transpose(0, 2, 1) @ by_column.reshape(*size.shape, -1)
         ).real  # (unit, rows rows, columns columns)
-        H = form.reshape(units, rows, rows, columns, columns).transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
+        H = (
+            form.reshape(units, rows, rows, columns, columns)
+            .transpose(0, 1, 3, 2, 4)
+            .reshape(units, rows * columns, -1)
+        )
         pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
         out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 from ...core.errors import ConfigError
 
-LARGEST_RESIDUAL = 0.5  # peak residual beyond which the set of models that covers a population is too large for a robust observer
+LARGEST_RESIDUAL = (
+    0.5  # peak residual beyond which the set of models that covers a population is too large for a robust observer
+)
 NEGLIGIBLE_RESIDUAL = 0.1  # peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides
 TOLERANCE = 0.1  # the strongest prior whose held-out error exceeds the lowest by no more than this share is chosen
 GUARD = 2e-3  # spectral radii above one less this are penalised, so that the search slides along the edge of stability
@@ -69,7 +71,9 @@ class RefineOptions:
 
     def __post_init__(self) -> None:
         good = {
-            "horizons": len(self.horizons) > 0 and min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
+            "horizons": len(self.horizons) > 0
+            and min(self.horizons, default=0) >= 1
+            and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
             "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
             "balance": 0 <= self.balance <= 1,
@@ -81,4 +85,6 @@ class RefineOptions:
         }
         for name, fine in good.items():
             if not fine:
-                raise ConfigError(f"Refinement: {name} = {getattr(self, name)} is out of its range; see RefineOptions for what it may be.")
+                raise ConfigError(
+                    f"Refinement: {name} = {getattr(self, name)} is out of its range; see RefineOptions for what it may be."
+                )

@@ -54,10 +54,17 @@ def start_pooled(
 
 
 def refine_pooled(
-    V: Array, problem: RefinementProblem, error: Array, span: Array, score: Callable[[Array], float], options: RefineOptions
+    V: Array,
+    problem: RefinementProblem,
+    error: Array,
+    span: Array,
+    score: Callable[[Array], float],
+    options: RefineOptions,
 ) -> Array:
     """Fit one model to all units, horizons growing; shape (n_lifted, p)."""
-    few = replace(problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units))))
+    few = replace(
+        problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units)))
+    )
     found: list[tuple[float, float, Array]] = []
     sigma = problem.sigma
     for first, balance in options.starts:
@@ -71,9 +78,13 @@ def refine_pooled(
             edged = replace(few, sigma=sigma, guard=GUARD)
             kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, LEAST_GAIN)
             found.append((score(kept.V[0]), float(kept.cost[0]), kept.V))
-            log.debug("pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *found[-1][:2])
+            log.debug(
+                "pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *found[-1][:2]
+            )
     if not found:
-        log.warning("refinement of the pooled model: the best models are unstable, so it is sought among the stable ones")
+        log.warning(
+            "refinement of the pooled model: the best models are unstable, so it is sought among the stable ones"
+        )
         grown = _grow(V, problem, options, problem.admissible, 1)
         if grown is None:
             raise IdentificationError(
@@ -87,11 +98,17 @@ def refine_pooled(
 
 
 def _grow(
-    V: Array, problem: RefinementProblem, options: RefineOptions, admissible: Callable[[Array], npt.NDArray[np.bool_]], first: int
+    V: Array,
+    problem: RefinementProblem,
+    options: RefineOptions,
+    admissible: Callable[[Array], npt.NDArray[np.bool_]],
+    first: int,
 ) -> Array | None:
     """Minimise at growing horizons from the first one asked for, at most the longest; None where free runs diverge."""
     V = V.copy()
-    V[:, problem.lifting.n_states :] = problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
+    V[:, problem.lifting.n_states :] = (
+        problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
+    )
     for horizon in (h for h in options.horizons if h >= min(first, options.horizons[-1])):
         now = problem.at(horizon)
         solution = minimise(now.evaluate, admissible, V, options.iterations, LEAST_GAIN)

@@ -96,7 +96,9 @@ def refine_population(
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters}
     span = Ranges.of(factor, lifting.n_lifted, pooled)
     sizes = span.sizes(lifting, population.inputs)
-    found = _refine(scale_population(population, sizes), keys, lifting.in_sizes(sizes), values, span.factor(factor), pooled, options)
+    found = _refine(
+        scale_population(population, sizes), keys, lifting.in_sizes(sizes), values, span.factor(factor), pooled, options
+    )
     return found.in_channels(span.inverse)
 
 
@@ -117,7 +119,9 @@ def _refine(
     start, problem, error, span = start_pooled(lifting, parameters, factor, fitted, rows, options)
     spans = ranges(factor, rows, lifting)
     validation = HeldOutRuns(population, keys, lifting, parameters, rows, problem, spans)
-    common = refine_pooled(start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options)
+    common = refine_pooled(
+        start, restrict(problem, rows), error, span, lambda V: validation.trade_off([V], (np.inf,))[0].score, options
+    )
     prepared = _with_prior(problem, common, factor, rows)
     validation = replace(validation, problem=prepared)
     path, trade_off = _path(prepared, common, validation, options)
@@ -162,7 +166,9 @@ def _check(
 ) -> None:
     m = len(population.inputs) + len(lifting.input_functions)
     width = 2 * lifting.n_lifted + m
-    wrong = [name for name in lifting.parameters if name not in parameters or np.shape(parameters[name]) != (len(keys),)]
+    wrong = [
+        name for name in lifting.parameters if name not in parameters or np.shape(parameters[name]) != (len(keys),)
+    ]
     if factor.R.shape != (len(keys), width, width) or wrong or pooled.shape != (len(keys),) or not pooled.any():
         raise DimensionError(
             f"Refinement: {len(keys)} units with {lifting.n_lifted} lifted states and {m} inputs need factors of shape "
@@ -171,7 +177,9 @@ def _check(
         )
 
 
-def _with_prior(problem: RefinementProblem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]) -> RefinementProblem:
+def _with_prior(
+    problem: RefinementProblem, common: Array, factor: Factor, rows: npt.NDArray[np.int64]
+) -> RefinementProblem:
     """The problem of all units at the longest horizon, errors in units of those of the pooled model, with a prior around it."""
     edged = normalised(restrict(problem, rows), common[None])
     model = matrices_of(common, problem.T, problem.lifting.n_lifted)
@@ -181,10 +189,14 @@ def _with_prior(problem: RefinementProblem, common: Array, factor: Factor, rows:
 
 def _strengthen(problem: RefinementProblem, strength: float) -> RefinementProblem:
     """Give the prior a strength, in proportion to the residuals that a unit's free runs have."""
-    return problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
+    return (
+        problem if problem.prior is None else replace(problem, prior=problem.prior.scaled(strength * problem.residuals))
+    )
 
 
-def _path(problem: RefinementProblem, common: Array, validation: HeldOutRuns, options: RefineOptions) -> tuple[list[Array], list[TradeOff]]:
+def _path(
+    problem: RefinementProblem, common: Array, validation: HeldOutRuns, options: RefineOptions
+) -> tuple[list[Array], list[TradeOff]]:
     """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty."""
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
@@ -194,7 +206,12 @@ def _path(problem: RefinementProblem, common: Array, validation: HeldOutRuns, op
         V = _fit(now, V, options.path_iterations).V
         path.append(V)
         rows += validation.trade_off([V], (strength,))
-        log.debug("prior of strength %g: held-out score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
+        log.debug(
+            "prior of strength %g: held-out score %.4g, peak residual %.1f dB",
+            strength,
+            rows[-1].score,
+            rows[-1].peak_db,
+        )
         idle = len(rows) > _PATIENCE and rows[-1].score > (1 - TOLERANCE / 2) * rows[-1 - _PATIENCE].score
         if idle or _too_uncertain(rows[-1]):
             break
@@ -240,7 +257,9 @@ def _keep_bounded(
             return solution, strengths
         rows, strength = rows[sorted(found)], 10 * strength
         strengths[rows] = strength
-        log.warning("%s; fitted again with a prior of strength %g", "; ".join(found[i] for i in sorted(found)), strength)
+        log.warning(
+            "%s; fitted again with a prior of strength %g", "; ".join(found[i] for i in sorted(found)), strength
+        )
         part = replace(restrict(_strengthen(problem, strength), rows), pooled=False)
         V = np.repeat(common[None], len(rows), axis=0)
         solution = solution.updated(rows, _fit(part, V, options.iterations))

@@ -32,7 +32,9 @@ from .sensitivity import Normal, normal_equations
 Array = npt.NDArray[np.float64]
 _SAMPLES = 64  # residuals of a state that a segment contributes, at least
 _ROW_WEIGHT = 0.1  # of a lifted function's one-step error against a state's free-run error
-_LEAST_VARIANCE = 1e-10  # of the one-step error, relative to the mean square of the function; an earlier value is predicted exactly
+_LEAST_VARIANCE = (
+    1e-10  # of the one-step error, relative to the mean square of the function; an earlier value is predicted exactly
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +48,13 @@ class OneStep:
 
     @classmethod
     def of(
-        cls, R: Array, T: Array, n_states: int, n_lifted: int, n_samples: npt.NDArray[np.int64], pooled: npt.NDArray[np.int64]
+        cls,
+        R: Array,
+        T: Array,
+        n_states: int,
+        n_lifted: int,
+        n_samples: npt.NDArray[np.int64],
+        pooled: npt.NDArray[np.int64],
     ) -> OneStep:
         """Read them from factors of ``[Psi | Theta_plus]``, shape (unit, p + n_lifted, p + n_lifted); `pooled` units set the variance."""
         p = len(T)
@@ -56,7 +64,9 @@ class OneStep:
         rows = np.linalg.lstsq(mean[:p, :p], mean[:p, p:], rcond=None)[0].T
         left = np.diagonal(mean[p:, p:]) - np.sum(rows * mean[:p, p:].T, axis=1)
         own = np.stack([np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T for M in matrix])
-        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - np.sum(own * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2)
+        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - np.sum(
+            own * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2
+        )
         return cls(matrix, least, np.maximum(left, _LEAST_VARIANCE * np.diagonal(mean[p:, p:])), rows)
 
     def normal(self, rows: Array, row: int) -> Array:
@@ -64,7 +74,9 @@ class OneStep:
         p = rows.shape[-1]
         G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
         slope = c - (G @ rows[..., None])[..., 0]
-        rest = np.maximum(self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1) - self.least[:, row], 0.0)
+        rest = np.maximum(
+            self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1) - self.least[:, row], 0.0
+        )
         out = np.empty((len(rows), p + 1, p + 1))
         out[:, :p, :p], out[:, :p, p], out[:, p, :p], out[:, p, p] = G, slope, slope, rest
         return np.asarray(out / self.variance[row])

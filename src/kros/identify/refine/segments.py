@@ -72,7 +72,12 @@ class Segments:
 
 
 def read_segments(
-    population: Population, keys: Mapping[str, Sequence[EpisodeKey]], horizon: int, count: int, seed: int, history: int = 0
+    population: Population,
+    keys: Mapping[str, Sequence[EpisodeKey]],
+    horizon: int,
+    count: int,
+    seed: int,
+    history: int = 0,
 ) -> Segments:
     """Draw segments of every unit, those of its last episode at the end."""
     held = held_segments(count, keys)

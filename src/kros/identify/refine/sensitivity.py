@@ -48,7 +48,13 @@ class Normal:
 
 
 def normal_equations(
-    V: Array, T: Array, lifting: Lifting, parameters: Mapping[str, Array], segments: Segments, sigma: Array, stride: int = 1
+    V: Array,
+    T: Array,
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    segments: Segments,
+    sigma: Array,
+    stride: int = 1,
 ) -> Normal:
     """Run all segments with their unit's model and accumulate the normal equations, errors in units of sigma (n,), at every `stride`-th step."""
     n, h = lifting.n_states, segments.history
@@ -58,7 +64,20 @@ def normal_equations(
     W = np.repeat(np.moveaxis(V @ T.T, 0, -1), per_unit, axis=-1)  # (n, p, batch)
     x, u = segments.states.reshape(n_samples, n, batch), segments.inputs.reshape(n_samples, m, batch)
     window = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T.copy()
-    run = _Run(W, T, lifting, own, x, u, segments.valid.reshape(n_samples, batch), h, sigma, stride, units, _moving_past(lifting))
+    run = _Run(
+        W,
+        T,
+        lifting,
+        own,
+        x,
+        u,
+        segments.valid.reshape(n_samples, batch),
+        h,
+        sigma,
+        stride,
+        units,
+        _moving_past(lifting),
+    )
     matrix, squares = np.zeros((units, width, width)), np.zeros((units, n))
     with np.errstate(over="ignore", invalid="ignore"):
         for J in run.rows(window):
@@ -88,12 +107,19 @@ class _Run:
     def rows(self, window: Array) -> Iterator[Array]:
         """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from the first window on, which is moved on."""
         n, p, batch = self.W.shape
-        S = np.zeros((2 + max((d for _, _, d in self.past), default=0), n, n * p, batch))  # now, earlier, and space for the next
+        S = np.zeros(
+            (2 + max((d for _, _, d in self.past), default=0), n, n * p, batch)
+        )  # now, earlier, and space for the next
         loops = library()
         return self._in_numpy(window, S) if loops is None else self._compiled(loops, window, S)
 
     def _compiled(self, loops: Library, window: Array, S: Array) -> Iterator[Array]:
-        (n, p, batch), lifting, (n_samples, m), per_unit = self.W.shape, self.lifting, self.u.shape[:2], self.W.shape[2] // self.units
+        (n, p, batch), lifting, (n_samples, m), per_unit = (
+            self.W.shape,
+            self.lifting,
+            self.u.shape[:2],
+            self.W.shape[2] // self.units,
+        )
         entries = (*range(n), *(entry for entry, _, _ in self.past))
         tape = tape_of(lifting, m, entries)
         job = {
@@ -116,7 +142,10 @@ class _Run:
             "window": window,
             "S": S,
         }
-        of_lifting, total = formulas(lifting, tape, self.parameters, m, batch), (n_samples - 1 - self.history) // self.stride
+        of_lifting, total = (
+            formulas(lifting, tape, self.parameters, m, batch),
+            (n_samples - 1 - self.history) // self.stride,
+        )
         together = max(1, _AT_ONCE // (batch * n * (n * p + 1)))
         for start in range(0, total, together):
             count, first = min(together, total - start), self.history + start * self.stride
@@ -130,7 +159,12 @@ class _Run:
 
     def _in_numpy(self, window: Array, S: Array) -> Iterator[Array]:
         lifting, W, (n, p, batch), nl, h = self.lifting, self.W, self.W.shape, self.lifting.n_lifted, self.history
-        psi, work, F, kept = np.empty((p, batch)), np.empty((n * p, batch)), np.empty((n, n + len(self.past), batch)), list(S)
+        psi, work, F, kept = (
+            np.empty((p, batch)),
+            np.empty((n * p, batch)),
+            np.empty((n, n + len(self.past), batch)),
+            list(S),
+        )
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
             u = self.u[k]
@@ -149,7 +183,9 @@ class _Run:
         rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
         rows[:, :, ~valid] = 0.0
         n, width, batch = rows.shape
-        return rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3).reshape(self.units, width, -1)
+        return (
+            rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3).reshape(self.units, width, -1)
+        )
 
 
 def _moving_past(lifting: Lifting) -> list[Past]:

@@ -21,8 +21,16 @@ def peak_residual_db(A: Array, B: Array, output_scale: Array, input_scale: Array
     if len(A) < 2:
         return float("nan")
     z = np.exp(1j * np.pi * np.logspace(-_DECADES_BELOW_NYQUIST, 0, points))
-    G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j) * input_scale / output_scale[:, None]
-    inverse, G, every = pseudo_inverse_first(G), entries_first(G), np.arange(points)  # (m, n, unit, frequency) and (n, m, ...)
+    G = (
+        np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
+        * input_scale
+        / output_scale[:, None]
+    )
+    inverse, G, every = (
+        pseudo_inverse_first(G),
+        entries_first(G),
+        np.arange(points),
+    )  # (m, n, unit, frequency) and (n, m, ...)
     n_units = len(A)
 
     def bound_of(row: int) -> tuple[Array, Array]:
@@ -35,7 +43,9 @@ def peak_residual_db(A: Array, B: Array, output_scale: Array, input_scale: Array
         return largest, who
 
     def against(rows: Array, witness: Array) -> Array:
-        return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - G[:, :, None, witness, every]))
+        return sigma_max_first(
+            multiply(inverse[:, :, None, witness, every], G[:, :, rows] - G[:, :, None, witness, every])
+        )
 
     if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
         return -np.inf

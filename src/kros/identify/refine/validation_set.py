@@ -31,7 +31,11 @@ def free_run_errors(
 ) -> tuple[Array, Array, Array]:
     """Return what the free runs of several models, differ by from one episode of every unit: RMS, largest recorded, reached."""
     n, models = lifting.n_states, len(A)
-    rms, reached, top = np.full((models, len(keys), n), np.inf), np.full((models, len(keys), n), np.inf), np.zeros((len(keys), n))
+    rms, reached, top = (
+        np.full((models, len(keys), n), np.inf),
+        np.full((models, len(keys), n), np.inf),
+        np.zeros((len(keys), n)),
+    )
     for start in range(0, len(keys), _TOGETHER):
         episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
         by_length: dict[int, list[int]] = {}
@@ -39,11 +43,15 @@ def free_run_errors(
             by_length.setdefault(len(episode), []).append(row)
         for rows in by_length.values():
             own = {name: np.tile(values[rows], models) for name, values in parameters.items()}
-            rms[:, rows], top[rows], reached[:, rows] = _errors(A[:, rows], B[:, rows], lifting, own, [episodes[row] for row in rows])
+            rms[:, rows], top[rows], reached[:, rows] = _errors(
+                A[:, rows], B[:, rows], lifting, own, [episodes[row] for row in rows]
+            )
     return rms, top, reached
 
 
-def _errors(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]) -> tuple[Array, Array, Array]:
+def _errors(
+    A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
+) -> tuple[Array, Array, Array]:
     """Do the same for episodes of one length, in blocks of samples that stay in the cache: a run goes on from its last states."""
     n, h, (models, units), length = lifting.n_states, lifting.history, A.shape[:2], len(episodes[0])
     lifting.window.require(length)
@@ -52,7 +60,9 @@ def _errors(A: Array, B: Array, lifting: Lifting, parameters: Mapping[str, Array
     first = np.tile(np.stack([e[: h + 1, :n] for e in episodes]), (models, 1, 1))
     block = max(_LEAST, _AT_ONCE // (models * units * episodes[0].shape[1]))
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(0, length - h, block):  # samples k .. stop, of which the last h + 1 are where the next block starts
+        for k in range(
+            0, length - h, block
+        ):  # samples k .. stop, of which the last h + 1 are where the next block starts
             stop = min(k + block, length - h) + h
             ahead = min(stop + 1, length)
             u = np.tile(np.stack([e[k:ahead, n:] for e in episodes], axis=-1), (1, 1, models))
@@ -116,10 +126,17 @@ class HeldOutRuns:
         own = {name: values[self.rows] for name, values in self.parameters.items()}
         ends = [last[row] for row in self.rows]
         rms, top, _ = free_run_errors(models.A, models.B, self.lifting, own, self.population, ends)
-        span = np.where(top > 0, top, self.scales[0][: self.lifting.n_states])  # a state may rest at zero in the last episode
+        span = np.where(
+            top > 0, top, self.scales[0][: self.lifting.n_states]
+        )  # a state may rest at zero in the last episode
         percent = np.median(100 * rms / span, axis=1)
         score = np.mean((rms / self.problem.sigma) ** 2, axis=(1, 2))
         return tuple(
-            TradeOff(float(s), tuple(percent[i].tolist()), float(score[i]), peak_residual_db(models.A[i], models.B[i], *self.scales))
+            TradeOff(
+                float(s),
+                tuple(percent[i].tolist()),
+                float(score[i]),
+                peak_residual_db(models.A[i], models.B[i], *self.scales),
+            )
             for i, s in enumerate(strengths)
         )

@@ -63,7 +63,9 @@ class FilteredDifference:
         """
         del u, parameters
         if y.ndim != 3:
-            raise DimensionError(f"Filtered difference: measurements should have shape (n_samples, batch, q), found {y.shape}.")
+            raise DimensionError(
+                f"Filtered difference: measurements should have shape (n_samples, batch, q), found {y.shape}."
+            )
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for number, (measurement, state) in enumerate(self.pairs):
             rate = np.zeros(y.shape[1::-1])
@@ -112,7 +114,9 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
         truth = states[..., hidden[j]][inside]
         truth = (truth - truth.mean()) / (np.abs(truth).max(initial=0.0) or 1.0)
         for cutoff in cutoffs_hz(sample_period_s)[::4]:
-            rate = FilteredDifference(states.shape[-1], ((i, hidden[j]),), float(cutoff), sample_period_s).run(y, y[..., :0])
+            rate = FilteredDifference(states.shape[-1], ((i, hidden[j]),), float(cutoff), sample_period_s).run(
+                y, y[..., :0]
+            )
             rate = rate[..., hidden[j]][inside]
             rate = (rate - rate.mean()) / (np.abs(rate).max(initial=0.0) or 1.0)
             power = float(rate @ rate) * float(truth @ truth)

@@ -99,7 +99,8 @@ class ExtendedKalman:
         Q = self.Q.reshape(-1, 1, n, n)
         k, (n_samples, batch) = len(Q), y.shape[:2]
         values = {
-            name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in {**self.parameters, **(parameters or {})}.items()
+            name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))
+            for name, v in {**self.parameters, **(parameters or {})}.items()
         }
         if (loops := library()) is not None:
             return self._compiled(loops, y, u, values)
@@ -119,7 +120,9 @@ class ExtendedKalman:
                 PC, nu = P[..., C], y[sample] - x[..., C]
                 L = _divided(PC, PC[..., C, :] + self.R)
                 if gone[sample]:
-                    lost = np.asarray(missing[sample].any(axis=-1))  # a sample with a measurement missing is left out whole
+                    lost = np.asarray(
+                        missing[sample].any(axis=-1)
+                    )  # a sample with a measurement missing is left out whole
                     L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
                 x = x + (L @ nu[..., None])[..., 0]
                 P = P - L @ PC.swapaxes(-1, -2)
@@ -142,8 +145,23 @@ class ExtendedKalman:
         lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape
         Q, tape = self.Q.reshape(-1, n, n), tape_of(lifting, m, tuple(range(n)), of_inputs=False)
         states = np.empty((n_samples, len(Q), n, batch))
-        job = {"filters": len(Q), "samples": n_samples, "batch": batch, "q": len(self.measured), "slopes": len(tape.slopes)}
-        job |= {"A": self.A[:n], "B": self.B[:n], "Q": Q, "R": self.R, "P": self.P0, "y": y, "u": u, "measured": self.measured}
+        job = {
+            "filters": len(Q),
+            "samples": n_samples,
+            "batch": batch,
+            "q": len(self.measured),
+            "slopes": len(tape.slopes),
+        }
+        job |= {
+            "A": self.A[:n],
+            "B": self.B[:n],
+            "Q": Q,
+            "R": self.R,
+            "P": self.P0,
+            "y": y,
+            "u": u,
+            "measured": self.measured,
+        }
         job |= {"slope": tape.slopes, "states": states}
         loops.call("kros_kalman", formulas(lifting, tape, values, m, batch), ("kalman_job", job))
         return states.transpose(1, 0, 3, 2)
@@ -161,7 +179,9 @@ class ExtendedKalman:
         for step in range(d):
             found[:, step] = before[:, 0]  # nothing arrived but where to start
             inputs = np.broadcast_to(u[step : len(u) - d + step], (*before.shape[:-1], u.shape[-1]))
-            before = lifting.lift(before, values) @ self.A[:n].T + lifting.lift_inputs(inputs, before, values) @ self.B[:n].T
+            before = (
+                lifting.lift(before, values) @ self.A[:n].T + lifting.lift_inputs(inputs, before, values) @ self.B[:n].T
+            )
         found[:, d:] = before
         return found
 

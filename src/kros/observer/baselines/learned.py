@@ -43,7 +43,9 @@ class Features:
         outputs = y.reshape(-1, y.shape[-1])
         static = least_squares(inputs, outputs).T
         mean = outputs.mean(axis=0)
-        alone = np.mean((outputs - inputs @ static.T) ** 2, axis=0) > (1 - _EXPLAINED) * np.mean((outputs - mean) ** 2, axis=0)
+        alone = np.mean((outputs - inputs @ static.T) ** 2, axis=0) > (1 - _EXPLAINED) * np.mean(
+            (outputs - mean) ** 2, axis=0
+        )
         static[alone] = 0.0
         static[alone, 0] = mean[alone]
         return cls(lifting, tuple(measured), static, taps)
@@ -57,7 +59,9 @@ class Features:
     @cached_property
     def _bare(self) -> Lifting:
         """The lifting with these functions alone."""
-        return replace(self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=())
+        return replace(
+            self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=()
+        )
 
     def channels(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Return z, shape (n_samples, batch, channels), of y (n_samples, batch, q) and u (n_samples, batch, m); parameters of shape (batch,)."""
@@ -97,5 +101,7 @@ class Learned:
         for column, state in enumerate(self.estimated):
             weights = self.response[..., column]
             moving = irfft(np.einsum("fcb,cf->fb", spectrum, rfft(weights, size, axis=1), optimize=True), size, axis=0)
-            estimate[..., state] = self.constant[column] + first[0] @ weights.sum(axis=1) + moving[self.features.taps - 1 : len(z)]
+            estimate[..., state] = (
+                self.constant[column] + first[0] @ weights.sum(axis=1) + moving[self.features.taps - 1 : len(z)]
+            )
         return estimate

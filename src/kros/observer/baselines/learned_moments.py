@@ -67,7 +67,9 @@ class Moments:
                 group, h = (key.unit, key.condition), len(estimated)
                 if group not in found:
                     found[group] = np.zeros((h, *gram.shape)), np.zeros((h, len(gram))), np.zeros(h)
-                for into, new in zip(found[group], (gram / size[:, None, None] ** 2, cross.T / size[:, None], power), strict=True):
+                for into, new in zip(
+                    found[group], (gram / size[:, None, None] ** 2, cross.T / size[:, None], power), strict=True
+                ):
                     into += new
                 counts[group] = counts.get(group, 0) + 1
         for group, own in found.items():
@@ -96,9 +98,13 @@ class Moments:
             means = {condition: self._means(state, fold, condition) for condition in trained}
             for count in taps:
                 used, own = self._used(count), [i for i, choice in enumerate(tried) if choice.taps == count]
-                found = {c: solved(gram[np.ix_(used, used)], cross[used], _RIDGES) for c, (gram, cross) in means.items()}
+                found = {
+                    c: solved(gram[np.ix_(used, used)], cross[used], _RIDGES) for c, (gram, cross) in means.items()
+                }
                 weights = np.stack([found[tried[i].condition][_RIDGES.index(tried[i].ridge)] for i in own])
-                errors[state][np.ix_(own, held)] = np.stack([self._error(group, state, used, weights) for group in held], axis=1)
+                errors[state][np.ix_(own, held)] = np.stack(
+                    [self._error(group, state, used, weights) for group in held], axis=1
+                )
         members = [[i for i, group in enumerate(self.groups) if group[1] == condition] for condition in conditions]
         scores = sum(np.log(errors[..., rows].mean(axis=-1)) for rows in members)
         return tuple(tried[i] for i in np.argmin(scores, axis=-1))
@@ -113,7 +119,9 @@ class Moments:
     def estimator(self, without: Collection[str] = (), choices: Sequence[Choice] | None = None) -> Learned:
         """Train on all units but some; names of units that took no part are ignored."""
         if not set(self.units) - set(without):
-            raise DataError(f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units.")
+            raise DataError(
+                f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units."
+            )
         taps, h = self.features.taps, len(self.estimated)
         chosen = choices or (Choice(taps, RIDGE),) * h
         weights = np.zeros((self.gram.shape[-1], h))
@@ -204,7 +212,9 @@ def episode_moments(z: Array, truth: Array, taps: int) -> tuple[Array, Array, Ar
     blocks[:, 1:, :, 0] = product[:, 1 : 1 + c].transpose(2, 0, 1)
     sums[:, 0], sums[:, 1:] = level[0, 1 : 1 + c], product[:, 0].T
     rows[:, 0], rows[:, 1:] = level[1:, state], product[:, state].transpose(2, 0, 1)
-    gram = np.block([[np.full((1, 1), n_samples), sums.reshape(1, -1)], [sums.reshape(-1, 1), blocks.reshape(c * taps, -1)]])
+    gram = np.block(
+        [[np.full((1, 1), n_samples), sums.reshape(1, -1)], [sums.reshape(-1, 1), blocks.reshape(c * taps, -1)]]
+    )
     cross = np.concatenate([level[:1, state], rows.reshape(-1, h)])
     return gram / n_samples, cross / n_samples, np.mean(truth**2, axis=0)
 

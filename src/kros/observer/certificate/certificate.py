@@ -121,7 +121,9 @@ class ReliftCertificate:
         """Return what the certificate of an observer says of the same observer for signals divided by other sizes (`kros.observer.in_sizes`)."""
         x, u = factors(observer, sizes)
         n, lifting = observer.lifting.n_states, observer.lifting
-        by_name = dict(zip((*lifting.states, *observer.inputs), np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
+        by_name = dict(
+            zip((*lifting.states, *observer.inputs), np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True)
+        )
         errors = [by_name[name] for name, _ in lifting.window.quantities if name in lifting.states]
         y = x[list(observer.measured)]
         scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
@@ -145,14 +147,20 @@ class ReliftCertificate:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "relift")
         values: dict[str, Any] = {name: content[name] for name in _PLAIN}
-        values |= {"status": ReliftStatus(content["status"])} | {name: tuple(content[name]) for name in ("channels", "assumptions")}
+        values |= {"status": ReliftStatus(content["status"])} | {
+            name: tuple(content[name]) for name in ("channels", "assumptions")
+        }
         scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
         values |= {name: arrays[name] for name in _ARRAYS}
         return cls(scales=scales, **values)
 
     def __repr__(self) -> str:
         """Say what is proven, in a line."""
-        said = f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})" if self.certified else f"{self.status.value}: {self.reason}"
+        said = (
+            f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})"
+            if self.certified
+            else f"{self.status.value}: {self.reason}"
+        )
         return f"<ReliftCertificate {said}>"
 
 
@@ -200,12 +208,20 @@ def relift_certificate(
     """
     start = time.perf_counter()
     asked = ReliftCertificate(
-        scales or ReliftScales.ones(observer), _assumptions(observer, box, parameters), dict(box or {}), dict(parameters or {})
+        scales or ReliftScales.ones(observer),
+        _assumptions(observer, box, parameters),
+        dict(box or {}),
+        dict(parameters or {}),
     )
     try:
         system = asked.system(observer)
     except UnboundedSlopeError as error:
-        return replace(asked, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.", solve_s=time.perf_counter() - start)
+        return replace(
+            asked,
+            status=ReliftStatus.UNBOUNDED,
+            reason=f"No certificate: {error}.",
+            solve_s=time.perf_counter() - start,
+        )
     few, width = system.corner_count <= MOST_CORNERS, system.L.shape[1]
     corners = np.array(list(product((-1.0, 1.0), repeat=width))) if few else np.zeros((0, width))
     found, reason, status = prove(system)

@@ -75,7 +75,9 @@ class ReliftScales:
             values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             object.__setattr__(self, name, values)
             sized = (
-                np.all(values > 0) and np.isfinite(values).any() if name == "error" else np.isfinite(values).all() and np.all(values >= 0)
+                np.all(values > 0) and np.isfinite(values).any()
+                if name == "error"
+                else np.isfinite(values).all() and np.all(values >= 0)
             )
             if not sized:
                 raise DimensionError(f"Re-lift scales: {name} should be finite sizes above zero, found {values}.")
@@ -92,7 +94,9 @@ class ReliftScales:
 
     def with_internal(self, count: int) -> ReliftScales:
         """Return the scales for an observer with so many internal states: they have no residual, and their errors do not count."""
-        return ReliftScales(np.append(self.error, np.full(count, np.inf)), np.append(self.residual, np.zeros(count)), self.noise)
+        return ReliftScales(
+            np.append(self.error, np.full(count, np.inf)), np.append(self.residual, np.zeros(count)), self.noise
+        )
 
     @classmethod
     def ones(cls, observer: ObserverData) -> ReliftScales:
@@ -267,7 +271,10 @@ def error_system(
     enters[slots, range(width)] = 1.0
     arriving = np.zeros((width, sum(of.sizes)))
     arriving[:own] = omega[slots[:own]]
-    new = [after + enters @ held[-1] if delay else np.vstack([after[:n] + omega, after[n:]]), K.A @ of.xi(h, order) + K.B @ nu]
+    new = [
+        after + enters @ held[-1] if delay else np.vstack([after[:n] + omega, after[n:]]),
+        K.A @ of.xi(h, order) + K.B @ nu,
+    ]
     if delay:
         ahead = new[0]
         for i in range(1, delay + 1):
@@ -303,7 +310,9 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 
-def slope_box(observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
+def slope_box(
+    observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None
+) -> tuple[Array, Array]:
     """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names))."""
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
     ranges = {**(box or {}), **(parameters or {})}

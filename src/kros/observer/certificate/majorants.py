@@ -89,7 +89,10 @@ def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[
     peak, tried = np.zeros((n_bands, system.n_outputs)), len(theta)
     for remaining in reversed(range(_ROUNDS)):
         pieces = -(-len(theta) * max(system.n_states, 1) ** 2 // _AT_ONCE)
-        some = [enclosed.segments(*own) for own in zip(np.array_split(theta, pieces), np.array_split(half, pieces), strict=True)]
+        some = [
+            enclosed.segments(*own)
+            for own in zip(np.array_split(theta, pieces), np.array_split(half, pieces), strict=True)
+        ]
         T, reach = (np.concatenate(each) for each in zip(*some, strict=True))
         np.maximum.at(peak, band, np.sum(np.abs(T @ root[band][:, None]) ** 2, axis=-1).max(axis=1))
         allowed = _CLOSE * np.sqrt(np.maximum(peak, peak.mean(axis=0)))
@@ -128,7 +131,9 @@ def _least_above(rows: Array) -> Array:
         values, vectors = np.linalg.eigh((adjoint(rows) * mu[:, None, :]) @ rows + ridge)
         along = rows @ vectors
         height = ((along.real**2 + along.imag**2) @ (1 / np.sqrt(values))[..., None])[..., 0]
-        excess = height.max(axis=-1) / np.maximum(np.sum(mu * height, axis=-1), _TINY)  # of the trace over that of the dual
+        excess = height.max(axis=-1) / np.maximum(
+            np.sum(mu * height, axis=-1), _TINY
+        )  # of the trace over that of the dual
         better = excess < least[left]
         least[left] = np.minimum(least[left], excess)
         vectors, values = vectors[better], values[better]

@@ -144,7 +144,9 @@ def _proven(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain
     return R is not None and proven(R, [(A, B)], C, gain, D)
 
 
-def _stacked(modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain: float) -> tuple[Array, Array, Array, Array]:
+def _stacked(
+    modes: Sequence[tuple[float, ErrorSystem]], multipliers: Array, gain: float
+) -> tuple[Array, Array, Array, Array]:
     """Stack the steps of all modes, each times the root of its probability, and the outputs."""
     first = modes[0][1]
     n, width = len(first.A), first.L.shape[1]
@@ -193,7 +195,11 @@ def _root(A: Array, B: Array, C: Array, D: Array, gain: float, arriving: ErrorSy
         following = (following + following.T) / 2
         weighed = following @ enters
         inner = np.eye(enters.shape[2]) - D.T @ D - np.einsum("tij,tik->jk", enters, weighed)
-        if not np.isfinite(following).all() or np.linalg.eigvalsh(inner)[0] <= 0 or np.linalg.eigvalsh(following)[0] <= 0:
+        if (
+            not np.isfinite(following).all()
+            or np.linalg.eigvalsh(inner)[0] <= 0
+            or np.linalg.eigvalsh(following)[0] <= 0
+        ):
             return None
         K = np.linalg.solve(inner, np.einsum("tij,tik->jk", weighed, steps) + D.T @ C)
         done = np.abs(following - P).max() <= 1e-11 * np.abs(following).max()

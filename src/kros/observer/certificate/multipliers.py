@@ -32,7 +32,10 @@ _BINDING = 0.1
 def best_multipliers(H: Array, width: int) -> Array | None:
     """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability."""
     G, some = H[:, :width, :width], _MOST_FREQUENCIES // 2
-    largest = [np.argsort(-size)[:some] for size in (np.linalg.norm(H, axis=(1, 2)), _needed(G, _balanced(np.abs(G).max(axis=0))))]
+    largest = [
+        np.argsort(-size)[:some]
+        for size in (np.linalg.norm(H, axis=(1, 2)), _needed(G, _balanced(np.abs(G).max(axis=0))))
+    ]
     chosen = np.unique(np.concatenate([*largest, np.linspace(0, len(H) - 1, some).astype(int)]))
     for _ in range(_CUTS):
         t = _best(H[chosen], width)
@@ -94,7 +97,9 @@ def _stabilising(G: Array) -> Array | None:
             least, best = level, t
         if level > 0.999 * before and before >= _WELL_INSIDE and np.array_equal(binding, known):
             break
-    return best if least < 1 else None  # where little room is left, the centre at a looser level may be worse than what it began with
+    return (
+        best if least < 1 else None
+    )  # where little room is left, the centre at a looser level may be worse than what it began with
 
 
 def _balanced(size: Array) -> Array:
@@ -144,7 +149,9 @@ class _Barrier:
         R, through = _adjoint(H[:, :width]), H[:, width:, :width]
         sides = np.concatenate([-_adjoint(H[:, width:, width:]) @ through, R[:, width:]], axis=2)
         own, fixed = R[:, :width], -_adjoint(through) @ through
-        fixed = np.concatenate([np.concatenate([fixed, own], axis=2), np.concatenate([_adjoint(own), np.zeros_like(own)], axis=2)], axis=1)
+        fixed = np.concatenate(
+            [np.concatenate([fixed, own], axis=2), np.concatenate([_adjoint(own), np.zeros_like(own)], axis=2)], axis=1
+        )
         return cls(fixed, sizes, _adjoint(vectors) @ sides)
 
     def of_slopes(self) -> _Barrier:
@@ -167,7 +174,9 @@ class _Barrier:
         except np.linalg.LinAlgError:
             return None
         logs = 2 * np.log(np.einsum("fii->fi", root).real).sum() + len(M) * np.log(t).sum() + np.log(apart).sum()
-        return _Point(t, apart, room, self.looser, sides, M, -float(logs + (width * np.log(room) if np.isfinite(room) else 0.0)))
+        return _Point(
+            t, apart, room, self.looser, sides, M, -float(logs + (width * np.log(room) if np.isfinite(room) else 0.0))
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,7 +207,11 @@ class _Point:
         second, third = _adjoint(once) @ once, _adjoint(once) @ (once / self.apart[:, :, None])
         part = inverse @ second
         first = -(1 / self.apart).sum() - np.einsum("fii->", part).real
-        last = (self.apart**-2.0).sum() + 2 * np.einsum("fij,fji->", inverse, third).real + np.einsum("fij,fji->", part, part).real
+        last = (
+            (self.apart**-2.0).sum()
+            + 2 * np.einsum("fij,fji->", inverse, third).real
+            + np.einsum("fij,fji->", part, part).real
+        )
         mixed = _signed(weight * np.einsum("fij,fji->i", part, inverse).real)
         return np.append(gradient, first), np.vstack([np.column_stack([hessian, mixed]), np.append(mixed, last)])
 

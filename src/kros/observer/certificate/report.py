@@ -55,7 +55,9 @@ def relift_report(
 ) -> list[ReliftRow]:
     """Compare bounds and errors, episode by episode; recorded states stand for the true ones, so their noise is part of the residual."""
     if certificate.gain is None:
-        raise DimensionError(f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first.")
+        raise DimensionError(
+            f"Re-lift report of observer {observer.name}: it has no certificate ({certificate.reason}); certify it first."
+        )
     seen, lengths, scales = seen or course(observer, batch, estimates), batch.lengths, certificate.scales
     with np.errstate(divide="ignore", invalid="ignore"):
         w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
@@ -75,7 +77,13 @@ def relift_report(
     )
     root = np.sqrt(lengths)
     by_frozen = np.where(np.isnan(by_frozen), np.inf, by_frozen)
-    columns = (np.sqrt(energy["r"]), by_gain, np.sqrt(energy["z"]), np.minimum(by_gain, by_frozen), np.sqrt(energy["e"]))
+    columns = (
+        np.sqrt(energy["r"]),
+        by_gain,
+        np.sqrt(energy["z"]),
+        np.minimum(by_gain, by_frozen),
+        np.sqrt(energy["e"]),
+    )
     return [ReliftRow(unit, *(float(c[i] / root[i]) for c in columns)) for i, unit in enumerate(batch.units)]
 
 
@@ -124,11 +132,24 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
     noise[:late] = 0.0
     truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start, early)
     omega, recorded = held_residual(observer, truth, inputs, values), len(observer.recorded)
-    omega[: len(early), :, :recorded] -= early[: len(omega), :, :recorded]  # what is corrected beside the observer's gain
-    return Course(omega, noise, first_error(observer, truth[0] - start), truth - estimates, batch.lengths, inputs, y, batch.states - states)
+    omega[: len(early), :, :recorded] -= early[
+        : len(omega), :, :recorded
+    ]  # what is corrected beside the observer's gain
+    return Course(
+        omega,
+        noise,
+        first_error(observer, truth[0] - start),
+        truth - estimates,
+        batch.lengths,
+        inputs,
+        y,
+        batch.states - states,
+    )
 
 
-def held_residual(observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+def held_residual(
+    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None
+) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h, inputs = observer.lifting.history, observer.runtime.clip_inputs(inputs)
     if h:

@@ -58,7 +58,11 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
     multipliers, least = frequency_bound(system)
     if not np.isfinite(least):
         return
-    how = "Riccati equation with a multiplier for every slope" if len(multipliers) else "Riccati equation of the bounded-real lemma"
+    how = (
+        "Riccati equation with a multiplier for every slope"
+        if len(multipliers)
+        else "Riccati equation of the bounded-real lemma"
+    )
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
     least = max(least, _NOTHING * size, np.finfo(float).tiny)  # where nothing arrives, any small gain will do
     for factor in _STEPS:
@@ -175,6 +179,9 @@ def _single(H: Array) -> tuple[Array, float]:
     if lowest == 0.0:  # the slope does not reach the output
         return np.ones(1), float(np.linalg.norm(H[:, 1:, 1:], 2, axis=(1, 2)).max())
     found = minimize_scalar(
-        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])), bounds=_LOG_RANGE, method="bounded", options={"xatol": 1e-2}
+        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])),
+        bounds=_LOG_RANGE,
+        method="bounded",
+        options={"xatol": 1e-2},
     )
     return np.array([lowest * (1 + np.exp(found.x))]), float(np.sqrt(found.fun))

@@ -22,7 +22,10 @@ _MANY_CORNERS = 4  # beyond which one larger matrix is decided sooner
 def frozen_gain(system: ErrorSystem) -> float:
     """Return the largest gain that slopes frozen at a corner or in the middle attain."""
     width = system.L.shape[1]
-    places = [np.zeros(width), *(product((-1.0, 1.0), repeat=width) if width > 0 and system.corner_count <= MOST_CORNERS else ())]
+    places = [
+        np.zeros(width),
+        *(product((-1.0, 1.0), repeat=width) if width > 0 and system.corner_count <= MOST_CORNERS else ()),
+    ]
     return max(hinf_norm(system.frozen(place)) for place in places)
 
 

@@ -122,12 +122,17 @@ class SignalBound:
         facts |= {} if self.within is None else {"set_within_limits": self.within}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
         facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
-        return facts | {"set_cover_to_error_max": float(over.max()) if over.size else None, "set_outside": list(self.outside)}
+        return facts | {
+            "set_cover_to_error_max": float(over.max()) if over.size else None,
+            "set_outside": list(self.outside),
+        }
 
     def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""
         by = np.asarray(factors, dtype=float)
-        return replace(self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")})
+        return replace(
+            self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")}
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for a record; what is infinite is None."""
@@ -219,13 +224,19 @@ def signal_bound(
         return replace(found, reason="its error does not settle where slopes and limits rest")
     energies = _energies(signal, batch, known).of_units(batch.units)
     plant = StateSpace(
-        frozen.A, frozen.B, np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]), system.dt
+        frozen.A,
+        frozen.B,
+        np.vstack([system.C[:n], frozen.C]),
+        np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]),
+        system.dt,
     )
     # The cover is made for the errors and for what slopes act on: a matrix that no unit exceeds, where it matters.
     rough = majorants(plant, energies.edges, energies.energy.mean(axis=0))
     if rough is None:
         return replace(found, reason=_TOO_SHARP)
-    matter = np.einsum("p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough)
+    matter = np.einsum(
+        "p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough
+    )
     matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
     final = cover(energies.energy, matter)
     M = majorants(plant, energies.edges, final)
@@ -294,7 +305,11 @@ def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Cours
     keep = [*range(n), *(range(n, n + q) if noisy else ())]
     if observer.lifting.history:
         assert system.start is not None
-        earlier = [observer.lifting.states.index(name) for name, _ in observer.lifting.window.quantities if name in observer.lifting.states]
+        earlier = [
+            observer.lifting.states.index(name)
+            for name, _ in observer.lifting.window.quantities
+            if name in observer.lifting.states
+        ]
         spread = np.eye(nw)[earlier][:, :n]  # the first error and the earlier ones that equal it
         B = np.hstack([B, system.start @ spread * size[n + q :]])
         D = np.hstack([D, np.zeros((len(D), n))])

@@ -91,7 +91,9 @@ def identify_predictor(
     return embedded(name, past, model, inputs, few)
 
 
-def embedded(name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch, ridge: float = RIDGE) -> Observer:
+def embedded(
+    name: str, past: PastMoments, model: Model, inputs: Sequence[str], batch: EpisodeBatch, ridge: float = RIDGE
+) -> Observer:
     """Write a model F, G, H of `PastMoments.model` into an observer; the rows of the measured states are fitted to the recordings."""
     return embedded_with(name, past, model, inputs, batch, (ridge,))[0]
 
@@ -109,7 +111,9 @@ def embedded_with(
     turn = np.vstack([H, null_space(H / np.linalg.norm(H, axis=1)[:, None]).T])
     back = np.linalg.inv(turn)
     F, G = turn @ F @ back, turn @ G
-    rows = _measured_rows(F, G, past.channels(batch), batch.measurements(measured, arrived=False), batch.states[..., hidden], ridges)
+    rows = _measured_rows(
+        F, G, past.channels(batch), batch.measurements(measured, arrived=False), batch.states[..., hidden], ridges
+    )
     place = [*hidden, *range(n, n + internal)]
     channels = [*range(q), *(q + j for j in past.free), *range(q + m, q + m + len(lifting.functions))]
     widened = replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(internal))))
@@ -119,13 +123,28 @@ def embedded_with(
         raw = np.zeros((n + internal, q + m + len(lifting.functions)))  # of y, u and sigma, in place of z
         own = np.zeros((n + internal, n + internal))
         raw[np.ix_(place, channels)], own[np.ix_(place, place)] = G, F
-        raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = following[:, len(F) :], following[:, : len(F)]
+        raw[np.ix_(list(measured), channels)], own[np.ix_(list(measured), place)] = (
+            following[:, len(F) :],
+            following[:, : len(F)],
+        )
         raw[:, q : q + m] -= raw[:, :q] @ past.static
         raw[list(measured), range(q)] += 1.0
         own[:, list(measured)] = raw[:, :q]
         A = np.vstack([np.hstack([own, raw[:, q + m :]]), silent])
         B, D = (np.vstack([M, silent[:, : M.shape[1]]]) for M in (raw[:, q : q + m], raw[:, :q]))
-        return Observer(name, widened, A, B, measured, tuple(inputs), gain(D, dt), Injection.STATE, dt, replaces=True, internal=internal)
+        return Observer(
+            name,
+            widened,
+            A,
+            B,
+            measured,
+            tuple(inputs),
+            gain(D, dt),
+            Injection.STATE,
+            dt,
+            replaces=True,
+            internal=internal,
+        )
 
     return [observer(following) for following in rows]
 

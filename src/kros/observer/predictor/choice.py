@@ -102,12 +102,15 @@ def choose(
     def weights(of_states: npt.ArrayLike) -> dict[str, tuple[float, ...]]:
         own = {c: of_states if c in others else 1.0 for c in stressed}
         return {
-            c: tuple(map(float, np.where(counts > 0, own[c], 0.0) * (AT_LIMITS if c in beyond else 1.0))) for c, counts in stressed.items()
+            c: tuple(map(float, np.where(counts > 0, own[c], 0.0) * (AT_LIMITS if c in beyond else 1.0)))
+            for c, counts in stressed.items()
         }
 
     def judged(basis: Basis, of_states: npt.ArrayLike, deviation: float) -> Array:
         part, given = past.restricted(basis), weights(of_states)
-        return _held_out(past, stressed, lambda units, rows: part.errors(part.regression(units, deviation, given)[0])[rows])
+        return _held_out(
+            past, stressed, lambda units, rows: part.errors(part.regression(units, deviation, given)[0])[rows]
+        )
 
     tried = {poles: np.array([judged(Basis(delays[0], poles), s, DEVIATIONS[-1]) for s in shares]) for poles in lags}
     poles = lags[_first_good(np.array([[share @ tried[p].min(axis=0)] for p in lags]))]
@@ -136,7 +139,9 @@ def _orders(
     rows, hidden = list(zip(past.units, past.conditions, strict=True)), hidden_of(past.lifting, past.measured)
     ends = batch.lengths if until is None else np.minimum(np.asarray(until), batch.lengths)
     pieces = [(i, (key.unit, key.condition), 0, int(ends[i])) for i, key in enumerate(batch.keys)]
-    pieces += [(i, (key.unit, limited(key.condition)), int(ends[i]), int(batch.lengths[i])) for i, key in enumerate(batch.keys)]
+    pieces += [
+        (i, (key.unit, limited(key.condition)), int(ends[i]), int(batch.lengths[i])) for i, key in enumerate(batch.keys)
+    ]
     pieces = [piece for piece in pieces if piece[3] > piece[2] and piece[1] in rows]
 
     def missed(units: Sequence[str], which: list[int]) -> Array:
@@ -159,7 +164,9 @@ def _orders(
     return list(_held_out(past, emphasis, missed).T)
 
 
-def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable[[list[str], list[int]], Array]) -> Array:
+def _held_out(
+    past: PastMoments, emphasis: Mapping[str, Array], missed: Callable[[list[str], list[int]], Array]
+) -> Array:
     """Mean over units, weighted over conditions, of logarithms of root mean square errors on units left out, shape (h, ...) as a row of `missed`."""
     names = list(dict.fromkeys(past.units))
     folds = [names[i::FOLDS] for i in range(min(FOLDS, len(names)))]
@@ -170,7 +177,9 @@ def _held_out(past: PastMoments, emphasis: Mapping[str, Array], missed: Callable
     total: Array = np.zeros(1)
     weights: Array = np.zeros(1)
     for condition, counts in emphasis.items():
-        own = [found[i] for i, other in enumerate(past.conditions) if other == condition and np.isfinite(found[i]).all()]
+        own = [
+            found[i] for i, other in enumerate(past.conditions) if other == condition and np.isfinite(found[i]).all()
+        ]
         if own:
             shape = (-1,) + (1,) * (own[0].ndim - 1)
             total = total + counts.reshape(shape) * np.mean(np.log(own), axis=0) / 2

@@ -38,10 +38,17 @@ Array = npt.NDArray[np.float64]
 _DAMPING = Damping(1e-7, 1e-2, 1e6, 6.0)
 _THIN = 4
 _FREQUENCIES = 400
-_MARGIN, _SHORT, _BARRIER = 0.25, 0.9, 1e-3  # of the circle criterion without a gain, of the way to it, and weight of its logarithm
+_MARGIN, _SHORT, _BARRIER = (
+    0.25,
+    0.9,
+    1e-3,
+)  # of the circle criterion without a gain, of the way to it, and weight of its logarithm
 _TINY = 1e-6
 _ABOUT = (-2.0, -1.0, -0.5, 0.0, 0.5, 1.0, 2.0)  # widths of a resonance
-_COUPLED, _ROUNDS = 0.3, 60  # share of the room that slopes may take in the beginning, and of the search for their multipliers
+_COUPLED, _ROUNDS = (
+    0.3,
+    60,
+)  # share of the room that slopes may take in the beginning, and of the search for their multipliers
 
 
 def with_limits(observer: Observer, lower: npt.ArrayLike, upper: npt.ArrayLike) -> Observer:
@@ -52,14 +59,28 @@ def with_limits(observer: Observer, lower: npt.ArrayLike, upper: npt.ArrayLike) 
     n, recorded = observer.lifting.n_states, len(observer.recorded)
     sides = [np.asarray(side, dtype=float) for side in (lower, upper)]
     at = [i for i in range(recorded) if i not in observer.measured and any(np.isfinite(side[i]) for side in sides)]
-    place = [*range(n), *at, *range(n, observer.lifting.n_lifted)]  # of the widened states: every raw one begins as a copy
+    place = [
+        *range(n),
+        *at,
+        *range(n, observer.lifting.n_lifted),
+    ]  # of the widened states: every raw one begins as a copy
     A, B, D = observer.A[np.ix_(place, place)], observer.B[place], observer.controller.D[place]
     A[:, at] = 0.0
-    lifting = replace(observer.lifting, states=(*observer.lifting.states, *(f"memory_{n - recorded + i + 1}" for i in range(len(at)))))
+    lifting = replace(
+        observer.lifting, states=(*observer.lifting.states, *(f"memory_{n - recorded + i + 1}" for i in range(len(at))))
+    )
     none = np.full(len(lifting.states) - recorded, np.inf)
     runtime = replace(observer.runtime, lower=np.append(sides[0], -none), upper=np.append(sides[1], none), relift=True)
     controller = gain(D, observer.sample_period_s)
-    return replace(observer, lifting=lifting, A=A, B=B, controller=controller, internal=observer.internal + len(at), runtime=runtime)
+    return replace(
+        observer,
+        lifting=lifting,
+        A=A,
+        B=B,
+        controller=controller,
+        internal=observer.internal + len(at),
+        runtime=runtime,
+    )
 
 
 def limited_states(observer: Observer) -> list[int]:
@@ -69,7 +90,9 @@ def limited_states(observer: Observer) -> list[int]:
     return at if len(at) <= observer.internal and np.array_equal(observer.A[at], observer.A[n - len(at) : n]) else []
 
 
-def conditioned(observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 40) -> Observer:
+def conditioned(
+    observer: Observer, batch: EpisodeBatch, importance: npt.ArrayLike = 1.0, iterations: int = 40
+) -> Observer:
     """Return a predictor of `with_limits` with the gain that is best on recordings that meet the limits."""
     problem = _Conditioning(observer, batch, importance)
     start = problem.at(np.zeros((len(problem.F), len(problem.raw))), problem.stability.first)
@@ -155,7 +178,9 @@ class _Conditioning:
             estimates, slopes = self._run(gain)
             missed = self.truth - estimates
             criterion = mean_log(self.share.ravel(), np.mean(missed**2, axis=0).ravel())
-        return _Point(gain, multipliers, missed, slopes, criterion + _BARRIER * self.stability.barrier(gain, multipliers))
+        return _Point(
+            gain, multipliers, missed, slopes, criterion + _BARRIER * self.stability.barrier(gain, multipliers)
+        )
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
         """Gauss-Newton steps, those of the barrier included."""
@@ -169,7 +194,10 @@ class _Conditioning:
         traces = np.trace(moved, axis1=2, axis2=3).real.mean(axis=1)
         moved = moved.reshape(size, -1)
         rows, frequencies = len(point.missed[::_THIN]), len(white)
-        H, g, sizes = scaled(X @ X.T / rows + _BARRIER * (moved @ moved.conj().T).real / frequencies, X @ missed / rows + _BARRIER * traces)
+        H, g, sizes = scaled(
+            X @ X.T / rows + _BARRIER * (moved @ moved.conj().T).real / frequencies,
+            X @ missed / rows + _BARRIER * traces,
+        )
 
         def trial(damping: float) -> _Point:
             step = (np.linalg.solve(H + damping * np.eye(size), g) / sizes).reshape(point.gain.shape)
@@ -184,7 +212,10 @@ class _Conditioning:
         n_samples, batch = self.drive.shape[:2]
         F, raw, limits = self.F.T, self.raw, np.array(self.limits)
         h, moved = self.start.copy(), np.zeros((batch, gain.size, len(self.F)))
-        estimates, slopes = np.empty(self.truth.shape), np.empty((-(-n_samples // _THIN), batch, gain.size, len(self.shown)))
+        estimates, slopes = (
+            np.empty(self.truth.shape),
+            np.empty((-(-n_samples // _THIN), batch, gain.size, len(self.shown))),
+        )
         by_gain = np.eye(gain.size).reshape(gain.size, *gain.shape)  # (parameter, row, limit)
         for k in range(n_samples):
             excess = np.clip(h[:, raw], self.lower, self.upper) - h[:, raw]
@@ -218,7 +249,10 @@ class _Stability:
 
     def __init__(self, observer: Observer, rows: list[int], raw: list[int]) -> None:
         system, t = _slopes_of(observer)
-        out, into = np.vstack([np.eye(len(system.A))[raw], system.M]), np.hstack([np.eye(len(system.A))[:, rows], system.L])
+        out, into = (
+            np.vstack([np.eye(len(system.A))[raw], system.M]),
+            np.hstack([np.eye(len(system.A))[:, rows], system.L]),
+        )
         poles = np.linalg.eigvals(system.A)
         width, angle = 1 - np.abs(poles), np.abs(np.angle(poles))
         near = (angle + np.multiply.outer(_ABOUT, width)).ravel()
@@ -234,8 +268,14 @@ class _Stability:
             t = t * max(coupled / _COUPLED, _TINY) ** 2
             steps = (t * 4.0**k for k in range(_ROUNDS // 2))
             found = next((larger for larger in steps if np.isfinite(self.barrier(none, larger))), None)
-            if found is None:  # between the frequencies that were looked at slopes let errors grow: the limits alone are left
-                self.slopes, self.by_gain, self.by_slopes = 0, self.by_gain[:, : self.limits], self.by_slopes[:, : self.limits, :0]
+            if (
+                found is None
+            ):  # between the frequencies that were looked at slopes let errors grow: the limits alone are left
+                self.slopes, self.by_gain, self.by_slopes = (
+                    0,
+                    self.by_gain[:, : self.limits],
+                    self.by_slopes[:, : self.limits, :0],
+                )
             t = np.ones(0) if found is None else found
         self.first = t
         self.margin = _MARGIN * float(np.linalg.eigvalsh(self.distance(none, self.first))[:, 0].min())
@@ -274,6 +314,9 @@ class _Stability:
         if not self.slopes or not gain.any():
             return t
         found = minimize(
-            lambda log: self.barrier(gain, t * np.exp(log)), np.zeros(len(t)), method="Nelder-Mead", options={"maxiter": _ROUNDS}
+            lambda log: self.barrier(gain, t * np.exp(log)),
+            np.zeros(len(t)),
+            method="Nelder-Mead",
+            options={"maxiter": _ROUNDS},
         )
         return np.asarray(t * np.exp(found.x))

@@ -199,7 +199,11 @@ class PastMoments:
         return self.balanced(without, importance, deviation, weights).model(order)
 
     def balanced(
-        self, without: Sequence[str] = (), importance: npt.ArrayLike = 1.0, deviation: float = 0.0, weights: Weights | None = None
+        self,
+        without: Sequence[str] = (),
+        importance: npt.ArrayLike = 1.0,
+        deviation: float = 0.0,
+        weights: Weights | None = None,
     ) -> Balanced:
         """Return what all orders of `model` have in common."""
         W, P, left = self.regression(without, deviation, weights)
@@ -215,7 +219,9 @@ class PastMoments:
         leading = np.linalg.eigh(root @ P @ root.T)[1][:, ::-1]
         return Balanced(S, E, W, P, leading.T @ root, inverse @ leading)
 
-    def regression(self, without: Sequence[str] = (), deviation: float = 0.0, weights: Weights | None = None) -> tuple[Array, Array, Array]:
+    def regression(
+        self, without: Sequence[str] = (), deviation: float = 0.0, weights: Weights | None = None
+    ) -> tuple[Array, Array, Array]:
         """Regress the hidden states on the basis.
 
         Parameters
@@ -242,7 +248,9 @@ class PastMoments:
         power, share = self.power[rows], np.ones((len(rows), self.power.shape[1]))
         if weights is not None:
             own = [self.conditions[i] for i in rows]
-            share = np.array([np.broadcast_to(np.asarray(weights.get(c, 0.0)), power.shape[1:]) / own.count(c) for c in own])
+            share = np.array(
+                [np.broadcast_to(np.asarray(weights.get(c, 0.0)), power.shape[1:]) / own.count(c) for c in own]
+            )
         share = share / share.sum(axis=0)
         found = self._solved(rows, share, deviation)
         for _ in range(_REWEIGHTED if weights is not None else 0):
@@ -261,7 +269,9 @@ class PastMoments:
         """Solve the normal equations of rows that count by shares, shape (row, h) of sum one for every hidden state."""
         channels, power = self.n_channels, np.sum(share * self.power[rows], axis=0)
 
-        every = np.zeros((share.shape[1] + 1, len(self.gram)))  # rows that take no part count nothing: no copy of the others
+        every = np.zeros(
+            (share.shape[1] + 1, len(self.gram))
+        )  # rows that take no part count nothing: no copy of the others
         every[0, rows], every[1:, rows] = share.mean(axis=1), share.T
         alike = bool(np.allclose(every[1:], every[0]))
         pooled = np.tensordot(every[:1] if alike else every, self.gram, 1)
@@ -313,7 +323,9 @@ class Balanced:
     def model(self, order: int) -> Model:
         """Return the model F, G, H of an order."""
         if not len(self.W) <= order:
-            raise DimensionError(f"Predictor: {len(self.W)} hidden states need an order of at least as many, found {order}.")
+            raise DimensionError(
+                f"Predictor: {len(self.W)} hidden states need an order of at least as many, found {order}."
+            )
         down, up = self.down[:order], self.up[:, :order]
         scale = np.sqrt(np.diag(down @ self.P @ down.T))
         down, up = down / scale[:, None], up * scale
@@ -340,7 +352,11 @@ def followed_inputs(inputs: Array, y: Array, truth: Array) -> tuple[Array, tuple
     static = _static(inputs, y, in_motion(truth))
     left = _centred(y - inputs @ static.T).std(axis=0)
     static = np.where((left < _FOLLOWS * _centred(y).std(axis=0))[:, None], static, 0.0)
-    share = np.abs(static) * _centred(inputs).std(axis=0) / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
+    share = (
+        np.abs(static)
+        * _centred(inputs).std(axis=0)
+        / np.maximum(_centred(y).std(axis=0), np.finfo(float).tiny)[:, None]
+    )
     return static, tuple(int(j) for j in np.flatnonzero(share.max(axis=0) < _FOLLOWS))
 
 
@@ -377,10 +393,18 @@ def _static(inputs: Array, y: Array, moving: bool) -> Array:
     return (best[:m] / np.where(size > 0, size, 1.0)[:m, None]).T
 
 
-def _channels(lifting: Lifting, measured: tuple[int, ...], static: Array, free: tuple[int, ...], batch: EpisodeBatch) -> Array:
-    y, u, x = batch.measurements(measured, arrived=False), batch.inputs, np.zeros((*batch.states.shape[:-1], lifting.n_states))
+def _channels(
+    lifting: Lifting, measured: tuple[int, ...], static: Array, free: tuple[int, ...], batch: EpisodeBatch
+) -> Array:
+    y, u, x = (
+        batch.measurements(measured, arrived=False),
+        batch.inputs,
+        np.zeros((*batch.states.shape[:-1], lifting.n_states)),
+    )
     x[..., list(measured)] = y
-    return np.concatenate([y - u @ static.T, u[..., list(free)], lifting.lift(x, batch.parameters)[..., lifting.n_states :]], axis=-1)
+    return np.concatenate(
+        [y - u @ static.T, u[..., list(free)], lifting.lift(x, batch.parameters)[..., lifting.n_states :]], axis=-1
+    )
 
 
 def _basis_states(basis: Basis, z: Array, rows: npt.NDArray[np.intp], slow: int) -> Array:

@@ -51,7 +51,9 @@ class Sensitivities:
         share = np.stack([H, -H @ behind])
         responses = np.zeros((len(H), n, n + channels, channels, order))
         responses[:, :, :n] = np.einsum("zoi,zikjc->oijck", share, again, optimize=True)
-        responses[:, :, range(n, n + channels), range(channels)] = np.einsum("zoi,zik->oik", share, filtered)[:, :, None]
+        responses[:, :, range(n, n + channels), range(channels)] = np.einsum("zoi,zik->oik", share, filtered)[
+            :, :, None
+        ]
         # What was constant before the first sample stays so.
         held = np.linalg.solve(np.eye(n) - F, np.hstack([G, np.eye(n)]))
         at_rest = np.hstack([held[:, :channels].T, np.eye(channels)])[self._resting]

@@ -58,7 +58,9 @@ def with_start(
     moving = np.concatenate([y_w[0], u_w[0]], axis=-1) @ seen.T
     start, still = None, at_rest(seen, moving, np.concatenate([y[0], u[0]], axis=-1) @ seen.T, in_motion(truth))
     for _ in range(_ROUNDS):
-        known = run_observer(replace(alone, start_in_motion=start), y, u, own)[window].reshape(count + 1, -1, len(hidden))
+        known = run_observer(replace(alone, start_in_motion=start), y, u, own)[window].reshape(
+            count + 1, -1, len(hidden)
+        )
         gain = regressed(moving, np.where(hidden, known[0] - rest, 0.0)) @ seen
         if not shows_motion(gain @ np.concatenate([y[0], u[0]], axis=-1).T, (known[0] - rest).T, truth):
             gain, still = np.zeros_like(gain), still[:0]

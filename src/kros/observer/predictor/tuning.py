@@ -77,7 +77,12 @@ class _Tuning:
     """Recordings to tune on, samples on the last axis."""
 
     def __init__(
-        self, past: PastMoments, batch: EpisodeBatch, importance: npt.ArrayLike, deviation: float, weights: Weights | None
+        self,
+        past: PastMoments,
+        batch: EpisodeBatch,
+        importance: npt.ArrayLike,
+        deviation: float,
+        weights: Weights | None,
     ) -> None:
         hidden = hidden_of(past.lifting, past.measured)
         seen, truth = past.channels(batch), batch.states[..., hidden]
@@ -100,7 +105,8 @@ class _Tuning:
         conditions = [condition for _, condition in names]
         counts = np.array(
             [
-                np.broadcast_to(np.asarray((weights or {"": 1.0}).get(c, 0.0), dtype=float), len(hidden)) / conditions.count(c)
+                np.broadcast_to(np.asarray((weights or {"": 1.0}).get(c, 0.0), dtype=float), len(hidden))
+                / conditions.count(c)
                 for c in conditions
             ]
         )
@@ -110,7 +116,9 @@ class _Tuning:
         self.each = _alike(rows)
         first = [i for i in range(len(rows)) if not weights or i % len(own) == rows.index(rows[i])]
         each = _alike([rows[i] for i in first])
-        self.curved = [(first[i : i + _SIDE_BY_SIDE], each[i : i + _SIDE_BY_SIDE]) for i in range(0, len(first), _SIDE_BY_SIDE)]
+        self.curved = [
+            (first[i : i + _SIDE_BY_SIDE], each[i : i + _SIDE_BY_SIDE]) for i in range(0, len(first), _SIDE_BY_SIDE)
+        ]
         self.rest = np.zeros(z.shape[:2])
         self.rest[lifted] = z[lifted, :, 0]
         self.free = in_motion(batch.states[..., hidden])
@@ -122,7 +130,11 @@ class _Tuning:
         with np.errstate(over="ignore", invalid="ignore"):
             free = self._free(blocks)
             for part in self._parts():
-                np.add.at(found, self.group[part], np.mean(self.missed(blocks, part, free) ** 2, axis=-1).T * self.each[part, None])
+                np.add.at(
+                    found,
+                    self.group[part],
+                    np.mean(self.missed(blocks, part, free) ** 2, axis=-1).T * self.each[part, None],
+                )
             return _Point(blocks, found, mean_log(self.share.ravel(), found.ravel()))
 
     def steps(self, point: _Point) -> Callable[[float], _Point]:
@@ -134,7 +146,9 @@ class _Tuning:
         width, back = into.shape[1], np.linalg.pinv(out)
         weight = (self.share / np.maximum(point.errors, _TINY))[self.group]
         parameters = n * (width + outputs)
-        every = max(1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters)))
+        every = max(
+            1, int(self.truth[0, 0].size * sum(len(part) for part, _ in self.curved) * outputs / (_ROWS * parameters))
+        )
 
         def turned(rows: Array) -> Array:
             """Coefficients, rows, in directions that are those of white states."""
@@ -143,8 +157,14 @@ class _Tuning:
             direct = np.einsum("nk,onr->okr", out, direct.reshape(outputs, n, -1)).reshape(-1, direct.shape[1])
             return np.concatenate([inner, direct])
 
-        H = self._curvature(blocks, weight, into, every) if free is None else self._curvature_of_free(blocks, free, weight, into, every)
-        H, g, size = scaled(turned(turned(H).T), turned(self._gradient(point, free, weight * self.each[:, None], into))[:, 0])
+        H = (
+            self._curvature(blocks, weight, into, every)
+            if free is None
+            else self._curvature_of_free(blocks, free, weight, into, every)
+        )
+        H, g, size = scaled(
+            turned(turned(H).T), turned(self._gradient(point, free, weight * self.each[:, None], into))[:, 0]
+        )
         slows = np.hstack([_slowing(model[0]), np.zeros((n, len(self.z)))]) @ into
         outward = turned(np.concatenate([slows.ravel(), np.zeros(outputs * n)]))[:, 0] / size
         outward /= np.linalg.norm(outward)
@@ -178,7 +198,9 @@ class _Tuning:
             found = found + rows.T @ rows
         return np.asarray(found)
 
-    def _curvature_of_free(self, blocks: Sequence[Block], free: FreeStart, weight: Array, into: Array, every: int) -> Array:
+    def _curvature_of_free(
+        self, blocks: Sequence[Block], free: FreeStart, weight: Array, into: Array, every: int
+    ) -> Array:
         """The same where every recording has a start of its own, which moves the states that coefficients multiply."""
         outputs, n = len(self.truth), len(into) - len(self.z)
         H = np.zeros((n * (into.shape[1] + outputs),) * 2)
@@ -190,14 +212,19 @@ class _Tuning:
             direct = np.zeros((outputs, *h[..., ::every].shape[:1], outputs, *h[..., ::every].shape[1:]))
             direct[range(outputs), :, range(outputs)] = h[..., ::every]
             root = np.sqrt(weight[part].T * each / h[0, 0, ::every].size)[..., None]
-            X = np.concatenate([(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)])
+            X = np.concatenate(
+                [(part_of * root).reshape(-1, root[..., 0].size * inner.shape[-1]) for part_of in (inner, direct)]
+            )
             H += X @ X.T
         return H
 
     def _gradient(self, point: _Point, free: FreeStart | None, weight: Array, into: Array) -> Array:
         """How fast the weighted squares fall with all coefficients, of all recordings and samples."""
         blocks = point.blocks
-        inner, direct = np.zeros((sum(len(b.F) for b in blocks), len(into))), np.zeros((len(self.truth), sum(len(b.F) for b in blocks)))
+        inner, direct = (
+            np.zeros((sum(len(b.F) for b in blocks), len(into))),
+            np.zeros((len(self.truth), sum(len(b.F) for b in blocks))),
+        )
         F, _, H = joined(blocks)
         backwards = [Block(b.F.T, b.H.T, b.H) for b in blocks]
         for part in self._parts():
@@ -231,11 +258,15 @@ class _Tuning:
         missed = self.truth[:, part] - estimates_along(blocks, self.z[:, part], self.rest[:, part])
         return missed if free is None else free.without(missed)
 
-    def states(self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None, every: int = 1) -> tuple[Array, Array]:
+    def states(
+        self, blocks: Sequence[Block], part: slice | list[int], free: FreeStart | None, every: int = 1
+    ) -> tuple[Array, Array]:
         """Return states of all blocks on some episodes, shape (n, batch, n_samples / every), and their rest, shape (n, batch)."""
         h, rest = states_along(blocks, self.z[:, part], self.rest[:, part], every)
         if free is not None:
-            h += free.moved(free.fitted(self.truth[:, part] - estimates_along(blocks, self.z[:, part], self.rest[:, part])), every)
+            h += free.moved(
+                free.fitted(self.truth[:, part] - estimates_along(blocks, self.z[:, part], self.rest[:, part])), every
+            )
         return h, rest
 
     def _free(self, blocks: Sequence[Block]) -> FreeStart | None:

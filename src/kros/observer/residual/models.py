@@ -55,7 +55,9 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     counted[:, np.arange(regressors.shape[1]) % _THIN != 0] = False
     regressors, following = regressors[counted], x[:, h + 1 :][counted]
     if len(regressors) < regressors.shape[1]:
-        raise DataError(f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record more.")
+        raise DataError(
+            f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record more."
+        )
     W = least_squares(regressors, following).T
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
 
@@ -70,7 +72,9 @@ class Refitted:
     columns: tuple[int, ...]
 
 
-def refitted_models(lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch) -> tuple[list[Refitted], Array]:
+def refitted_models(
+    lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch
+) -> tuple[list[Refitted], Array]:
     """Return the model as identified and with rows fitted to single steps; measured rows with every choice of hidden ones."""
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
@@ -104,7 +108,9 @@ def residual_models(
     for model in refitted:
         dynamics = mean_error_dynamics(model.A, slopes)
         chosen = spectra[..., model.columns, :][..., model.columns]
-        promised = promised_errors(ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s))
+        promised = promised_errors(
+            ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
+        )
         models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
 

@@ -27,11 +27,18 @@ FEWEST_SAMPLES = 64  # samples of a segment
 
 
 def one_step_residual(
-    lifting: Lifting, A: Array, B: Array, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+    lifting: Lifting,
+    A: Array,
+    B: Array,
+    states: Array,
+    inputs: Array,
+    parameters: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Array:
     """Run the one-step model along recordings and return what it misses; A (n_lifted, n_lifted), B (n_lifted, m)."""
     if states.ndim != 3 or inputs.ndim != 3 or states.shape[:2] != inputs.shape[:2]:
-        raise DimensionError(f"One-step residual: states {states.shape} and inputs {inputs.shape} should agree in (n_samples, batch).")
+        raise DimensionError(
+            f"One-step residual: states {states.shape} and inputs {inputs.shape} should agree in (n_samples, batch)."
+        )
     n, h = lifting.n_states, lifting.history
     lifting.window.require(len(states), beyond=1)
     x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)
@@ -41,7 +48,9 @@ def one_step_residual(
     return np.swapaxes(x[:, h + 1 :] - predicted, 0, 1)
 
 
-def mean_slopes(lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+def mean_slopes(
+    lifting: Lifting, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> Array:
     """Return the lifted functions' slopes by the states at their mean over recordings, shape (p, n)."""
     n = lifting.n_states
     if not lifting.functions:
@@ -88,7 +97,9 @@ def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[st
         total[inside] += response[..., :, None] * response[..., None, :].conj()
         counts[inside] += 1
     if not np.isfinite(total).all():
-        raise DataError("Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model.")
+        raise DataError(
+            "Residual spectra: the residual contains NaN or infinity; look at the recordings and the nominal model."
+        )
     names = list(dict.fromkeys(units))
     member = np.array([[u == name for u in units] for name in names], dtype=float)
     return np.asarray(np.einsum("ub,bfij->ufij", member / (member @ counts)[:, None], total))

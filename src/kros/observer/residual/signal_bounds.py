@@ -40,7 +40,9 @@ _BASES = (Basis(4, (0.8, 0.95, 0.98)), Basis(8, (0.95, 0.98)), Basis(8, (0.9, 0.
 def signal_lower_bounds(A: Array, C: Array, noise: Array, signals: SignalSet, dt: float) -> Array:
     """Return root mean squares of every state's error that no correction of a model beats over the set; NaN where none is proven."""
     n, q = len(A), len(C)
-    size = 2.0 ** np.round(np.log2(np.sqrt(np.maximum(signals.energies.mean_square.mean(axis=0), np.finfo(float).tiny))))
+    size = 2.0 ** np.round(
+        np.log2(np.sqrt(np.maximum(signals.energies.mean_square.mean(axis=0), np.finfo(float).tiny)))
+    )
     A, C, signals = A * size / size[:, None], C * size, replace(signals, energies=signals.energies.scaled(size))
     C = C / noise[:, None]
     best, edges, mean = np.full(n, np.nan), signals.energies.edges, signals.energies.energy.mean(axis=0)
@@ -72,7 +74,9 @@ def _even(A: Array, C: Array, edges: Array, root: Array, points: int) -> Array:
     x, weight = np.polynomial.legendre.leggauss(points)
     theta = (edges[:-1, None] + edges[1:, None] + np.diff(edges)[:, None] * x) / 2
     n, q = len(A), len(C)
-    G = np.linalg.solve(np.exp(1j * theta)[..., None, None] * np.eye(n) - A, np.broadcast_to(root[:, None], (*theta.shape, n, n)))
+    G = np.linalg.solve(
+        np.exp(1j * theta)[..., None, None] * np.eye(n) - A, np.broadcast_to(root[:, None], (*theta.shape, n, n))
+    )
     seen = C @ G
     removed = adjoint(seen) @ np.linalg.solve(np.eye(q) + seen @ adjoint(seen), seen)
     P = np.einsum("bpij,bpjk,bpik->bpi", G, np.eye(n) - removed, G.conj(), optimize=True).real

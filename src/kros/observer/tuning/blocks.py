@@ -72,7 +72,11 @@ def estimates_along(blocks: Sequence[Block], z: Array, rest: Array) -> Array:
 
 def _in_pairs(blocks: Sequence[Block]) -> Model:
     """Blocks side by side, shapes (b, 2, 2), (b, 2, channels), (h, b, 2); one of one state has a second one that nothing moves."""
-    F, G, H = np.zeros((len(blocks), 2, 2)), np.zeros((len(blocks), 2, blocks[0].G.shape[1])), np.zeros((len(blocks[0].H), len(blocks), 2))
+    F, G, H = (
+        np.zeros((len(blocks), 2, 2)),
+        np.zeros((len(blocks), 2, blocks[0].G.shape[1])),
+        np.zeros((len(blocks[0].H), len(blocks), 2)),
+    )
     for i, b in enumerate(blocks):
         own = slice(len(b.F))
         F[i, own, own], G[i, own], H[:, i, own] = b.F, b.G, b.H
@@ -90,7 +94,9 @@ def moved(blocks: Sequence[Block], signals: Array, every: int, first: int) -> Ar
     for i, block in enumerate(blocks):
         for j, one in enumerate(filtered(signals, rest, *block._poles, every)):
             held[:, 2 * i + j] = one[..., first:]
-    share = np.stack([part for b in blocks for part in (b.H @ b.G, -b.H @ b.behind @ b.G)], axis=-1)  # (h, channels, 2 * blocks)
+    share = np.stack(
+        [part for b in blocks for part in (b.H @ b.G, -b.H @ b.behind @ b.G)], axis=-1
+    )  # (h, channels, 2 * blocks)
     return np.asarray(share.swapaxes(0, 1)[:, None] @ held.reshape(*held.shape[:2], -1))
 
 
@@ -102,7 +108,9 @@ def blocks_of(F: Array, G: Array, H: Array) -> list[Block]:
         turn = _modes(F)
     back = np.asarray(np.linalg.inv(turn), dtype=float)
     f, g, h = back @ F @ turn, back @ G, H @ turn
-    return [Block(f[i : i + 2, i : i + 2].copy(), g[i : i + 2].copy(), h[:, i : i + 2].copy()) for i in range(0, len(F), 2)]
+    return [
+        Block(f[i : i + 2, i : i + 2].copy(), g[i : i + 2].copy(), h[:, i : i + 2].copy()) for i in range(0, len(F), 2)
+    ]
 
 
 def _modes(F: Array) -> Array:

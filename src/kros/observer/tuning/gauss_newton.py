@@ -10,7 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-SETTLED = 3  # error dynamics forget within this part of an episode: what is slower, recordings of this length cannot judge
+SETTLED = (
+    3  # error dynamics forget within this part of an episode: what is slower, recordings of this length cannot judge
+)
 _TINY = np.finfo(float).tiny
 
 

@@ -35,7 +35,11 @@ from .gauss_newton import SETTLED, Damping, mean_log, scaled, search, whitening
 Array = npt.NDArray[np.float64]
 O = TypeVar("O", bound=ObserverData)  # noqa: E741
 _DAMPING, _LEAST_GAIN = Damping(1e-9, 1e-3, 1e9, 10.0), 1e-3
-_SKIP, _SHORT, _THIN = 300, 4, 4  # samples at the start of an episode, part of a short one, and samples between those that count
+_SKIP, _SHORT, _THIN = (
+    300,
+    4,
+    4,
+)  # samples at the start of an episode, part of a short one, and samples between those that count
 _ALIKE = 1e-14
 
 
@@ -51,7 +55,9 @@ def tune_observer(observer: O, batch: EpisodeBatch, iterations: int = 25) -> tup
     problem = _Tuning(observer, batch, hidden)
     start = problem.at(observer)
     if not np.isfinite(start.criterion):
-        raise DataError(f"Tuning observer {observer.name}: it diverges on the recordings; start from one that does not.")
+        raise DataError(
+            f"Tuning observer {observer.name}: it diverges on the recordings; start from one that does not."
+        )
     problem.slowest = max(problem.radius(observer), 1 - SETTLED / len(batch.states))
     found, criterion = search(start, problem.steps, _DAMPING, iterations, _LEAST_GAIN)
     return replace(observer, A=found.observer.A, B=found.observer.B, controller=found.observer.controller), criterion
@@ -71,7 +77,12 @@ class _Tuning:
     """Recordings to tune on."""
 
     def __init__(self, observer: ObserverData, batch: EpisodeBatch, hidden: list[int]) -> None:
-        self.batch, self.hidden, self.slowest, self.skip = batch, hidden, np.inf, min(_SKIP, len(batch.states) // _SHORT)
+        self.batch, self.hidden, self.slowest, self.skip = (
+            batch,
+            hidden,
+            np.inf,
+            min(_SKIP, len(batch.states) // _SHORT),
+        )
         self.values = {**observer.parameters, **observer.own(batch.parameters)}
         self.share = np.full(len(hidden), 1 / len(hidden))
         self.slopes = mean_slopes(observer.lifting, batch.states, batch.inputs, self.values)
@@ -101,7 +112,9 @@ class _Tuning:
         first, weight = -(-self.skip // _THIN), np.sqrt(self.share / point.errors)
         blocks = blocks_of(F, np.eye(len(F), states), weight[:, None] * np.eye(len(F))[self.hidden])
         X = moved(blocks, signals, _THIN, first).reshape(states * len(signals), -1)
-        missed = ((self.batch.states - point.estimate)[first * _THIN :: _THIN][..., self.hidden] * weight).transpose(2, 1, 0)
+        missed = ((self.batch.states - point.estimate)[first * _THIN :: _THIN][..., self.hidden] * weight).transpose(
+            2, 1, 0
+        )
         H, g, size = scaled(X @ X.T, X @ missed.ravel())
         splits = np.cumsum([observer.lifting.n_lifted, m, q])
 
@@ -112,7 +125,12 @@ class _Tuning:
                 (np.pad(part, ((0, len(observer.A) - states), (0, 0))) for part in np.split(dW, splits, axis=1)),
             )
             return self.at(
-                replace(observer, A=observer.A + dA, B=observer.B + dB, controller=StateSpace(K.A, K.B, K.C + dC, K.D + dD, K.dt))
+                replace(
+                    observer,
+                    A=observer.A + dA,
+                    B=observer.B + dB,
+                    controller=StateSpace(K.A, K.B, K.C + dC, K.D + dD, K.dt),
+                )
             )
 
         return trial

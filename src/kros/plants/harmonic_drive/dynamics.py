@@ -31,7 +31,10 @@ SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
 TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
 MEASURED = 2  # rows of p and v, in front of q and z
 RECORDED = MEASURED + 1 + COMMAND  # rows from p to i
-_HALF_STEP, _RATIO = np.array(0.5 * SUBSTEP_S), np.array(float(GEAR_RATIO))  # NumPy turns floats into these, at every call
+_HALF_STEP, _RATIO = (
+    np.array(0.5 * SUBSTEP_S),
+    np.array(float(GEAR_RATIO)),
+)  # NumPy turns floats into these, at every call
 _SMOOTHING = np.array([[1.0], [SMOOTHING_VELOCITY**2]])  # of what fades with the velocity, and of its sign
 
 

@@ -104,13 +104,16 @@ def draw_outlier(seed: int, spread: float, severity: float) -> DriveParameters:
 
 def concatenate(first: DriveParameters, second: DriveParameters) -> DriveParameters:
     """Append a batch to another."""
-    return DriveParameters(**{f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(first)})
+    return DriveParameters(
+        **{f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(first)}
+    )
 
 
 def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
     values: dict[str, Any] = {
-        name: nominal * np.exp(spread * deviation * rng.standard_normal()) for name, (nominal, deviation) in NOMINAL.items()
+        name: nominal * np.exp(spread * deviation * rng.standard_normal())
+        for name, (nominal, deviation) in NOMINAL.items()
     }
     values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(HARMONICS))
     values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, HARMONICS)
@@ -118,4 +121,6 @@ def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
 
 
 def _stack(units: Sequence[dict[str, Any]]) -> DriveParameters:
-    return DriveParameters(**{f.name: np.array([unit[f.name] for unit in units], dtype=float) for f in fields(DriveParameters)})
+    return DriveParameters(
+        **{f.name: np.array([unit[f.name] for unit in units], dtype=float) for f in fields(DriveParameters)}
+    )

@@ -90,14 +90,29 @@ class HarmonicDrivePopulation:
     def __post_init__(self) -> None:
         object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
         object.__setattr__(self, "conditions", tuple(self.conditions))
-        if not self.conditions or len(set(self.conditions)) < len(self.conditions) or not set(self.conditions) <= set(CONDITIONS):
-            raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} should be one or both of {CONDITIONS}, each once.")
+        if (
+            not self.conditions
+            or len(set(self.conditions)) < len(self.conditions)
+            or not set(self.conditions) <= set(CONDITIONS)
+        ):
+            raise ConfigError(
+                f"Harmonic Drive population: conditions {self.conditions} should be one or both of {CONDITIONS}, each once."
+            )
         low = {"n_units": 1, "n_episodes": 1, "seconds": 2.0, "seed": 0, "spread": 0.0, "outlier_severity": 0.0}
-        high = {"n_units": 998_998, "n_episodes": 1000, "seconds": 3600.0, "seed": 2**63, "spread": 5.0, "outlier_severity": 2.0}
+        high = {
+            "n_units": 998_998,
+            "n_episodes": 1000,
+            "seconds": 3600.0,
+            "seed": 2**63,
+            "spread": 5.0,
+            "outlier_severity": 2.0,
+        }
         for name, least in low.items():
             value = getattr(self, name)
             if not least <= value <= high[name]:
-                raise ConfigError(f"Harmonic Drive population: {name} = {value} is out of range; use {least} to {high[name]}.")
+                raise ConfigError(
+                    f"Harmonic Drive population: {name} = {value} is out of range; use {least} to {high[name]}."
+                )
 
     def simulate(self) -> SimulatedPopulation[Truth]:
         """Simulate all episodes of all units.
@@ -109,7 +124,9 @@ class HarmonicDrivePopulation:
             a second at rest at the start, an offset of the measured position in each episode, targets not lagged.
         """
         units, parameters = self._units()
-        keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in sorted(self.conditions) for e in range(self.n_episodes))
+        keys = tuple(
+            EpisodeKey(u.id, c, str(e)) for u in units for c in sorted(self.conditions) for e in range(self.n_episodes)
+        )
         trajectory = np.arange(len(keys))
         episode, condition = trajectory % self.n_episodes, trajectory // self.n_episodes % len(self.conditions)
         loaded = np.array([c == "load" for c in sorted(self.conditions)], float)[condition]
@@ -119,10 +136,27 @@ class HarmonicDrivePopulation:
         signals = simulate(parameters.take(rows), loaded, episode, (targets[0], targets[1]), GAINS[loop])
         self._disturb(signals.states, keys)
         inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
-        recordings = SimulatedEpisodes({key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)})
-        raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, recordings, {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO}, TRUTHS)
+        recordings = SimulatedEpisodes(
+            {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
+        )
+        raw = Population(
+            CHANNELS,
+            SAMPLE_PERIOD_S,
+            units,
+            keys,
+            recordings,
+            {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
+            TRUTHS,
+        )
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
-        truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, signals.load_torque[:, REST_SAMPLES:-1])
+        truth = Truth(
+            tuple(u.id for u in units),
+            parameters,
+            loop,
+            GAINS[loop],
+            load_rows,
+            signals.load_torque[:, REST_SAMPLES:-1],
+        )
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def _units(self) -> tuple[tuple[Unit, ...], DriveParameters]:
@@ -137,7 +171,9 @@ class HarmonicDrivePopulation:
     def _targets(self) -> Array:
         """Target position and velocity of every episode, shape (2, n_episodes, n_samples)."""
         n_samples = round(self.seconds / SAMPLE_PERIOD_S) + 1
-        pairs = [episode_reference(self.seed, e, n_samples, REST_SAMPLES, SAMPLE_PERIOD_S) for e in range(self.n_episodes)]
+        pairs = [
+            episode_reference(self.seed, e, n_samples, REST_SAMPLES, SAMPLE_PERIOD_S) for e in range(self.n_episodes)
+        ]
         return np.stack([np.stack(pair) for pair in pairs], axis=1)
 
     def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...]) -> None:

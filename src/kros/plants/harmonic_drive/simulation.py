@@ -38,13 +38,17 @@ class SimulatedSignals:
     load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current: what the load takes from the flange
 
 
-def simulate(p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains) -> SimulatedSignals:
+def simulate(
+    p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains
+) -> SimulatedSignals:
     """Simulate all trajectories; `targets` hold position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples = len(p), targets[0].shape[1]
     n_loaded = int(np.count_nonzero(loaded))
     rows = np.cumsum(loaded > 0) - 1
     out = SimulatedSignals(
-        np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples)), np.empty((n_loaded, n_samples), np.float32)
+        np.empty((n, len(_SIGNALS), n_samples)),
+        np.empty((n, 1, n_samples)),
+        np.empty((n_loaded, n_samples), np.float32),
     )
     for start in range(0, n, CHUNK_TRAJECTORIES):
         part = slice(start, start + CHUNK_TRAJECTORIES)
@@ -94,7 +98,11 @@ class _Controller:
         self.p[:] = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
         self._integral = physics.z[COMMAND].copy()
         self._error, self._raw = np.empty(n), np.empty(n)
-        self._position, self._velocity, self._antiwindup = np.array(gains.position), np.array(gains.velocity), np.array(gains.antiwindup)
+        self._position, self._velocity, self._antiwindup = (
+            np.array(gains.position),
+            np.array(gains.velocity),
+            np.array(gains.antiwindup),
+        )
         self._integrated = np.array(gains.integral * SAMPLE_PERIOD_S)
 
     def sample(self, rp: Array, rv: Array) -> None:

@@ -52,7 +52,9 @@ class Truth:
     def load_torque(self, key: EpisodeKey) -> Array:
         """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,)."""
         if key not in self.load_rows:
-            raise DataError(f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one.")
+            raise DataError(
+                f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one."
+            )
         return self.load_signals[self.load_rows[key]]
 
     def as_dict(self) -> dict[str, Any]:

@@ -41,7 +41,9 @@ def recorded_episodes(run: RunFolder) -> list[Shown]:
     except NotShownError:
         groups = run.facts["groups"]
         unit = next((u for u, group in groups.items() if group != OUTLIERS), next(iter(groups)))
-        keys = {key.condition: key for key in (EpisodeKey(*row) for row in reversed(run.facts["test"])) if key.unit == unit}
+        keys = {
+            key.condition: key for key in (EpisodeKey(*row) for row in reversed(run.facts["test"])) if key.unit == unit
+        }
         found = [_read(run, key) for key in keys.values()]
     return sorted(found, key=lambda s: s.key.condition != run.identify_on)
 
@@ -114,7 +116,11 @@ def overview_and_zoom(run: RunFolder, blocks: Sequence[tuple[str, Shown, Sequenc
             else:
                 _clip_start(full, strip.lines)
             shade(full, episode.time_s, window)
-        label_rows(panels[:, 0], [strip.channel for strip in strips], [" error" if strip.near is None else "" for strip in strips])
+        label_rows(
+            panels[:, 0],
+            [strip.channel for strip in strips],
+            [" error" if strip.near is None else "" for strip in strips],
+        )
         hide_times(panels[:-1].ravel())
         panels[0, 0].set_title(title)
         panels[0, 1].set_title(f"{length_s:g} s of it" + (" at constant speed" if run.calibrated else ""))
@@ -132,12 +138,23 @@ def _clip_start(axes: Axes, lines: Sequence[Line]) -> None:
         axes.set_ylim(-1.5 * largest, 1.5 * largest)
 
 
-def draw_lines(axes: Axes, time_s: Array, lines: Sequence[Line], window: slice | None = None, width: float = 1.1) -> None:
+def draw_lines(
+    axes: Axes, time_s: Array, lines: Sequence[Line], window: slice | None = None, width: float = 1.1
+) -> None:
     """Draw lines over time, all of them or a window; what diverges is cut."""
     part = slice(None) if window is None else window
     for order, (label, values, look) in enumerate(lines):
         x, y = thin(time_s[part], np.where(np.abs(values[part]) < 1e6, values[part], np.nan))
-        axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=width * look.weight, zorder=2 + 0.1 * order)
+        axes.plot(
+            x,
+            y,
+            look.style,
+            color=look.colour,
+            alpha=look.opacity,
+            label=label,
+            lw=width * look.weight,
+            zorder=2 + 0.1 * order,
+        )
     axes.set_xlim(time_s[part][0], time_s[part][-1])
 
 

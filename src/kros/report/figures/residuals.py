@@ -38,7 +38,9 @@ def short(name: str) -> str:
 def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
     """Return the residuals of all units beside the weights of an uncertain model that was made of these models."""
     freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // _POINTS)]
-    responses = models.systems(model.unit_ids).frequency_response(freqs) * model.input_scale / model.output_scale[:, None]
+    responses = (
+        models.systems(model.unit_ids).frequency_response(freqs) * model.input_scale / model.output_scale[:, None]
+    )
     own = model.scaled_nominal().frequency_response(freqs)
     dt, units, nominal = model.sample_period_s, model.unit_ids, model.nominal_id
     return unit_residuals(model.form, own, responses, model.weight, freqs, dt, unit_ids=units, nominal_id=nominal)
@@ -73,7 +75,14 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
     levels, bound, fitted = decibel(residuals.entries), decibel(residuals.largest), decibel(residuals.entry_weights)
     for i, row in enumerate(block):
         for j, panel in enumerate(row):
-            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units", [residuals.unit_ids[k] for k in inside])
+            lines_of_units(
+                panel,
+                freqs,
+                levels[inside][..., i, j],
+                Tone.BLUE.light,
+                "units",
+                [residuals.unit_ids[k] for k in inside],
+            )
             panel.plot(freqs, bound[:, i, j], color=Tone.BLUE.light, lw=2.6, alpha=0.45, label="largest")
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, lw=1.1, label="fitted weight")
             _mark_unit(panel, residuals, levels[..., i, j], alarm)

@@ -16,7 +16,9 @@ from ..run_folder import RunFolder, Shown
 from ..theme import Tone
 
 _MOST = 4  # states that are shown
-_ABOVE = 0.01  # of the sampling frequency: offsets below would flatten the rest of a linear scale of a study with a gearbox
+_ABOVE = (
+    0.01  # of the sampling frequency: offsets below would flatten the rest of a linear scale of a study with a gearbox
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,13 +34,17 @@ class SpectraRow:
 def observer_row(label: str, spectra: Mapping[str, Array], logarithmic: bool = False) -> SpectraRow:
     """Return a row of observers by their names; a linear scale is cut to those with a correction."""
     lines = {observer_label(n): (density, observer_look(n)) for n, density in spectra.items()}
-    return SpectraRow(label, lines, logarithmic, [observer_label(n) for n in spectra if split_observer(n)[1] != "open_loop"])
+    return SpectraRow(
+        label, lines, logarithmic, [observer_label(n) for n in spectra if split_observer(n)[1] != "open_loop"]
+    )
 
 
 def of_episode(run: RunFolder, shown: Shown, names: Sequence[str]) -> dict[str, Array]:
     """Return the spectra of the errors in one kept episode, by observer."""
     with np.errstate(over="ignore", invalid="ignore"):
-        return {n: error_spectrum(shown.observers[n].astype(float) - shown.states, run.sample_period_s)[1] for n in names}
+        return {
+            n: error_spectrum(shown.observers[n].astype(float) - shown.states, run.sample_period_s)[1] for n in names
+        }
 
 
 def spectra_figure(run: RunFolder, rows: Sequence[SpectraRow], height_in: float, columns: int | None = None) -> Figure:
@@ -77,20 +83,30 @@ def _top(row: SpectraRow, inside: npt.NDArray[np.bool_], i: int) -> float | None
     return 1.1 * top if top > 0 else None
 
 
-def band_shares(freqs_hz: Array, own: Array, other: Array, channels: Sequence[Channel], band_hz: Sequence[float]) -> dict[str, float]:
+def band_shares(
+    freqs_hz: Array, own: Array, other: Array, channels: Sequence[Channel], band_hz: Sequence[float]
+) -> dict[str, float]:
     """Return the power of a density, shape (n_freqs, n), inside a band relative to another's, by channel."""
     inside = (freqs_hz >= band_hz[0]) & (freqs_hz <= band_hz[1])
     power = own[inside].sum(axis=0), other[inside].sum(axis=0)
-    return {c.name: float(power[0][i] / power[1][i]) for i, c in enumerate(channels) if power[1][i] > 0 and np.isfinite(power[0][i])}
+    return {
+        c.name: float(power[0][i] / power[1][i])
+        for i, c in enumerate(channels)
+        if power[1][i] > 0 and np.isfinite(power[0][i])
+    }
 
 
 def share_text(run: RunFolder, own: Array, other: Array, band_hz: Sequence[float]) -> str:
     """Return shares for a sentence: ``velocity 20 %, current 3 %``; what is measured needs no estimate and is left out."""
     shares = band_shares(run.arrays["freqs_hz"], own, other, run.states[:_MOST], band_hz)
-    return ", ".join(f"{name} {number(100 * share, 2)} %" for name, share in shares.items() if name in run.hidden_states)
+    return ", ".join(
+        f"{name} {number(100 * share, 2)} %" for name, share in shares.items() if name in run.hidden_states
+    )
 
 
-def share_sentence(run: RunFolder, spectra: Mapping[str, Array], paper: Sequence[str], pair: Sequence[str], where: str) -> str:
+def share_sentence(
+    run: RunFolder, spectra: Mapping[str, Array], paper: Sequence[str], pair: Sequence[str], where: str
+) -> str:
     """Return what is shaded, and how much of the other's power in it the paper's Koopman observer and the deployed one leave."""
     band_hz = run.band_hz
     if band_hz is None:

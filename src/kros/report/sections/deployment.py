@@ -57,7 +57,9 @@ def _made(run: RunFolder, observer: Observer, metrics: Mapping[str, Any], units:
         ("Reads", [f"Measured: {named(measured)}. Inputs: {named(observer.inputs)}.{beyond}"]),
         (
             "Gives",
-            [f"Every step {joined([axis_label(c, units.get(c, '')) for c in (*measured, *hidden)])}; not measured: {joined(hidden)}."],
+            [
+                f"Every step {joined([axis_label(c, units.get(c, '')) for c in (*measured, *hidden)])}; not measured: {joined(hidden)}."
+            ],
         ),
         ("Rate", [f"One step every {1e3 * dt:g} ms ({1 / dt:g} Hz), at no other rate."]),
         ("Delay", _delay(observer)),
@@ -73,7 +75,9 @@ def _made(run: RunFolder, observer: Observer, metrics: Mapping[str, Any], units:
         ("Cost of a step", [_cost(observer)]),
         (
             "Run it",
-            ["kros estimate RUN DATA estimates.csv on recordings; kros export c RUN OUT or kros export fmu RUN OUT.fmu for a machine."],
+            [
+                "kros estimate RUN DATA estimates.csv on recordings; kros export c RUN OUT or kros export fmu RUN OUT.fmu for a machine."
+            ],
         ),
     ]
 
@@ -89,9 +93,15 @@ def _assumed_sensor(observer: Observer, units: Mapping[str, str]) -> list[str]:
 
 def _delay(observer: Observer) -> list[str]:
     late = observer.runtime.delay
-    taken = f"measurements count as {late} sample{'s' if late > 1 else ''} late" if late else "measurements count as of their own sample"
+    taken = (
+        f"measurements count as {late} sample{'s' if late > 1 else ''} late"
+        if late
+        else "measurements count as of their own sample"
+    )
     start = "at rest or in motion" if observer.start_in_motion is not None else "as from rest"
-    return [f"An estimate is for the next sample, from data up to this one; {taken}. It starts at the first measurement, {start}."]
+    return [
+        f"An estimate is for the next sample, from data up to this one; {taken}. It starts at the first measurement, {start}."
+    ]
 
 
 def _parameters(run: RunFolder, observer: Observer) -> list[str]:
@@ -109,7 +119,13 @@ def _parameters(run: RunFolder, observer: Observer) -> list[str]:
 
 
 def _ends(own: Mapping[str, Any]) -> str:
-    return joined([f"{word} {number(own[side])}" for side, word in (("lower", "at least"), ("upper", "at most")) if own[side] is not None])
+    return joined(
+        [
+            f"{word} {number(own[side])}"
+            for side, word in (("lower", "at least"), ("upper", "at most"))
+            if own[side] is not None
+        ]
+    )
 
 
 def _cost(observer: Observer) -> str:
@@ -137,7 +153,9 @@ def _certificate(trust: Trust) -> list[str]:
 def _assumed(run: RunFolder, name: str) -> list[str]:
     if not run.has("observers/relift.json"):
         return []
-    assumptions = load_artifact(run.folder / "observers", "relift")[0]["certificates"].get(name, {}).get("assumptions", [])
+    assumptions = (
+        load_artifact(run.folder / "observers", "relift")[0]["certificates"].get(name, {}).get("assumptions", [])
+    )
     return [f"{'; '.join(assumptions)}."] if assumptions else []
 
 

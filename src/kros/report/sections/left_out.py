@@ -72,5 +72,7 @@ def _cells(table: ErrorTable, channel: str, cell: ErrorCell, powers: bool) -> li
         return ["–", "diverged" if cell.diverged else "–", "–", *extra]
     notes = {"mean": "–".join(number(v, 2) for v in cell.interval)} if cell.interval else {}
     values = {what: getattr(cell, what) for what in ("mean", "worst")}
-    cells = [Cell(number(v), strong=v == table.best(channel, w), note=notes.get(w, ""), value=v) for w, v in values.items()]
+    cells = [
+        Cell(number(v), strong=v == table.best(channel, w), note=notes.get(w, ""), value=v) for w, v in values.items()
+    ]
     return [Cell(number(cell.rms), value=cell.rms), *cells, *extra]

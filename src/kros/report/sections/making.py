@@ -25,8 +25,14 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
     longest = max(timing.values(), default=0.0) or 1.0
     rows = [[stage, Cell(number(seconds), bar=seconds / longest)] for stage, seconds in timing.items()]
     caption = "Wall-clock time; a stage that was found done counts with the time it took."
-    versions = [["Python", platform.python_version()], *([name, found] for name in _PACKAGES if (found := _version(name)) is not None)]
-    tables = [*([Table(["stage", "seconds"], rows, caption)] if rows else []), Table(["package", "version"], versions, "Versions")]
+    versions = [
+        ["Python", platform.python_version()],
+        *([name, found] for name in _PACKAGES if (found := _version(name)) is not None),
+    ]
+    tables = [
+        *([Table(["stage", "seconds"], rows, caption)] if rows else []),
+        Table(["package", "version"], versions, "Versions"),
+    ]
     study = json.dumps(run.study, indent=1, ensure_ascii=False)
     return Section("making", "How this was made", [text], tables, folded=[("The study, every setting resolved", study)])
 

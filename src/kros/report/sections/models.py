@@ -31,7 +31,11 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     lifted = next((m.lifting.functions for m in run.models.values() if m.lifting.functions), ())
     if lifted:
         text += f"Lifted functions: {', '.join(lifted)}."
-    units = [f"{row['unit']} ({row['status']})" for row in metrics.get("units", []) if row["status"] not in ("ok", "not calibrated")]
+    units = [
+        f"{row['unit']} ({row['status']})"
+        for row in metrics.get("units", [])
+        if row["status"] not in ("ok", "not calibrated")
+    ]
     paragraphs = [text] + ([f"Units with a remark: {'; '.join(units)}."] if units else [])
     return Section("models", "Models", paragraphs, [_table(models)], ["models", "free_run", "free_run_spectra"])
 
@@ -40,12 +44,17 @@ def _table(models: Mapping[str, Any]) -> Table:
     errors = {name: entry.get("freerun_error_percent", {}) for name, entry in models.items()}
     channels = list(dict.fromkeys(c for of_model in errors.values() for c in of_model))
     columns = [(c, statistic) for c in channels for statistic in ("median", "worst")]
-    values = {name: [of_model.get(c, {}).get(statistic) for c, statistic in columns] for name, of_model in errors.items()}
+    values = {
+        name: [of_model.get(c, {}).get(statistic) for c, statistic in columns] for name, of_model in errors.items()
+    }
     best = [min((v for v in column if v is not None), default=None) for column in zip(*values.values(), strict=True)]
     rows: list[Cells] = [
         [
             *(model_label(name), str(entry["order"]), minus(radius_text(entry["spectral_radius_max"]))),
-            *(Cell(number(v), strong=v is not None and v == least) for v, least in zip(values[name], best, strict=True)),
+            *(
+                Cell(number(v), strong=v is not None and v == least)
+                for v, least in zip(values[name], best, strict=True)
+            ),
         ]
         for name, entry in models.items()
     ]

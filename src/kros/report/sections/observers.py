@@ -7,7 +7,17 @@ from typing import Any
 
 from ..content import Cell, Section, Table, where
 from ..error_tables import ErrorCell, ErrorTable, error_table
-from ..names import axis_label, channel_units, condition_label, in_condition, joined, number, observer_label, paper_pair, split_observer
+from ..names import (
+    axis_label,
+    channel_units,
+    condition_label,
+    in_condition,
+    joined,
+    number,
+    observer_label,
+    paper_pair,
+    split_observer,
+)
 from ..run_folder import RunFolder
 from ..trust import best_certified, mean_error, trusts
 
@@ -60,7 +70,9 @@ def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """Return what has to be known of baselines to compare with them: which correct nothing, what was trained on how much, what there is none of."""
     off = [observer_label(name) for name, facts in observers.items() if facts.get("correction_off")]
     notes = (
-        [f"Tuning switched the correction off, no gain was better than the model alone on training episodes: {', '.join(off)}."]
+        [
+            f"Tuning switched the correction off, no gain was better than the model alone on training episodes: {', '.join(off)}."
+        ]
         if off
         else []
     )
@@ -70,7 +82,11 @@ def baseline_notes(observers: Mapping[str, Mapping[str, Any]]) -> list[str]:
         notes.append(
             f"The learned estimator was trained on {part} {learned['episodes_recorded']} training episodes, from their first sample on."
         )
-    missing = [facts["reason"] for name, facts in observers.items() if name == "mean_profile" and facts.get("status") == "failed"]
+    missing = [
+        facts["reason"]
+        for name, facts in observers.items()
+        if name == "mean_profile" and facts.get("status") == "failed"
+    ]
     return [*notes, *missing]
 
 
@@ -101,18 +117,27 @@ def _compared(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[
 def _all(tables: Sequence[ErrorTable], metrics: Mapping[str, Any], measured: Sequence[str]) -> Table:
     """All observers in all conditions, a row each."""
     pairs = [(table, name) for table in tables for name in table.cells]
-    rows = [[observer_label(name), condition_label(t.condition), *_errors(t, name, metrics, measured, interval=True)] for t, name in pairs]
+    rows = [
+        [observer_label(name), condition_label(t.condition), *_errors(t, name, metrics, measured, interval=True)]
+        for t, name in pairs
+    ]
     caption = f"All {len(trusts(metrics))} observers in every condition: sort by any column, filter by words. Mean with its 95 % interval over units."
     if any(len(table.ranked) < len(table.channels) for table in tables):
         caption += " The current's error under load is the load's torque itself: reported, not ranked."
     head = ["observer", "condition", *_head(tables[0], metrics, measured)]
     chosen = where((name for _, name in pairs), metrics["study"].get("deployed"))
-    return Table(head, rows, caption, [("", 2), *_groups(tables[0], measured)], folded=True, emphasised=chosen, sortable=True)
+    return Table(
+        head, rows, caption, [("", 2), *_groups(tables[0], measured)], folded=True, emphasised=chosen, sortable=True
+    )
 
 
 def _head(table: ErrorTable, metrics: Mapping[str, Any], measured: Sequence[str]) -> list[str]:
     units = channel_units(metrics)
-    of_channels = [title for c in table.hidden(measured) for title in (axis_label("RMS", units.get(c, "")), "mean (%)", "worst (%)")]
+    of_channels = [
+        title
+        for c in table.hidden(measured)
+        for title in (axis_label("RMS", units.get(c, "")), "mean (%)", "worst (%)")
+    ]
     return [*of_channels, "for the set", "as it runs"]
 
 
@@ -120,7 +145,9 @@ def _groups(table: ErrorTable, measured: Sequence[str]) -> list[tuple[str, int]]
     return [*((c.replace("_", " "), 3) for c in table.hidden(measured)), ("certified", 2)]
 
 
-def _errors(table: ErrorTable, name: str, metrics: Mapping[str, Any], measured: Sequence[str], interval: bool = False) -> list[Cell | str]:
+def _errors(
+    table: ErrorTable, name: str, metrics: Mapping[str, Any], measured: Sequence[str], interval: bool = False
+) -> list[Cell | str]:
     trust = trusts(metrics)[name]
     channels = [cell for c in table.hidden(measured) for cell in _cells(table, c, table.cells[name].get(c), interval)]
     return [*channels, trust.by_set, trust.as_it_runs.partition(",")[0]]
@@ -136,7 +163,12 @@ def _cells(table: ErrorTable, channel: str, cell: ErrorCell | None, interval: bo
     return [
         Cell(number(cell.rms), value=cell.rms),
         Cell(number(mean), strong=mean == table.best(channel, "mean"), note=note, value=mean),
-        Cell(number(worst), strong=worst == table.best(channel, "worst"), note="" if interval else cell.worst_unit or "", value=worst),
+        Cell(
+            number(worst),
+            strong=worst == table.best(channel, "worst"),
+            note="" if interval else cell.worst_unit or "",
+            value=worst,
+        ),
     ]
 
 
@@ -144,13 +176,19 @@ def _against_truth(metrics: Mapping[str, Any]) -> list[Table]:
     """Errors and lag against what the states really were, of the recording itself and of all observers; none where the recordings do not say."""
     recorded = [{"observer": _RECORDED, **r} for r in metrics.get("recorded", [])]
     rows = [r for r in [*recorded, *metrics["evaluation"]] if "true_rms" in r and r["role"] != "outlier"]
-    places, observers = dict.fromkeys((r["channel"], r["condition"]) for r in rows), tuple(dict.fromkeys(r["observer"] for r in rows))
+    places, observers = (
+        dict.fromkeys((r["channel"], r["condition"]) for r in rows),
+        tuple(dict.fromkeys(r["observer"] for r in rows)),
+    )
     if not rows:
         return []
     found: dict[tuple[str, str, str], list[Mapping[str, Any]]] = {}
     for r in rows:
         found.setdefault((r["observer"], r["channel"], r["condition"]), []).append(r)
-    body = [[observer_label(o), *(cell for place in places for cell in _true_cells(found.get((o, *place), [])))] for o in observers]
+    body = [
+        [observer_label(o), *(cell for place in places for cell in _true_cells(found.get((o, *place), [])))]
+        for o in observers
+    ]
     groups = [("", 1), *((f"{channel.replace('_', ' ')}{in_condition(condition)}", 3) for channel, condition in places)]
     caption = (
         "Against what the states really were, which the simulation or a better sensor knows: RMS error in percent of the largest true value, mean over the "

@@ -28,7 +28,9 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         "flagged."
     )
     flagged = [score_card(row, score_names(run, row["condition"])) for row in rows if row["outlier"]][:_NAMED]
-    return Section("outliers", "Outliers", [text, *undecided_text(rows), _MEANING, *flagged], figures=["outlier_scores"])
+    return Section(
+        "outliers", "Outliers", [text, *undecided_text(rows), _MEANING, *flagged], figures=["outlier_scores"]
+    )
 
 
 def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
@@ -40,7 +42,9 @@ def undecided_text(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     ):
         silent = [r for r in rows if r.get("status") == status]
         if silent:
-            texts.append(f"{len(silent)} of {len(rows)} scores say nothing about their unit, as {why}: {flagged_text(silent)}.")
+            texts.append(
+                f"{len(silent)} of {len(rows)} scores say nothing about their unit, as {why}: {flagged_text(silent)}."
+            )
     return texts
 
 
@@ -51,7 +55,9 @@ def score_text(row: Mapping[str, Any], names: Names | None) -> str:
         return f"{text}."
     text += f", most at {number(row['freq_hz'])} Hz{_entry(row, names, ' in the response of {0} to {1}')}"
     if row.get("lowest_db") is not None:
-        which = "every choice" if row["lowest_db"] > 0 else "some choices only" if row["highest_db"] > 0 else "no choice"
+        which = (
+            "every choice" if row["lowest_db"] > 0 else "some choices only" if row["highest_db"] > 0 else "no choice"
+        )
         text += f". It exceeds the others under {which} of the nominal, by {number(row['lowest_db'])} to {number(row['highest_db'])} dB"
         text += f"; with {100 * row['agreement']:.0f} % of these nominals alone it would be flagged"
     return f"{text}."
@@ -69,7 +75,9 @@ def score_names(run: RunFolder, condition: str) -> Names | None:
     """Signals behind the entries of the residuals that units are scored by; None where the run does not know."""
     try:
         model = run.outlier_models[condition]
-        return entry_names(model.form, next(m for n, m in run.models.items() if m.lifting.n_lifted == len(model.output_scale)))
+        return entry_names(
+            model.form, next(m for n, m in run.models.items() if m.lifting.n_lifted == len(model.output_scale))
+        )
     except (NotShownError, KeyError, StopIteration):
         return None
 
@@ -92,6 +100,4 @@ def score_card(row: Mapping[str, Any], names: Names | None) -> str:
     text = f"{score_text(row, names)} Status: {row.get('status', 'outlier' if row['outlier'] else 'ok')}."
     if row.get("detectable_db") is None or row.get("detectable") is None:
         return text
-    return (
-        f"{text} Flagged from {number(row['detectable_db'])} dB on, a change of gain by {number(row['detectable'], 2)} % in one response."
-    )
+    return f"{text} Flagged from {number(row['detectable_db'])} dB on, a change of gain by {number(row['detectable'], 2)} % in one response."

@@ -27,7 +27,10 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section:
         text += f"{_limited(name, own)} "
     if facts.get("dropped"):
         text += f"Left out for bad samples: {', '.join(facts['dropped'])}. "
-    told = [f"{c.replace('_', ' ')}: {', '.join(f'{k} {v:g}' for k, v in own.items() if v)}" for c, own in study.get("sensor", {}).items()]
+    told = [
+        f"{c.replace('_', ' ')}: {', '.join(f'{k} {v:g}' for k, v in own.items() if v)}"
+        for c, own in study.get("sensor", {}).items()
+    ]
     if told:
         text += f"Declared of the sensor beyond the recordings, and told to all: {'; '.join(told)}. "
     alerts = [f"Look at this first: {alert}" for alert in facts.get("alerts", ())]
@@ -39,7 +42,11 @@ def _limited(name: str, own: Mapping[str, Any]) -> str:
     ends = " and ".join(number(own[side]) for side in ("lower", "upper") if own[side] is not None)
     text = f"{name.replace('_', ' ').capitalize()} is limited at {ends}, {'as declared' if own['declared'] else 'found in the recordings'}"
     seen = own.get("seen")
-    return f"{text}; seen at a limit: {', '.join(seen['units'])}." if seen else f"{text}; no unit was seen there for certain."
+    return (
+        f"{text}; seen at a limit: {', '.join(seen['units'])}."
+        if seen
+        else f"{text}; no unit was seen there for certain."
+    )
 
 
 def _channels(run: RunFolder) -> list[Table]:
@@ -49,6 +56,14 @@ def _channels(run: RunFolder) -> list[Table]:
         return []
     steps, rows = run.facts["resolution"], []
     for c in channels:
-        role = "input" if c.role is Role.INPUT else "state, measured at run time" if c.measured else "state, to be estimated"
-        rows.append([c.name.replace("_", " "), {"1": "fraction"}.get(c.unit, c.unit or "–"), role, number(steps.get(c.name))])
+        role = (
+            "input"
+            if c.role is Role.INPUT
+            else "state, measured at run time"
+            if c.measured
+            else "state, to be estimated"
+        )
+        rows.append(
+            [c.name.replace("_", " "), {"1": "fraction"}.get(c.unit, c.unit or "–"), role, number(steps.get(c.name))]
+        )
     return [Table(["channel", "unit", "role", "resolution found"], rows)]

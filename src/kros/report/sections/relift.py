@@ -32,7 +32,9 @@ _SIGNALS = (
 
 def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     """Return the certificates of the observers as they run; None where there are none."""
-    observers = {name: entry for name, entry in metrics.get("observers", {}).items() if entry.get("relift_certified") is not None}
+    observers = {
+        name: entry for name, entry in metrics.get("observers", {}).items() if entry.get("relift_certified") is not None
+    }
     if not observers or not run.has("observers/relift.json"):
         return None
     record = load_artifact(run.folder / "observers", "relift")[0]
@@ -48,10 +50,15 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     groups = [("", 3), ("median unit", 2), ("worst unit", 2)]
     table = Table(head, rows, caption, groups, emphasised=where(observers, deployed))
     assumptions = record["certificates"].get(deployed, {}).get("assumptions", [])
-    conditions = [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
+    conditions = (
+        [f"Assumed for “{observer_label(deployed)}”: {'; '.join(assumptions)}."] if deployed and assumptions else []
+    )
     signals = _signals(observers, deployed)
     return Section(
-        "relift", "Certified as it runs", [_TEXT, _BOUND, *([_SIGNALS] if signals else []), *conditions, *failed], [table, *signals]
+        "relift",
+        "Certified as it runs",
+        [_TEXT, _BOUND, *([_SIGNALS] if signals else []), *conditions, *failed],
+        [table, *signals],
     )
 
 
@@ -75,11 +82,21 @@ def _signals(observers: Mapping[str, Mapping[str, Any]], deployed: str | None) -
         bounds = entry.get("set_bound_percent", {})
         over = [number(entry.get(f"set_bound_to_error_{which}")) for which in ("min", "max")]
         lost = number(entry.get("dropout_mean_square_gain")) if entry.get("dropout_certified") else "none"
-        rows.append([observer_label(name), *(number(bounds.get(state)) for state in states), *over, *([lost] if lossy else [])])
+        rows.append(
+            [observer_label(name), *(number(bounds.get(state)) for state in states), *over, *([lost] if lossy else [])]
+        )
     groups = [
         ("", 1),
         ("bound for any unit, % of the largest value", len(states)),
         ("bound over error, units", 2),
         *([("", 1)] if lossy else []),
     ]
-    return [Table(head, rows, "Bounds on RMS errors for signals like those recorded", groups, emphasised=where(observers, deployed))]
+    return [
+        Table(
+            head,
+            rows,
+            "Bounds on RMS errors for signals like those recorded",
+            groups,
+            emphasised=where(observers, deployed),
+        )
+    ]

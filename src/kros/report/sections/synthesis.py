@@ -29,9 +29,7 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
         return None
     rows = [_row(name, entry) for name, entry in observers.items()]
     kept = [i for i in range(len(_HEAD)) if any(row[i] != "–" for row in rows)]
-    caption = (
-        "Solutions: “optimal” reaches its lower bound, “bounded” is apart from it by the gap. What is certified of each stands under Trust."
-    )
+    caption = "Solutions: “optimal” reaches its lower bound, “bounded” is apart from it by the gap. What is certified of each stands under Trust."
     emphasised = where(observers, metrics["study"].get("deployed"))
     table = Table([_HEAD[i] for i in kept], [[row[i] for i in kept] for row in rows], caption, emphasised=emphasised)
     return Section("synthesis", "Synthesis", [_TEXT], [table], ["synthesis"])

@@ -43,13 +43,18 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     rows: list[Cells] = [
         [
             observer_label(name),
-            *(Cell(text, strong=text.startswith("no") and name == deployed) for text in (trust.by_set, trust.as_it_runs)),
+            *(
+                Cell(text, strong=text.startswith("no") and name == deployed)
+                for text in (trust.by_set, trust.as_it_runs)
+            ),
             *(dropout_text(metrics, name, trust, run.measured_states), sensor_text(metrics, name, run.measured_states)),
         ]
         for name, trust in found.items()
     ]
     head = ["observer", "certified for the set", "certified as it runs", "tolerates dropouts", "sensor needed"]
-    table = Table(head, rows, "What stands behind every observer", emphasised=where(found, deployed), prose=True, sortable=True)
+    table = Table(
+        head, rows, "What stands behind every observer", emphasised=where(found, deployed), prose=True, sortable=True
+    )
     claimed = verdict(metrics, run.measured_states)
     lists = [
         ("What is claimed", claimed),
@@ -79,6 +84,8 @@ def _remarks(run: RunFolder) -> list[Table]:
             what = "not made" if own.get("status") == "failed" else "not certified for plants"
             reason = "; ".join(dict.fromkeys(own["reason"].split("; ")))
             reasons.setdefault((what, reason), []).append(observer_label(name))
-    rows: list[Cells] = [["; ".join(names), Cell(what, strong=True), reason] for (what, reason), names in reasons.items()]
+    rows: list[Cells] = [
+        ["; ".join(names), Cell(what, strong=True), reason] for (what, reason), names in reasons.items()
+    ]
     caption = "What could not be made, or not be certified for the set of plants, and why"
     return [Table(["observer", "", "reason"], rows, caption, prose=True, folded=True)] if rows else []

@@ -37,7 +37,11 @@ def section(run: RunFolder, metrics: Mapping[str, Any]) -> Section | None:
     )
     tall = any(len(m.output_scale) > len(m.input_scale) for m in run.uncertain.values())
     high = [n for n, e in entries.items() if (e["peak_db"].get(e["form"]) or 0) >= 0]
-    paragraphs = [text, *([_PAPER] if tall else []), *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else [])]
+    paragraphs = [
+        text,
+        *([_PAPER] if tall else []),
+        *([_HIGH.format(names=", ".join(model_label(n) for n in high))] if high else []),
+    ]
     paragraphs += [*confounded_text(metrics), *small_set_text(metrics), *noise_text(entries)]
     tables = [_peaks(entries), _weights(entries)]
     return Section("uncertainty", "Uncertainty", paragraphs, tables, ["forms", "weights"])
@@ -67,7 +71,9 @@ def _peaks(entries: Mapping[str, Any]) -> Table:
         cells: list[Cell | str] = [form_label(form)]
         for entry in entries.values():
             value, chosen = entry["peak_db"].get(form), entry["form"] == form
-            cells.append(Cell("–" if value is None else minus(f"{value:.1f}"), strong=chosen, note="used" if chosen else ""))
+            cells.append(
+                Cell("–" if value is None else minus(f"{value:.1f}"), strong=chosen, note="used" if chosen else "")
+            )
         rows.append(cells)
     caption = "Peak residual over units and frequencies, dB; the nominal unit that suits each form best."
     return Table(["form", *(model_label(n) for n in entries)], rows, caption)
@@ -87,8 +93,12 @@ def _weights(entries: Mapping[str, Any]) -> Table:
                 number(entry["misfit_max"]),
             ]
         )
-    head = ["model", "weights, left and right", "largest normalised residual", "over the best cover (dB)", "largest misfit"]
-    caption = (
-        "A cover holds when no unit's normalised residual exceeds one. The misfit is what the form cannot rebuild, relative to the plant."
-    )
+    head = [
+        "model",
+        "weights, left and right",
+        "largest normalised residual",
+        "over the best cover (dB)",
+        "largest misfit",
+    ]
+    caption = "A cover holds when no unit's normalised residual exceeds one. The misfit is what the form cannot rebuild, relative to the plant."
     return Table(head, rows, caption)

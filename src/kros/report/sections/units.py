@@ -36,7 +36,11 @@ def section(run: RunFolder, metrics: Row) -> Section | None:
     if not metrics.get("units"):
         return None
     found, name = _known(run, metrics), metrics["study"].get("deployed")
-    hidden = [c for c in dict.fromkeys(r["channel"] for known in found.values() for r in known.errors) if c not in run.measured_states]
+    hidden = [
+        c
+        for c in dict.fromkeys(r["channel"] for known in found.values() for r in known.errors)
+        if c not in run.measured_states
+    ]
     flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
     named = some_of(flagged)
     text = f"Errors are those of “{observer_label(name)}”. " if name else ""
@@ -85,7 +89,9 @@ def _quantiles(columns: Mapping[str, Mapping[str, float]], units: int) -> Table:
     for title, values in columns.items():
         numbers, last = np.array(list(values.values())), max(values, key=lambda u: values[u])
         inner = [number(float(np.quantile(numbers, share, method="nearest"))) for share in _SHARES.values()]
-        rows.append([title, str(len(numbers)), number(float(numbers.min())), *inner, number(float(numbers.max())), last])
+        rows.append(
+            [title, str(len(numbers)), number(float(numbers.min())), *inner, number(float(numbers.max())), last]
+        )
     return Table(["", "units", "smallest", *_SHARES, "largest", "which is"], rows, f"How {units} units are spread")
 
 
@@ -118,7 +124,9 @@ def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Se
             own = errors.get(channel, {})
             row += [_cell(own.get("rms")), _cell(own.get("error_percent"))]
         scores = {r["condition"]: r for r in known.scores}
-        row += [_cell(scores.get(c, {}).get("score"), strong=bool(scores.get(c, {}).get("outlier"))) for c in conditions]
+        row += [
+            _cell(scores.get(c, {}).get("score"), strong=bool(scores.get(c, {}).get("outlier"))) for c in conditions
+        ]
         row += [_cell(known.bound.get("residual"))] if any(k.bound for k in found.values()) else []
         row += [_cell(_degrees(known.own.get("phase_rad")))] if run.calibrated else []
         rows.append(row)

@@ -24,7 +24,15 @@ from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from .field import FieldRecordings
 from .innovation import monitored
-from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys, unit_parameters
+from .recordings import (
+    check_channels,
+    hidden_states,
+    identify_on,
+    load_calibration,
+    open_data,
+    training_keys,
+    unit_parameters,
+)
 from .verdict import with_verdict
 
 
@@ -33,15 +41,26 @@ def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False
 
     A name that a unit of the study has is refused where the recordings are others, unless `same_unit` states that it is the same machine.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (config, store):
+    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (
+        config,
+        store,
+    ):
         return scored(config, store, data, workers, same_unit)
 
 
-def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False) -> list[dict[str, Any]]:
+def scored(
+    config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False
+) -> list[dict[str, Any]]:
     """Score the units of some recordings against a run that is open."""
     kept = [name.split("/") for name in sorted(store.files())]
-    folders = [store.path(*parts[:2]) for parts in kept if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")]
-    observer = Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
+    folders = [
+        store.path(*parts[:2])
+        for parts in kept
+        if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")
+    ]
+    observer = (
+        Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
+    )
     population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     watched: list[dict[str, Any]] = []
@@ -69,7 +88,10 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
             f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
         )
     levels = {
-        (row["unit"], row["condition"]): {key: row[key] for key in ("level_db", "level_rate", "level_units", "bands_db")} for row in watched
+        (row["unit"], row["condition"]): {
+            key: row[key] for key in ("level_db", "level_rate", "level_units", "bands_db")
+        }
+        for row in watched
     }
     rows = [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
     return in_order(rows)
@@ -91,7 +113,9 @@ def score_condition(
         if models.lifting.parameters
         else {u: {} for u in units}
     )
-    tasks = [(population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units]
+    tasks = [
+        (population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units
+    ]
     recorded, rows = Recorded.of(factors_of(store, models.condition), models, outliers.freqs_hz), []
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
@@ -106,7 +130,9 @@ def score_condition(
             )
         known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
-        score = recorded.qualified(outliers.score(unit, response, known, None if recorded.same_motions(factor) else motion), evidence)
+        score = recorded.qualified(
+            outliers.score(unit, response, known, None if recorded.same_motions(factor) else motion), evidence
+        )
         seconds = float(factor.n_samples.sum()) * models.sample_period_s
         row = score_row(score, models.condition, len(keys), seconds)
         rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})

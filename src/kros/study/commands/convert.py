@@ -29,7 +29,9 @@ def write_one(task: Task) -> GroupRecord:
     return write_group(population, unit, condition, folder)
 
 
-def convert_recordings(source: Path, out: Path, reader: str | None, mapping: Path | None, workers: int, progress: Progress) -> Population:
+def convert_recordings(
+    source: Path, out: Path, reader: str | None, mapping: Path | None, workers: int, progress: Progress
+) -> Population:
     """Convert recordings; the output folder appears whole or not at all."""
     csv = read_mapping(mapping) if mapping is not None else None
     chosen = reader or ("csv" if csv is not None else detect_reader(source))

@@ -25,12 +25,25 @@ _STAGE, _RECORDINGS = "simulate", "simulated"
 
 
 def simulate_to(
-    out: Path, plant: str, units: int, episodes: int, seconds: float, seed: int, spread: float, loop: str, outlier: bool, format_: str
+    out: Path,
+    plant: str,
+    units: int,
+    episodes: int,
+    seconds: float,
+    seed: int,
+    spread: float,
+    loop: str,
+    outlier: bool,
+    format_: str,
 ) -> dict[str, Any]:
     """Simulate a population into a new folder, with the truth beside it in ``truth.json``."""
     from ...plants import PLANTS
 
-    for name, value, allowed in (("--plant", plant, tuple(PLANTS)), ("--format", format_, FORMATS), ("--loop", loop, ("stiff", "soft"))):
+    for name, value, allowed in (
+        ("--plant", plant, tuple(PLANTS)),
+        ("--format", format_, FORMATS),
+        ("--loop", loop, ("stiff", "soft")),
+    ):
         if value not in allowed:
             raise ConfigError(f"{name} {value!r}: choose one of {', '.join(allowed)}.")
     if format_ == "raw" and plant != HARMONIC_DRIVE:
@@ -58,11 +71,22 @@ def simulate_to(
 
 
 def run_demo(
-    out: Path, units: int, episodes: int, seconds: float, seed: int, workers: int, progress: Progress, overrides: Sequence[str] = ()
+    out: Path,
+    units: int,
+    episodes: int,
+    seconds: float,
+    seed: int,
+    workers: int,
+    progress: Progress,
+    overrides: Sequence[str] = (),
 ) -> RunResult:
     """Simulate a population with one badly assembled drive and run the study on it, all below one folder."""
     out = Path(out).absolute()
-    raw = {"name": "demo", "data": {"source": str(out / _RECORDINGS), "reader": "parquet"}, "predictor": {"effort": "quick"}}
+    raw = {
+        "name": "demo",
+        "data": {"source": str(out / _RECORDINGS), "reader": "parquet"},
+        "predictor": {"effort": "quick"},
+    }
     config = validate_config(raw, out, overrides=overrides)
     with open_run(out, config) as store, open_executor(workers) as executor:
         _simulate_in(store, units, episodes, seconds, seed, progress, partial(executor.map, _load, range(workers)))
@@ -77,7 +101,13 @@ def _load(_: int) -> None:
 
 
 def _simulate_in(
-    store: Store, units: int, episodes: int, seconds: float, seed: int, progress: Progress, meanwhile: Callable[[], object]
+    store: Store,
+    units: int,
+    episodes: int,
+    seconds: float,
+    seed: int,
+    progress: Progress,
+    meanwhile: Callable[[], object],
 ) -> None:
     """Simulate into a run folder, where the same simulation is not there already; workers get something to do meanwhile."""
     settings = ("harmonic-drive", units, episodes, seconds, seed, 1.0, "stiff", True, "parquet")

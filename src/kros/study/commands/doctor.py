@@ -24,7 +24,9 @@ def diagnose() -> list[str]:
     lines += [f"  {name:<16} {_version(name) or 'MISSING: install kros again'}" for name in _REQUIRED]
     lines.append("optional")
     lines += [f"  {name:<16} {_version(name) or 'not installed'}   {purpose}" for name, purpose in _OPTIONAL.items()]
-    lines.append(f"C compiler        {shutil.which('cc') or shutil.which('gcc') or 'none'}   for checking exported C code")
+    lines.append(
+        f"C compiler        {shutil.which('cc') or shutil.which('gcc') or 'none'}   for checking exported C code"
+    )
     return lines
 
 

@@ -47,7 +47,9 @@ class Estimated:
         return said
 
 
-def estimate_recordings(run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None) -> Estimated:
+def estimate_recordings(
+    run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None
+) -> Estimated:
     """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; where a parameter is followed, it stands behind them."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         if out.exists() or out.suffix not in ENDINGS:
@@ -69,7 +71,9 @@ def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
     """Return what is to be known of the estimates: the observer, columns with their units of measure, parameters of every unit and their sources."""
     observer = recordings.observer
     name = recordings.name
-    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded} | ({} if name is None else {name: "rad"})
+    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded} | (
+        {} if name is None else {name: "rad"}
+    )
     parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
     about = {key: observer.about.get(key) for key in ("kros", "study")}
     return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}
@@ -108,15 +112,24 @@ def _parquet(path: Path, facts: dict[str, Any]) -> Iterator[Write]:
     from pyarrow import parquet
 
     text = pa.dictionary(pa.int32(), pa.string())
-    columns = [pa.field(name, pa.float64(), metadata={"unit": unit} if unit else None) for name, unit in facts["columns"].items()]
+    columns = [
+        pa.field(name, pa.float64(), metadata={"unit": unit} if unit else None)
+        for name, unit in facts["columns"].items()
+    ]
     labels = [pa.field(name, pa.int64() if name == "k" else text) for name in KEYS]
-    metadata = {name: value if isinstance(value, str) else json.dumps(value) for name, value in facts.items() if value is not None}
+    metadata = {
+        name: value if isinstance(value, str) else json.dumps(value)
+        for name, value in facts.items()
+        if value is not None
+    }
     schema = pa.schema([*labels, *columns], metadata=metadata)
     with parquet.ParquetWriter(path, schema, write_page_checksum=True) as file:
 
         def write(key: EpisodeKey, values: Array) -> None:
             zeros = pa.array(np.zeros(len(values), np.int32))
-            labelled = [pa.DictionaryArray.from_arrays(zeros, pa.array([t])) for t in (key.unit, key.condition, key.episode)]
+            labelled = [
+                pa.DictionaryArray.from_arrays(zeros, pa.array([t])) for t in (key.unit, key.condition, key.episode)
+            ]
             numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
             table = pa.Table.from_arrays([*labelled, pa.array(np.arange(len(values))), *numbers], schema=schema)
             file.write_table(table, row_group_size=max(len(table), 1))

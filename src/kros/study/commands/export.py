@@ -43,7 +43,9 @@ def export_run(
     """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
-        loads = {f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")}
+        loads = {
+            f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")
+        }
         if observer not in (*names, *loads):
             raise ConfigError(
                 f"Run {run}: has no observer {observer!r}{did_you_mean(observer, (*names, *loads)) or ';'} known are {', '.join((*names, *loads))}."
@@ -58,7 +60,9 @@ def export_run(
         limit = np.inf if config.load.limit is None else config.load.limit
         level = AngleLoad(config.load.level_s, chosen.sample_period_s, limit=limit)
         load = LoadOutput(level, current=config.load.current) if observer in loads else None
-        return export_c(chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen), on_board=True)
+        return export_c(
+            chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen), on_board=True
+        )
 
 
 def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut | None:
@@ -67,9 +71,12 @@ def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut |
     try:
         population = open_source(config)
         units = {
-            u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad} for u in population.unit_ids
+            u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad}
+            for u in population.unit_ids
         }
-        batch = EpisodeBatch.read(population, spread([k for k in facts.test if k.unit in units], _EPISODES), parameters=units)
+        batch = EpisodeBatch.read(
+            population, spread([k for k in facts.test if k.unit in units], _EPISODES), parameters=units
+        )
     except (KrosError, KeyError) as error:
         log.warning("Numerical error: not measured, since the run's recordings cannot be read: %s", error)
         return None

@@ -20,7 +20,16 @@ from ...observer.screen import sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig
 from ..engine.store import Store
-from .recordings import UnitValues, check_channels, hidden_states, identify_on, load_calibration, open_data, parse_given, unit_values
+from .recordings import (
+    UnitValues,
+    check_channels,
+    hidden_states,
+    identify_on,
+    load_calibration,
+    open_data,
+    parse_given,
+    unit_values,
+)
 
 Array = npt.NDArray[np.float64]
 _BATCH, _PHASES, _SEEN = 64, 24, 20_000  # episodes, phases, samples
@@ -38,7 +47,9 @@ class FieldRecordings:
     name: str | None
 
     @classmethod
-    def open(cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None) -> FieldRecordings:
+    def open(
+        cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None
+    ) -> FieldRecordings:
         """Open what `data` names, and settle the parameters of every unit."""
         if not store.holds("observers", "deployed.json"):
             raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
@@ -55,7 +66,10 @@ class FieldRecordings:
 
     def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
         """Read episodes, some at a time."""
-        keys, values = keys or self.population.episodes, {u: {**self.observer.parameters, **own} for u, own in self.values.items()}
+        keys, values = (
+            keys or self.population.episodes,
+            {u: {**self.observer.parameters, **own} for u, own in self.values.items()},
+        )
         for start in range(0, len(keys), _BATCH):
             yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
 
@@ -63,7 +77,9 @@ class FieldRecordings:
         """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
         observer, units, n = self.observer, found.batch.units, len(self.observer.recorded)
         estimates, status = np.empty((*found.y.shape[:2], n)), sample_status(observer, found.y, found.u)
-        others, rows = ([i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True))
+        others, rows = (
+            [i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True)
+        )
         if others:
             own = found.parameters(observer, others)
             x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], own)
@@ -72,7 +88,9 @@ class FieldRecordings:
             return estimates, None, status
         followed = np.tile(found.batch.parameters[self.name], (len(found.y), 1))
         if rows:
-            tracked = track_parameter(observer, found.y[:, rows], found.u[:, rows], found.parameters(observer, rows), self.name)
+            tracked = track_parameter(
+                observer, found.y[:, rows], found.u[:, rows], found.parameters(observer, rows), self.name
+            )
             estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
             status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
         return estimates, followed, status
@@ -106,7 +124,10 @@ def _settled(
             )
         source = f"value that is {sources.get(unit)}"
         if name in missing and name == phase:
-            values[unit][name], source = _start(observer, population, unit, values[unit], name), "value of the smallest innovation"
+            values[unit][name], source = (
+                _start(observer, population, unit, values[unit], name),
+                "value of the smallest innovation",
+            )
         elif name in missing:
             source = "value of the nominal unit"
         sources[unit] = f"tracked from the {source}"

@@ -30,7 +30,19 @@ from .study_text import study_text
 
 log = logging.getLogger(__name__)
 MOST_FINDINGS = 12
-NO_LOAD = ("unloaded", "noload", "leerlauf", "ohnelast", "unbelastet", "leer", "idle", "empty", "vide", "avide", "sanscharge")
+NO_LOAD = (
+    "unloaded",
+    "noload",
+    "leerlauf",
+    "ohnelast",
+    "unbelastet",
+    "leer",
+    "idle",
+    "empty",
+    "vide",
+    "avide",
+    "sanscharge",
+)
 
 
 @dataclass(frozen=True)
@@ -120,14 +132,18 @@ def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingPro
     """Return lifted functions where recordings ask for them: the periodic term of an angle, with the phase of every unit where it can be calibrated."""
     if population.metadata.get("plant") == HARMONIC_DRIVE:
         return LiftingProposal(why="these recordings say which plant they are of, and its own lifting is taken")
-    angles = [c.name for c in population.channels if c.role is Role.STATE and c.measured and _may_be_angle(c.name, c.unit)]
+    angles = [
+        c.name for c in population.channels if c.role is Role.STATE and c.measured and _may_be_angle(c.name, c.unit)
+    ]
     keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]
     term = periodic_term(population, angles, keys) if angles and keys else None
     if term is None:
         return LiftingProposal()
     if term.ratio == 1:
         why = f"sin({term.angle}), as of gravity, explains {100 * term.share:.2g} % of what a linear model of one step leaves"
-        return LiftingProposal({"functions": [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]}, {}, why)
+        return LiftingProposal(
+            {"functions": [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]}, {}, why
+        )
     why = (
         f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({term.above:.0f} times what is left at ratios "
         f"around; {100 * term.share:.2g} % of the residual)"
@@ -136,7 +152,9 @@ def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingPro
     if spec is not None and _calibrates(population, facts, spec):
         table = {"angle": spec.angle, "ratio": spec.ratio, "reference": spec.reference, "measured": spec.measured}
         return LiftingProposal(
-            {"functions": [f"sin({term.ratio:g}*{term.angle} + phase)"]}, table, f"{why}; every unit has a phase of its own"
+            {"functions": [f"sin({term.ratio:g}*{term.angle} + phase)"]},
+            table,
+            f"{why}; every unit has a phase of its own",
         )
     return LiftingProposal({"functions": [f"{f}({term.ratio:g}*{term.angle})" for f in ("sin", "cos")]}, {}, why)
 
@@ -162,7 +180,9 @@ def _calibrates(population: Population, facts: RecordingFacts, spec: PhaseSpec) 
         return False
 
 
-def _lines(population: Population, found: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path) -> list[str]:
+def _lines(
+    population: Population, found: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path
+) -> list[str]:
     """Return what people read at the terminal."""
     units, counts = population.unit_ids, {(u, c): len(keys) for u, c, keys in population.groups()}
     fewest, most = min(counts.values()), max(counts.values())
@@ -173,10 +193,16 @@ def _lines(population: Population, found: Discovery | None, proposal: LiftingPro
     ]
     if found is not None:
         lines += [f"  {found.reading}", *column_lines(found.columns)]
-    lines += [f"lifting: {'; '.join(proposal.lifting['functions'])}: {proposal.why}" if proposal.lifting else f"lifting: {proposal.why}"]
+    lines += [
+        f"lifting: {'; '.join(proposal.lifting['functions'])}: {proposal.why}"
+        if proposal.lifting
+        else f"lifting: {proposal.why}"
+    ]
     lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
     if len(findings) > MOST_FINDINGS:
-        lines.append(f"looks wrong: {len(findings) - MOST_FINDINGS} further points, which are written at the start of the study")
+        lines.append(
+            f"looks wrong: {len(findings) - MOST_FINDINGS} further points, which are written at the start of the study"
+        )
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

@@ -33,7 +33,13 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
                 innovations += judged_innovations(recordings, monitor, found)
         highest, bands = highest_levels(monitor, innovations, condition)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and highest is not None and highest > 0
-        row: dict[str, Any] = {"unit": unit, "condition": condition, "score": None, "threshold": None, "outlier": outlier}
+        row: dict[str, Any] = {
+            "unit": unit,
+            "condition": condition,
+            "score": None,
+            "threshold": None,
+            "outlier": outlier,
+        }
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
         row |= {"recorded_s": samples * population.sample_period_s, "left_out": []}
         row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": highest}
@@ -46,8 +52,14 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
 
 def by_band(observer: Observer, monitor: Monitor, levels: Array) -> dict[str, dict[str, float]]:
     """Return levels, shape (q, bands), by the name of the measured channel and the centre frequency in Hz."""
-    names, centres = [observer.lifting.states[i] for i in observer.measured], monitor.centres_hz(observer.sample_period_s)
-    return {name: {f"{hz:.3g}": float(v) for hz, v in zip(centres, row, strict=True)} for name, row in zip(names, levels, strict=True)}
+    names, centres = (
+        [observer.lifting.states[i] for i in observer.measured],
+        monitor.centres_hz(observer.sample_period_s),
+    )
+    return {
+        name: {f"{hz:.3g}": float(v) for hz, v in zip(centres, row, strict=True)}
+        for name, row in zip(names, levels, strict=True)
+    }
 
 
 def judged_innovations(recordings: FieldRecordings, monitor: Monitor, found: Arriving) -> list[tuple[Array, Flags]]:
@@ -57,7 +69,9 @@ def judged_innovations(recordings: FieldRecordings, monitor: Monitor, found: Arr
     return [(nu[:length, i], judged[:length, i]) for i, length in enumerate(found.batch.lengths)]
 
 
-def highest_levels(monitor: Monitor | None, innovations: list[tuple[Array, Flags]], condition: str) -> tuple[float | None, Array | None]:
+def highest_levels(
+    monitor: Monitor | None, innovations: list[tuple[Array, Flags]], condition: str
+) -> tuple[float | None, Array | None]:
     """Return the highest level over the bound, dB, and that of every band, as the episodes come one after the other; None where nothing is judged."""
     if monitor is None or not any(judged.any() for _, judged in innovations):
         return None, None

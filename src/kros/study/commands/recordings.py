@@ -39,7 +39,9 @@ def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -
     except (ConfigError, DataError) as error:
         if not data.is_dir() or data.suffix == ".toml":
             raise
-        raise type(error)(f"{error} Recordings of another kind than the run's are named by a TOML with [data], as in a study.") from error
+        raise type(error)(
+            f"{error} Recordings of another kind than the run's are named by a TOML with [data], as in a study."
+        ) from error
 
 
 def hidden_states(observer: Observer) -> tuple[str, ...]:
@@ -58,7 +60,9 @@ def check_channels(population: Population, observer: Observer, *, field_recordin
             f"{', '.join((*population.states, *population.inputs))}; record it, or correct the mapping."
         )
     if expected != found and not field_recordings:
-        raise DataError(f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way.")
+        raise DataError(
+            f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way."
+        )
     own = observer.about.get("units_of_measure", {})
     for channel in population.channels:
         if channel.unit and own.get(channel.name, channel.unit) not in ("", channel.unit):
@@ -92,7 +96,10 @@ class UnitValues:
 
 
 def unit_values(
-    population: Population, calibration: PhaseCalibration | None, prefer: str, given: Mapping[str, Mapping[str, float]] | None = None
+    population: Population,
+    calibration: PhaseCalibration | None,
+    prefer: str,
+    given: Mapping[str, Mapping[str, float]] | None = None,
 ) -> UnitValues:
     """Return every unit's lifting parameters."""
     given = given or {}
@@ -119,7 +126,9 @@ def unit_values(
     return found
 
 
-def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> dict[str, dict[str, float]]:
+def unit_parameters(
+    population: Population, calibration: PhaseCalibration | None, prefer: str
+) -> dict[str, dict[str, float]]:
     """Return every unit's lifting parameters, as `unit_values` finds them."""
     found = unit_values(population, calibration, prefer)
     for reason in found.reasons.values():

@@ -38,7 +38,9 @@ def study_text(
 ) -> str:
     """Return a study as TOML."""
     lines = [
-        *_comment(f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; every line may be corrected.")
+        *_comment(
+            f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; every line may be corrected."
+        )
     ]
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
@@ -55,9 +57,15 @@ def study_text(
     if lifting:
         lines += ["[lifting]", *(f"{key} = {_value(value)}" for key, value in lifting.items())]
     else:
-        lines += ["# [lifting]", '# functions = ["sin(angle)"]  # nonlinear terms that you know of; without any, models are linear']
+        lines += [
+            "# [lifting]",
+            '# functions = ["sin(angle)"]  # nonlinear terms that you know of; without any, models are linear',
+        ]
     if calibrate:
-        lines += ["", *_comment("Where the phase of every unit is found: in the error of a speed that is held constant.")]
+        lines += [
+            "",
+            *_comment("Where the phase of every unit is found: in the error of a speed that is held constant."),
+        ]
         lines += ["[calibrate]", *(f"{key} = {_value(value)}" for key, value in calibrate.items())]
     return "\n".join(lines) + "\n"
 
@@ -80,7 +88,12 @@ def _mapping(found: Discovery) -> Iterator[str]:
             "# Columns that were left out; a channel of the role state is estimated, one of the role input is known at run time.",
         )
     for column in spare:
-        table = {"name": column.name, "column": column.reference, "role": "state", **({"unit": column.unit} if column.unit else {})}
+        table = {
+            "name": column.name,
+            "column": column.reference,
+            "role": "state",
+            **({"unit": column.unit} if column.unit else {}),
+        }
         yield from ("", *(f"# {line}" for line in ("[[data.csv.channel]]", *_channel(table, column))))
 
 
@@ -107,5 +120,9 @@ def _one_line(text: str) -> str:
 
 def _comment(text: str) -> list[str]:
     return textwrap.wrap(
-        _one_line(text), 118, initial_indent="# ", subsequent_indent="#   " if text.startswith("- ") else "# ", break_on_hyphens=False
+        _one_line(text),
+        118,
+        initial_indent="# ",
+        subsequent_indent="#   " if text.startswith("- ") else "# ",
+        break_on_hyphens=False,
     )

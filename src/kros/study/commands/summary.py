@@ -17,7 +17,9 @@ def summary_lines(result: RunResult) -> list[str]:
     """Return what was found and where the report is."""
     metrics = result.metrics
     study = metrics["study"]
-    lines = [f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"]
+    lines = [
+        f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"
+    ]
     lines += [f"look at: {alert}" for alert in study.get("alerts", ())]
     lines += [*confounded_text(metrics), *observer_lines(result)]
     flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
@@ -37,7 +39,11 @@ def _silent(rows: Sequence[Mapping[str, Any]]) -> str:
 def observer_lines(result: RunResult) -> list[str]:
     """Return one line an observer: mean error of all units in the condition that was identified on."""
     metrics = result.metrics
-    rows = [r for r in metrics.get("evaluation", []) if r["condition"] == metrics["study"]["identify_on"] and r["role"] != "outlier"]
+    rows = [
+        r
+        for r in metrics.get("evaluation", [])
+        if r["condition"] == metrics["study"]["identify_on"] and r["role"] != "outlier"
+    ]
     channels = list(dict.fromkeys(r["channel"] for r in rows))
     if not rows:
         return []

@@ -88,14 +88,22 @@ def _reasons(row: dict[str, Any]) -> list[str]:
     elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
         reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
     elif row["status"] == Status.OTHER_MOTIONS:
-        reasons.append("beyond the others, but by no more than one unit differs from motion to motion; repeat the motions of the study")
+        reasons.append(
+            "beyond the others, but by no more than one unit differs from motion to motion; repeat the motions of the study"
+        )
     elif row.get("detectable") is not None and not row["outlier"]:
         only = "only " if row["status"] == Status.CANNOT_TELL else ""
-        reasons.append(f"{only}a change of gain above {row['detectable']:.2g} % would be detected, at {row['detectable_hz']:.3g} Hz")
+        reasons.append(
+            f"{only}a change of gain above {row['detectable']:.2g} % would be detected, at {row['detectable_hz']:.3g} Hz"
+        )
     if "missing" in row:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     if row.get("level_db") is not None:
-        units = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed" if row["level_units"] < FEWEST_UNITS else ""
+        units = (
+            f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
+            if row["level_units"] < FEWEST_UNITS
+            else ""
+        )
         reasons.append(f"innovation {level_text(row)}{units}")
     elif "missing" in row:
         reasons.append("the deployed observer has no monitor, or no sample can be judged")

@@ -101,7 +101,9 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         from distributed import Client
         from distributed.comm.addressing import get_address_host_port
     except ImportError as error:
-        raise MissingDependencyError(f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'.") from error
+        raise MissingDependencyError(
+            f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'."
+        ) from error
     try:
         get_address_host_port(address)  # a client made with something else goes on trying
         client = Client(address, set_as_default=False)
@@ -113,7 +115,10 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
     if not threads:
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
     if any(n > 1 for n in threads.values()):
-        log.warning("Dask scheduler %s: workers of several threads run one task at a time; start them with --nthreads 1.", address)
+        log.warning(
+            "Dask scheduler %s: workers of several threads run one task at a time; start them with --nthreads 1.",
+            address,
+        )
     told = logging.getLogger("distributed.client")
     level = told.level
     told.setLevel(logging.CRITICAL)  # what it says of a lost connection is said by an error here

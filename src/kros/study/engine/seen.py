@@ -59,7 +59,9 @@ class KnownResults:
     ) -> Iterator[T]:
         """Yield results in the order of the tasks; see `Work.recall`."""
         known, named = self._read(title), {kind.__name__: kind for kind in kinds}
-        found: list[Any] = [self._restored(known, mark, named, usable, task) for task, mark in zip(tasks, marks, strict=True)]
+        found: list[Any] = [
+            self._restored(known, mark, named, usable, task) for task, mark in zip(tasks, marks, strict=True)
+        ]
         new = [(mark, task) for mark, task, result in zip(marks, tasks, found, strict=True) if result is None]
         keeps = self.changed is not None
         computed = work.map(title, _Packing(function, keeps), new)
@@ -102,7 +104,9 @@ class KnownResults:
             log.warning("%s: cannot be read (%s), so everything is computed", path, error)
             return {}
 
-    def _restored(self, known: Mapping[str, str], mark: str | None, kinds: Mapping[str, type], usable: Usable | None, task: Any) -> Any:
+    def _restored(
+        self, known: Mapping[str, str], mark: str | None, kinds: Mapping[str, type], usable: Usable | None, task: Any
+    ) -> Any:
         if mark is None or mark not in known:
             return None
         try:
@@ -179,7 +183,10 @@ def _packed(value: Any) -> Any:
     if isinstance(value, bytes):
         return {"bytes": base64.b64encode(value).decode()}
     if dataclasses.is_dataclass(value):
-        return {"is": type(value).__name__, "with": {f.name: _packed(getattr(value, f.name)) for f in dataclasses.fields(value)}}
+        return {
+            "is": type(value).__name__,
+            "with": {f.name: _packed(getattr(value, f.name)) for f in dataclasses.fields(value)},
+        }
     if isinstance(value, tuple):
         return {"tuple": [_packed(v) for v in value]}
     if isinstance(value, dict):

@@ -91,7 +91,12 @@ def _outdate(context: Context, steps: Sequence[StageStep]) -> None:
 
 def _key(context: Context, step: StageStep, upstream: str) -> str:
     dumped = context.config.dump()
-    dumped |= {f"{section}.{key}": value for section, table in dumped.items() if isinstance(table, dict) for key, value in table.items()}
+    dumped |= {
+        f"{section}.{key}": value
+        for section, table in dumped.items()
+        if isinstance(table, dict)
+        for key, value in table.items()
+    }
     inputs = _inputs_key(context) if step.stage is Stage.READ else ""
     return hash_of([upstream, inputs, {name: dumped[name] for name in step.sections}])
 

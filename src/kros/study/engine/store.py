@@ -64,7 +64,11 @@ class Store:
         """Return the runs inside that a stage made, which are in a folder of its name."""
         folder = self.path(stage)
         inside = sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
-        return [Store(f) for f in inside if f.is_dir() and not f.is_symlink() and ((f / records.FOLDER).is_dir() or (f / PARTIAL).is_dir())]
+        return [
+            Store(f)
+            for f in inside
+            if f.is_dir() and not f.is_symlink() and ((f / records.FOLDER).is_dir() or (f / PARTIAL).is_dir())
+        ]
 
     @contextmanager
     def drafting(self) -> Iterator[Store]:
@@ -94,7 +98,9 @@ class Store:
     def is_current(self, stage: str, key: str) -> bool:
         """Tell whether a stage was finished with this key and its files are as it left them."""
         record = self.record(stage)
-        return record is not None and record.key == key and all(record.matches(self.folder, name) for name in record.files)
+        return (
+            record is not None and record.key == key and all(record.matches(self.folder, name) for name in record.files)
+        )
 
     def files(self) -> frozenset[str]:
         """Return the names of all files that belong to the run."""
@@ -107,12 +113,16 @@ class Store:
 
     def verify(self, *stages: str) -> None:
         """Make sure that what finished stages wrote is as they left it, and the study and its metrics too."""
-        for stage in (*map(_name, stages), OWN) if stages else [r.stage for r in records.records(self.folder) if r.stage != SEEN]:
+        for stage in (
+            (*map(_name, stages), OWN) if stages else [r.stage for r in records.records(self.folder) if r.stage != SEEN]
+        ):
             record = records.read_record(self.folder, stage)
             for name in record.all if record is not None else ():
                 if record is not None and not record.matches(self.folder, name):
                     found = "was changed or damaged since" if self.path(name).exists() else "is missing"
-                    raise DataError(f"Run {self.folder}: {name}, which stage {stage} wrote, {found}; run the study again.")
+                    raise DataError(
+                        f"Run {self.folder}: {name}, which stage {stage} wrote, {found}; run the study again."
+                    )
 
     def commit(self, stage: str, key: str, seconds: float) -> None:
         """Record what the running stage wrote, then move it into place."""
@@ -139,7 +149,9 @@ class Store:
         target = records.place(self.folder, name)
         above = [p for p in target.parents if p.is_relative_to(self.folder) and p.exists() and not p.is_dir()]
         if above or (target.is_dir() and not target.is_symlink()):
-            raise ConfigError(f"Run folder {self.folder}: {(above or [target])[0]} is in the place of a result ({name}); move it away.")
+            raise ConfigError(
+                f"Run folder {self.folder}: {(above or [target])[0]} is in the place of a result ({name}); move it away."
+            )
 
     def clear(self, stage: str) -> None:
         """Forget a stage: the files it wrote, where they are as it left them, then its record; runs inside stay, to be resumed."""
@@ -203,7 +215,9 @@ class Store:
         def note(path: Path) -> None:
             record = self.record(SEEN)
             files = dict(record.files) if record is not None else {}
-            self._write(Record(SEEN, files=dict(sorted((files | {f"{SEEN}/{path.name}": records.digest(path)}).items()))))
+            self._write(
+                Record(SEEN, files=dict(sorted((files | {f"{SEEN}/{path.name}": records.digest(path)}).items())))
+            )
 
         return KnownResults(self.path(SEEN), key, note)
 

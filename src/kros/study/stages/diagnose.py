@@ -54,9 +54,14 @@ def diagnose(context: Context, found: UncertainModels) -> None:
     noise = [(kind, task) for kind, uncertain in found.sets.items() for task in _noise(context, kind, uncertain)]
     tasks: list[Task] = [(folder / kind / "noise", task) for kind, task in noise]  # those that read recordings begin
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks += [(folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config)) for kind in pair]
+    tasks += [
+        (folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config))
+        for kind in pair
+    ]
     tasks += _others(context, found.scores)
-    results = context.work.run("quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in tasks])
+    results = context.work.run(
+        "quantify (diagnose)", [partial(_attempt, place.parent.name, task) for place, task in tasks]
+    )
     for (place, _), result in zip(tasks, results, strict=True):
         if result is not None:
             result.save(place)
@@ -134,9 +139,14 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
     if top is None:
         return []
     condition = top["condition"]
-    outside = [top["unit"], *(r["unit"] for r in rows if r["outlier"] and r["condition"] == condition and r["unit"] != top["unit"])]
+    outside = [
+        top["unit"],
+        *(r["unit"] for r in rows if r["outlier"] and r["condition"] == condition and r["unit"] != top["unit"]),
+    ]
     sets = [context.identified.models(name, condition) for name in context.identified.edmd_kinds]
-    others = [u for u, state in zip(sets[0].unit_ids, sets[0].status, strict=True) if state == "ok" and u not in outside]
+    others = [
+        u for u, state in zip(sets[0].unit_ids, sets[0].status, strict=True) if state == "ok" and u not in outside
+    ]
     if len(others) < 2:
         return []
     responses = sets[0].scaled_responses(sets[0].frequencies(_POINTS), others)
@@ -156,7 +166,9 @@ def most_conspicuous(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any] | N
     return max(scored, key=lambda r: (bool(r["outlier"]), float(r["score"])), default=None)
 
 
-def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintySettings) -> UnitResiduals:
+def against_others(
+    models: ModelSet, others: list[str], outside: list[str], nominal: str, config: UncertaintySettings
+) -> UnitResiduals:
     """Return the residuals of all units beside the smallest diagonal cover of `others`, frequency by frequency, and beside fits to their entries."""
     freqs, form, row = models.frequencies(_POINTS), Form(config.form), others.index(nominal)
     everyone = [*others, *outside]

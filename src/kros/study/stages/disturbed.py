@@ -66,7 +66,9 @@ class Trial:
         return np.asarray(episodes.errors(run)[0])
 
 
-def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]) -> Trial | None:
+def make_trial(
+    context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]
+) -> Trial | None:
     """Return what is run on disturbed measurements; None where the study asks for nothing of it."""
     if not context.config.evaluate.robustness:
         return None
@@ -81,11 +83,16 @@ def make_trial(context: Context, keys: Sequence[EpisodeKey], units: dict[str, di
         return None
     calibrated = any(units.values())
     disturbances = tuple(standard_disturbances([k for k in Kind if calibrated or k is not Kind.PHASE]))
-    return Trial(context.population, given, FEW_SAMPLES, units, models.measured, disturbances, names, context.config.sensor)
+    return Trial(
+        context.population, given, FEW_SAMPLES, units, models.measured, disturbances, names, context.config.sensor
+    )
 
 
 def run_disturbed(
-    context: Context, trial: Trial | None, observers: Mapping[str, Observer], baselines: Mapping[str, tuple[Array, Sequence[int] | None]]
+    context: Context,
+    trial: Trial | None,
+    observers: Mapping[str, Observer],
+    baselines: Mapping[str, tuple[Array, Sequence[int] | None]],
 ) -> None:
     """Run the observers of a trial on disturbed measurements, and save what comes out."""
     if trial is None:
@@ -94,7 +101,11 @@ def run_disturbed(
     chosen = {name: observer for name, observer in observers.items() if name in trial.names}
     groups = alike(chosen.values())
     done = context.work.run("disturb", [partial(trial.errors_of_observers, group) for group in groups])
-    by_name = {o.name: found for group, errors in zip(groups, done, strict=True) for o, found in zip(group, errors, strict=True)}
+    by_name = {
+        o.name: found
+        for group, errors in zip(groups, done, strict=True)
+        for o, found in zip(group, errors, strict=True)
+    }
     errors = {name: (by_name[observer.name], None) for name, observer in chosen.items()} | dict(baselines)
     save_artifact(folder, "disturbed", contents(trial, errors))
 
@@ -105,7 +116,11 @@ def contents(trial: Trial, errors: Mapping[str, tuple[Array, Sequence[int] | Non
     return {
         "units": list(dict.fromkeys(k.unit for k in trial.keys)),
         "seconds": trial.samples * trial.population.sample_period_s,
-        "robustness": [row for name, (found, own) in errors.items() for row in robustness_rows(name, found, episodes, channels, own)],
+        "robustness": [
+            row
+            for name, (found, own) in errors.items()
+            for row in robustness_rows(name, found, episodes, channels, own)
+        ],
     }
 
 

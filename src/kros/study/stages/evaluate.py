@@ -92,13 +92,19 @@ def evaluate_baseline(
         baseline = replace(make(), limits=limits)
     except KrosError as error:
         return str(error)
-    (outcome,) = _outcomes(lambda batch: [baseline.run(batch, batch.parameters)[None]], population, keys, units, shown, sensor)
+    (outcome,) = _outcomes(
+        lambda batch: [baseline.run(batch, batch.parameters)[None]], population, keys, units, shown, sensor
+    )
     disturbed = None if trial is None else trial.errors_of_baseline(baseline)
     return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
 
 def evaluate_model(
-    models: ModelSet, population: Population, keys: tuple[EpisodeKey, ...], units: UnitParameters, shown: tuple[int, ...]
+    models: ModelSet,
+    population: Population,
+    keys: tuple[EpisodeKey, ...],
+    units: UnitParameters,
+    shown: tuple[int, ...],
 ) -> TestOutcome:
     """Run every unit's own model freely from the true first state, with delays from the first recorded ones."""
 
@@ -127,7 +133,9 @@ def _outcomes(
     for start in range(0, len(keys) or 1, _EPISODES):  # none at all are refused where they are read
         batch = EpisodeBatch.read(population, keys[start : start + _EPISODES], parameters=units, truths=truths)
         batch = as_shown(batch, sensor, population.states)
-        batch = replace(batch, states=np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2))  # in memory as estimates are
+        batch = replace(
+            batch, states=np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2)
+        )  # in memory as estimates are
         own = [i - start for i in shown if 0 <= i - start < len(batch.keys)]
         found.append([outcome for estimates in run(batch) for outcome in _of_block(estimates, batch, population, own)])
     blocks = [[i for i in shown if i // _EPISODES == block] for block in range(len(found))]
@@ -138,7 +146,11 @@ def _of_block(estimates: Array, batch: EpisodeBatch, population: Population, sho
     n, lengths = len(population.states), batch.lengths
     summaries = summarise_all(estimates, batch.states, lengths, population.sample_period_s)
     return [
-        TestOutcome(summary, [estimate[: lengths[i], i, :n].copy() for i in shown], true=_true(estimate[..., :n], batch, population))
+        TestOutcome(
+            summary,
+            [estimate[: lengths[i], i, :n].copy() for i in shown],
+            true=_true(estimate[..., :n], batch, population),
+        )
         for summary, estimate in zip(summaries, estimates, strict=True)
     ]
 
@@ -168,10 +180,16 @@ def run(context: Context) -> None:
     shown = showcase(context, keys, roles)
     shown_on = tuple(on.index(keys[i]) for i in shown if keys[i] in on)
 
-    observers, models = load_observers(context), {name: context.identified.models(name) for name in context.identified.kinds}
+    observers, models = (
+        load_observers(context),
+        {name: context.identified.models(name) for name in context.identified.kinds},
+    )
     trial = make_trial(context, keys, units, roles)
     work = estimation(context, population, keys, units, shown, trial)
-    work += [Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on)) for m, found in models.items()]
+    work += [
+        Piece((f"free run/{m}",), partial(evaluate_model, found, population, on, units, shown_on))
+        for m, found in models.items()
+    ]
     results = outcomes(context, work)
     free_runs = {m: outcome for m in models if isinstance(outcome := results.pop(f"free run/{m}"), TestOutcome)}
     estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, TestOutcome)}
@@ -227,7 +245,9 @@ def outcomes(context: Context, work: Sequence[Piece]) -> dict[str, TestOutcome |
     return {name: found[name] for name in dict.fromkeys((*load_observers(context), *found))}
 
 
-def baseline_makers(context: Context, population: Population, keys: tuple[EpisodeKey, ...]) -> dict[str, Callable[[], Baseline]]:
+def baseline_makers(
+    context: Context, population: Population, keys: tuple[EpisodeKey, ...]
+) -> dict[str, Callable[[], Baseline]]:
     """Return what makes every baseline that is no correction of a model."""
     models = {name: context.identified.models(name) for name in context.identified.kinds}
     asked, first = context.config.observer.baselines, next(iter(models.values()))
@@ -275,7 +295,9 @@ def unit_roles(context: Context) -> dict[str, str]:
     """Return for every unit whether it is the nominal one, another of the population, or filed as an outlier."""
     nominal = context.uncertain.nominal
     pooled = context.facts.pooled
-    return {u: "nominal" if u == nominal else ("off_nominal" if u in pooled else "outlier") for u in context.facts.groups}
+    return {
+        u: "nominal" if u == nominal else ("off_nominal" if u in pooled else "outlier") for u in context.facts.groups
+    }
 
 
 def showcase(context: Context, keys: tuple[EpisodeKey, ...], roles: dict[str, str]) -> tuple[int, ...]:
@@ -308,7 +330,10 @@ def error_rows(
                 continue
             row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition, "channel": channel}
             row |= {"rms": summary.rms[chosen, j].mean(), "error_percent": summary.percent[chosen, j].mean()}
-            row |= {f"{part}_error_percent": getattr(summary, f"{part}_percent")[chosen, j].mean() for part in ("start", "rest")}
+            row |= {
+                f"{part}_error_percent": getattr(summary, f"{part}_percent")[chosen, j].mean()
+                for part in ("start", "rest")
+            }
             row |= {} if power is None else {"gearbox_band_power": power[chosen, j].mean()}
             rows.append(row | true_entry(outcome.true, chosen, j))
     return rows
@@ -319,14 +344,20 @@ def true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) -> 
     if true is None or state not in true.states:
         return {}
     at = true.states.index(state)
-    return {f"true_{what}": float(values[episodes, at].mean()) for what, values in vars(true).items() if what != "states"}
+    return {
+        f"true_{what}": float(values[episodes, at].mean()) for what, values in vars(true).items() if what != "states"
+    }
 
 
-def recorded_rows(population: Population, keys: tuple[EpisodeKey, ...], roles: dict[str, str]) -> dict[str, list[dict[str, Any]]]:
+def recorded_rows(
+    population: Population, keys: tuple[EpisodeKey, ...], roles: dict[str, str]
+) -> dict[str, list[dict[str, Any]]]:
     """Return the errors of the recorded states themselves against what they really were, where the recordings say so."""
     rows: list[dict[str, Any]] = []
     for unit, condition in dict.fromkeys((k.unit, k.condition) for k in keys if population.truths):
-        batch = EpisodeBatch.read(population, [k for k in keys if (k.unit, k.condition) == (unit, condition)], truths=True)
+        batch = EpisodeBatch.read(
+            population, [k for k in keys if (k.unit, k.condition) == (unit, condition)], truths=True
+        )
         true = _true(batch.states, batch, population)
         for state in population.true_states:
             row = {"unit": unit, "role": roles[unit], "condition": condition, "channel": population.states[state]}
@@ -339,9 +370,16 @@ def free_run_percent(
 ) -> dict[str, dict[str, float]]:
     """Return median and worst free-run error over the pooled units, channel by channel."""
     per_unit = np.array(
-        [summary.percent[[i for i, k in enumerate(keys) if k.unit == u]].mean(axis=0) for u in pooled if any(k.unit == u for k in keys)]
+        [
+            summary.percent[[i for i, k in enumerate(keys) if k.unit == u]].mean(axis=0)
+            for u in pooled
+            if any(k.unit == u for k in keys)
+        ]
     )
-    return {c: {"median": float(np.median(per_unit[:, j])), "worst": float(per_unit[:, j].max())} for j, c in enumerate(channels)}
+    return {
+        c: {"median": float(np.median(per_unit[:, j])), "worst": float(per_unit[:, j].max())}
+        for j, c in enumerate(channels)
+    }
 
 
 def load_observers(context: Context) -> dict[str, Observer]:

@@ -34,7 +34,16 @@ from ..engine.seen import KnownResults
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
 from . import calibrate
-from .evaluate import TestOutcome, UnitParameters, band_hz, error_rows, estimation, evaluate_observers, facts_of, outcomes
+from .evaluate import (
+    TestOutcome,
+    UnitParameters,
+    band_hz,
+    error_rows,
+    estimation,
+    evaluate_observers,
+    facts_of,
+    outcomes,
+)
 from .read import FEWEST
 
 log = logging.getLogger(__name__)
@@ -58,7 +67,9 @@ def check_folds(config: StudyConfig, population: Population) -> None:
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     """Return the units of every fold."""
     if folds > len(units):
-        raise ConfigError(f"evaluate.folds = {folds}: there are {len(units)} units to leave out; ask for at most that many folds.")
+        raise ConfigError(
+            f"evaluate.folds = {folds}: there are {len(units)} units to leave out; ask for at most that many folds."
+        )
     parts = [list(units[fold::folds]) for fold in range(folds)]
     if len(units) - len(parts[0]) < FEWEST:
         raise ConfigError(
@@ -103,8 +114,14 @@ def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
-    known = whole.work.seen.read_only() if isinstance(whole.work.seen, KnownResults) else None  # factors of the same episodes are the same
-    context = Context(without(whole, held), whole.store.nested(FOLDER, str(number)), replace(whole.work, progress=progress, seen=known))
+    known = (
+        whole.work.seen.read_only() if isinstance(whole.work.seen, KnownResults) else None
+    )  # factors of the same episodes are the same
+    context = Context(
+        without(whole, held),
+        whole.store.nested(FOLDER, str(number)),
+        replace(whole.work, progress=progress, seen=known),
+    )
     steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
@@ -117,8 +134,15 @@ def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> di
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     """Return the study on the prepared recordings of all other units, which hands nothing over and so requires nothing."""
     config = whole.config
-    prepared = {"source": recordings_path(whole.store.folder).absolute(), "reader": "parquet", "prepare": (), "csv": None}
-    data = config.data.model_copy(update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)})
+    prepared = {
+        "source": recordings_path(whole.store.folder).absolute(),
+        "reader": "parquet",
+        "prepare": (),
+        "csv": None,
+    }
+    data = config.data.model_copy(
+        update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)}
+    )
     observer = config.observer.model_copy(update={"deployed": None})
     changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
     changes["evaluate"] = config.evaluate.model_copy(update={"reserve": 0})
@@ -155,7 +179,10 @@ def held_parameters(context: Context, population: Population, facts: RecordingFa
         return {unit: {} for unit in held}
     tasks = [(population.select([u]), calibration_keys(facts, u), calibration.spec) for u in held]
     segments = context.work.map("calibrate", segments_of, tasks)
-    return {u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad} for u, found in zip(held, segments, strict=True)}
+    return {
+        u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad}
+        for u, found in zip(held, segments, strict=True)
+    }
 
 
 def next_unit(context: Context) -> dict[str, Any]:
@@ -165,9 +192,19 @@ def next_unit(context: Context) -> dict[str, Any]:
     rows, failed = reserve_rows(context, deployed)
     evaluated: Rows = context.evaluation["rows"]
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
-    hidden = [c for c in context.population.states if c not in context.population.measured] or list(context.population.states)
-    content: dict[str, Any] = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence, "observer": deployed}
-    found = {c: bounds_of(of_condition(rows, c), of_condition(known, c), hidden, config.confidence) for c in context.population.conditions}
+    hidden = [c for c in context.population.states if c not in context.population.measured] or list(
+        context.population.states
+    )
+    content: dict[str, Any] = {
+        "reserve": len(facts.reserve),
+        "units": facts.reserve,
+        "confidence": config.confidence,
+        "observer": deployed,
+    }
+    found = {
+        c: bounds_of(of_condition(rows, c), of_condition(known, c), hidden, config.confidence)
+        for c in context.population.conditions
+    }
     content |= {"jointly": True, "condition": facts.identify_on, **found.pop(facts.identify_on), "others": found}
     return content | {"rows": rows, "failed": failed}
 
@@ -210,11 +247,19 @@ def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: floa
     if not usable:
         return {"bounds": None, "reason": "the observer has no finite error on the units that it was made from"}
     if len(units) < needed:
-        return {"bounds": None, "reason": f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"}
+        return {
+            "bounds": None,
+            "reason": f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}",
+        }
     errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-    bound = next_unit_bound([[errors[u, c, m] for c, m in usable] for u in units], [scale[p] for p in usable], confidence)
+    bound = next_unit_bound(
+        [[errors[u, c, m] for c, m in usable] for u in units], [scale[p] for p in usable], confidence
+    )
     if bound is None or not np.isfinite(bound).all():
-        return {"bounds": None, "reason": "the observer diverges on too many of the units in reserve, or they cannot be calibrated"}
+        return {
+            "bounds": None,
+            "reason": "the observer diverges on too many of the units in reserve, or they cannot be calibrated",
+        }
     values = dict(zip(usable, bound.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 

@@ -22,7 +22,15 @@ from ...data.population import EpisodeKey
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import AngleLoad, LoadCalibration, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
+from ...motor_drive import (
+    AngleLoad,
+    LoadCalibration,
+    calibrate_load,
+    calibrate_torque,
+    known_load,
+    load_from_current,
+    load_observer,
+)
 from ...motor_drive.accuracy import load_accuracy
 from ...motor_drive.signals import low_passed
 from ...observer import Observer, run_observer
@@ -53,14 +61,18 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     for kind, lifting in study.liftings().items():
         try:
             calibration = study.calibration(lifting)
-            observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories)
+            observer = load_observer(
+                f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories
+            )
             observer = replace(observer, seen=seen_by(context.identified, observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
             log.info("%s/load could not be made: %s", kind, error)
             continue
         observer.save(context.store.draft(FOLDER, f"{kind}.json"))
-        estimate = run_observer(observer, study.measured(study.test), study.test.inputs, study.parameters(observer, study.test))
+        estimate = run_observer(
+            observer, study.measured(study.test), study.test.inputs, study.parameters(observer, study.test)
+        )
         found = study.level(observer, calibration, estimate)
         facts[f"{kind}/load"] = {"order": len(observer.lifting.states), "episodes_left_out": len(calibration.left_out)}
         rows.append(study.row(f"{kind}/load", found))
@@ -76,7 +88,10 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     content = {"known": study.known, "rows": rows, "observers": facts, "corner_hz": 5.0, "settle_s": SETTLE_S}
     shown = int(np.flatnonzero(study.loaded)[0])
     key = study.test.keys[shown]
-    arrays = {"truth": study.truth[1][:, shown], **{f"estimate/{name}": values[:, shown] for name, values in curves.items()}}
+    arrays = {
+        "truth": study.truth[1][:, shown],
+        **{f"estimate/{name}": values[:, shown] for name, values in curves.items()},
+    }
     save_artifact(
         context.store.draft(FOLDER),
         KIND,
@@ -104,7 +119,11 @@ class LoadStudy:
         self.units = {u: {} if phases is None else {phases.spec.parameter: phases.units[u].phase_rad} for u in usable}
         self.known = list(config.units) or [u for u in usable if facts.keys("train", u, config.condition)][:_KNOWN]
         others = [u for u in usable if u not in self.known]
-        if not set(self.known) <= set(usable) or not self.known or not any(facts.keys("test", u, config.condition) for u in others):
+        if (
+            not set(self.known) <= set(usable)
+            or not self.known
+            or not any(facts.keys("test", u, config.condition) for u in others)
+        ):
             raise ConfigError(
                 f"Load: needs units with a known load and others to judge on, both recorded in condition {config.condition!r}; "
                 f"known {', '.join(self.known) or 'none'}, others {', '.join(others[:10]) or 'none'}; see load.units and load.condition."
@@ -133,13 +152,17 @@ class LoadStudy:
         states = self.context.population.states
         for name in (self.config.angle, self.config.current):
             if name not in states:
-                raise ConfigError(f"Load: there is no state {name!r} in {', '.join(states)}; set load.angle and load.current.")
+                raise ConfigError(
+                    f"Load: there is no state {name!r} in {', '.join(states)}; set load.angle and load.current."
+                )
         return states.index(self.config.angle), states.index(self.config.current)
 
     def load(self, batch: EpisodeBatch) -> Array:
         """Return the declared load, in units of current, zero in other conditions."""
         config, angle = self.config, self.places[0]
-        torque = known_load(batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, config.angle_rad, REAL_HZ)
+        torque = known_load(
+            batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, config.angle_rad, REAL_HZ
+        )
         return np.where([k.condition == config.condition for k in batch.keys], torque, 0.0)
 
     def liftings(self) -> dict[str, Lifting]:
@@ -204,5 +227,8 @@ class LoadStudy:
             "error_rms": accuracy.error_rms,
             "error_percent": accuracy.percent,
             "error_to_floor": accuracy.ratio,
-            "fast_rms": {"unloaded": float(np.std(fast[:, ~self.loaded])), "loaded": float(np.std(fast[:, self.loaded]))},
+            "fast_rms": {
+                "unloaded": float(np.std(fast[:, ~self.loaded])),
+                "loaded": float(np.std(fast[:, self.loaded])),
+            },
         }

@@ -26,15 +26,21 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
     data = config.data
     if given is not None:
         if data.csv is not None:
-            raise ConfigError("data.csv: maps the columns of CSV files, and the recordings are a population already; leave it out.")
+            raise ConfigError(
+                "data.csv: maps the columns of CSV files, and the recordings are a population already; leave it out."
+            )
         population = prepare(given, parse_steps(data.prepare))
     elif data.reader == ARRAYS:
-        raise ConfigError("Study of arrays: they are gone with the program that held them; give the population to kros.run again.")
+        raise ConfigError(
+            "Study of arrays: they are gone with the program that held them; give the population to kros.run again."
+        )
     else:
         population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
     unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
     if unknown:
-        raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}.")
+        raise ConfigError(
+            f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}."
+        )
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
@@ -61,7 +67,9 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     """Refuse what can be refused from names alone, before anything is written."""
     check_usable(population, config.split.test, config.data.identify_on, single_allowed)
     population = taking_part(config, population)
-    resolve_phase(config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test))
+    resolve_phase(
+        config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
+    )
     config.predictor.require_hidden(population.states, population.measured)
     require_measured(config.sensor, population.measured)
     limits_of(config.limits, {}, population.states)

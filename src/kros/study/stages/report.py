@@ -31,7 +31,11 @@ def render_run(folder: Path, workers: int = 1) -> Path:
     from ...report import render
 
     began = time.perf_counter()
-    with open_finished(folder, *_SHOWN, alone=True) as (_, store), store.drafting() as draft, open_executor(workers) as executor:
+    with (
+        open_finished(folder, *_SHOWN, alone=True) as (_, store),
+        store.drafting() as draft,
+        open_executor(workers) as executor,
+    ):
         render(store.folder, read_json(store.path("metrics.json")), executor.map, draft.draft(REPORT))
         record = store.record(Stage.REPORT)
         key, seconds = (record.key, record.seconds) if record is not None else ("", time.perf_counter() - began)

@@ -43,9 +43,15 @@ def resampling(context: Context, name: str, units: list[str]) -> Callable[[], Mo
 
 def _edmd_samples(models: ModelSet, factor: Factor, counts: list[int], units: list[str]) -> ModelSamples:
     assert models.alpha is not None
-    ranges = models.ranges if models.alpha_in_ranges else Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
+    ranges = (
+        models.ranges
+        if models.alpha_in_ranges
+        else Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
+    )
     weights = episode_weights(counts, DRAWS, _SEED)
-    return _restored(bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units), ranges)
+    return _restored(
+        bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units), ranges
+    )
 
 
 def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tuple[Factor, list[int]]:
@@ -54,8 +60,13 @@ def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tupl
     places = {unit: recorded.rows_of(unit) for unit in units}
     counts = [len(found) for found in places.values()]
     if min(counts) < 2:
-        raise DataError(f"Resampling: unit {units[int(np.argmin(counts))]} has {min(counts)} training episodes; at least two are needed.")
-    R, peak, n_samples = (_by_unit(getattr(recorded.factor, key), list(places.values()), max(counts)) for key in ("R", "peak", "n_samples"))
+        raise DataError(
+            f"Resampling: unit {units[int(np.argmin(counts))]} has {min(counts)} training episodes; at least two are needed."
+        )
+    R, peak, n_samples = (
+        _by_unit(getattr(recorded.factor, key), list(places.values()), max(counts))
+        for key in ("R", "peak", "n_samples")
+    )
     whole = Factor(R, peak, n_samples)
     lifted = context.identified.models(context.identified.edmd_kinds[0])
     parameters = {key: values[[lifted.index(u) for u in units]][:, None] for key, values in lifted.parameters.items()}
@@ -103,10 +114,16 @@ def _refined_models(context: Context, models: ModelSet) -> _Refined:
 
 def _refined_samples(of: _Refined, rows: Sequence[int]) -> ModelSamples:
     """Samples of some of the units, in the recordings' units of measure."""
-    normal = episode_normals(of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, RefineOptions(), of.pooled)
+    normal = episode_normals(
+        of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, RefineOptions(), of.pooled
+    )
     weights, units = episode_weights(of.counts, DRAWS, _SEED), of.models.units
     return _chosen(
-        _restored(bootstrap_refined(units, of.models.whitening, of.models.information, normal, weights, list(of.keys)), of.ranges), rows
+        _restored(
+            bootstrap_refined(units, of.models.whitening, of.models.information, normal, weights, list(of.keys)),
+            of.ranges,
+        ),
+        rows,
     )
 
 

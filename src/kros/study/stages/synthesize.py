@@ -25,8 +25,14 @@ def run(context: Context) -> None:
         work=context.work,
     )
     for name, design in found.designs.items():
-        replace(design.observer, about={**design.observer.about, "study": config.name}).save(draft("observers", f"{name}.json"))
+        replace(design.observer, about={**design.observer.about, "study": config.name}).save(
+            draft("observers", f"{name}.json")
+        )
         design.synthesis.save(draft("synthesis", name))
     copyfile(draft("observers", f"{found.deployed}.json"), draft("observers", "deployed.json"))
     save_running(draft("observers"), found.running)
-    save_artifact(draft("observers"), "observers", {"names": list(found.designs), "deployed": found.deployed, "facts": found.facts})
+    save_artifact(
+        draft("observers"),
+        "observers",
+        {"names": list(found.designs), "deployed": found.deployed, "facts": found.facts},
+    )

@@ -103,14 +103,19 @@ def minimise(
 
 
 def _feasible(blocks: Sequence[Block], x: Array, box: float) -> bool:
-    return bool(np.abs(x).max(initial=0.0) < box) and all(np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in blocks)
+    return bool(np.abs(x).max(initial=0.0) < box) and all(
+        np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in blocks
+    )
 
 
 def _find_feasible(blocks: Sequence[Block], start: Array, end: float, box: float) -> Outcome:
     """Minimise t subject to ``F_k + t I >= 0``, ``t >= -1``, until t is negative enough."""
     n = len(start)
     lifted = [
-        Block(b.constant, np.concatenate([b.basis, np.broadcast_to(np.eye(b.constant.shape[-1]), (1, *b.constant.shape))])) for b in blocks
+        Block(
+            b.constant, np.concatenate([b.basis, np.broadcast_to(np.eye(b.constant.shape[-1]), (1, *b.constant.shape))])
+        )
+        for b in blocks
     ]
     floor = np.zeros((n + 1, 1, 1, 1))
     floor[n] = 1.0
@@ -172,7 +177,10 @@ def _follow(
         if here - lower <= rtol * max(abs(here), 1e-12):
             return Outcome(x, here, lower, Ending.SOLVED, steps)
         step = _line_search((c + quadratic @ x) @ direction / mu, direction @ quadratic @ direction / mu, eigenvalues)
-        if step * np.abs(direction).max(initial=0.0) <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
+        if (
+            step * np.abs(direction).max(initial=0.0) <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300)
+            and decrement > _CENTRED
+        ):
             break
         x = x + step * direction
         if decrement < _CENTRED:
@@ -191,8 +199,14 @@ class _Scaled:
     @classmethod
     def of(cls, blocks: Sequence[Block], n: int) -> _Scaled:
         """Of blocks with n variables."""
-        bases = [np.ascontiguousarray(np.moveaxis(m, 0, 2)).reshape(len(m[0]), -1) for b in blocks for m in np.swapaxes(b.basis, 0, 1)]
-        return cls(bases, [np.empty_like(m) for m in bases], np.empty((sum(len(m) * (len(m) + 1) // 2 for m in bases), n)))
+        bases = [
+            np.ascontiguousarray(np.moveaxis(m, 0, 2)).reshape(len(m[0]), -1)
+            for b in blocks
+            for m in np.swapaxes(b.basis, 0, 1)
+        ]
+        return cls(
+            bases, [np.empty_like(m) for m in bases], np.empty((sum(len(m) * (len(m) + 1) // 2 for m in bases), n))
+        )
 
     def along(self, roots: Sequence[Array]) -> tuple[Array, Array]:
         """Return ``sum_k tr D_ki`` and ``sum_k tr D_ki D_kj`` of ``D_ki = R_k M_ki R_k'``, for lower triangular roots R in the order of the matrices."""

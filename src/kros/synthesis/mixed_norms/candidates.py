@@ -48,7 +48,9 @@ def by_inequalities(
     return found
 
 
-def _candidate(plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, label: str, time_limit_s: float) -> Verified | str:
+def _candidate(
+    plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, label: str, time_limit_s: float
+) -> Verified | str:
     """Solve the inequalities of the small plant and verify the controller on the whole one; a text says why there is none."""
     try:
         inequalities = MixedInequalities(balance(reached(small)), gamma)

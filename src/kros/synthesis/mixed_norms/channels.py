@@ -34,7 +34,9 @@ def part(plant: GeneralizedPlant, closed: StateSpace, channel: int) -> StateSpac
     return StateSpace(closed.A, closed.B[:, columns], closed.C[rows], closed.D[rows][:, columns], closed.dt)
 
 
-def verify(plant: GeneralizedPlant, controller: StateSpace, gamma: float, origin: str, optimal: bool = True) -> Verified | str:
+def verify(
+    plant: GeneralizedPlant, controller: StateSpace, gamma: float, origin: str, optimal: bool = True
+) -> Verified | str:
     """Recompute everything on the plant; return what was found, or why the controller is rejected."""
     if not all(np.isfinite(getattr(controller, name)).all() for name in "ABCD"):
         return f"{origin}: the controller is not finite"
@@ -55,7 +57,14 @@ def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
     left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
     left[plant.rows(2)], right[plant.columns(2)] = 1 / a, a
     D11 = plant.D11 * left[:, None] * right
-    return replace(plant, B1=plant.B1 * right, D21=plant.D21 * right, C1=plant.C1 * left[:, None], D12=plant.D12 * left[:, None], D11=D11)
+    return replace(
+        plant,
+        B1=plant.B1 * right,
+        D21=plant.D21 * right,
+        C1=plant.C1 * left[:, None],
+        D12=plant.D12 * left[:, None],
+        D11=D11,
+    )
 
 
 def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float | None = None) -> None:

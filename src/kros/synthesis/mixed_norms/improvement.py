@@ -98,7 +98,9 @@ def improved(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time
             break
         dense = _frequencies(loop.close(problem.theta(x_new)), 600)
         excess, _ = problem.gains(x_new, dense)
-        peaks = np.flatnonzero((excess >= np.maximum(np.roll(excess, 1), np.roll(excess, -1))) & (excess > np.log(level) - 0.05))
+        peaks = np.flatnonzero(
+            (excess >= np.maximum(np.roll(excess, 1), np.roll(excess, -1))) & (excess > np.log(level) - 0.05)
+        )
         freqs_hz = np.union1d(freqs_hz, dense[peaks])
         level = min(level, level * gamma / peak * (1 - _BACK_OFF)) if peak < 1.05 * gamma else level
         x = x_new if peak < 1.5 * gamma else x
@@ -122,7 +124,9 @@ def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float) -> Ar
     cost: Callable[[Array], tuple[float, Array]] = problem.cost
     p = problem.loop.plant
     rooms = [room] if p.D11[p.rows(2), p.columns(2)].size else []
-    found = minimize(cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": _ITERATIONS, "ftol": 1e-7})
+    found = minimize(
+        cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": _ITERATIONS, "ftol": 1e-7}
+    )
     return np.asarray(found.x)
 
 
@@ -141,4 +145,6 @@ def _frequencies(closed: StateSpace, count: int = _GRID) -> Array:
     bottom = min(sizes.min(initial=top) / 10, top / 100)
     resonances = np.abs(poles.imag) / (2 * np.pi)
     grid = np.geomspace(bottom, top, count)
-    return np.unique(np.concatenate([[0.0], grid, np.linspace(0, top, count // 2), resonances[resonances < top], sizes[sizes < top]]))
+    return np.unique(
+        np.concatenate([[0.0], grid, np.linspace(0, top, count // 2), resonances[resonances < top], sizes[sizes < top]])
+    )

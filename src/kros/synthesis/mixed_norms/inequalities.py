@@ -56,7 +56,13 @@ class MixedInequalities:
         p = self.balanced.plant
         n, _, n_u, _, n_y = p.sizes
         n_z1 = p.C1[p.rows(1)].shape[0]
-        shapes = {"X": (n, n, True), "Y": (n, n, True), "An": (n, n, False), "Bn": (n, n_y, False), "Cn": (n_u, n, False)}
+        shapes = {
+            "X": (n, n, True),
+            "Y": (n, n, True),
+            "An": (n, n, False),
+            "Bn": (n, n_y, False),
+            "Cn": (n_u, n, False),
+        }
         return shapes | {"Dn": (n_u, n_y, False), "Z": (n_z1, n_z1, True)}
 
     @property
@@ -85,7 +91,10 @@ class MixedInequalities:
         values = {name: np.zeros(shape[:2]) for name, shape in self.shapes.items()}
         values["X"] = values["Y"] = 2 * np.diag(self.balanced.spread)
         values["Z"] = 2 * np.eye(len(values["Z"]))
-        parts = [values[k][np.triu_indices(rows)] if symmetric else values[k].ravel() for k, (rows, _, symmetric) in self.shapes.items()]
+        parts = [
+            values[k][np.triu_indices(rows)] if symmetric else values[k].ravel()
+            for k, (rows, _, symmetric) in self.shapes.items()
+        ]
         return np.concatenate(parts)
 
     def objective(self) -> Array:
@@ -105,7 +114,9 @@ class MixedInequalities:
         frame = scale[:, None] * scale
         less = p.A - eye
         G = frame * _blocks([[v["X"], eye], [eye, v["Y"]]])
-        W = frame * _blocks([[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]])
+        W = frame * _blocks(
+            [[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]]
+        )
         Wt = W.swapaxes(-1, -2)
         found = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
@@ -119,7 +130,9 @@ class MixedInequalities:
                 found.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
             else:
                 level = self.gamma**2 * np.eye(C.shape[-2])
-                found.append(_blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]]))
+                found.append(
+                    _blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
+                )
         return found
 
     def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:

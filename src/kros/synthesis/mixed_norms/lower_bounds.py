@@ -134,7 +134,9 @@ def mixed_lower_bound(plant: GeneralizedPlant, gamma: float, value: float, time_
         n = block.basis.shape[0]
         # In units of the largest Q that could still be better.
         inside = Block(block.constant, block.basis * room)
-        found = minimise(np.zeros(n), [inside], np.zeros(n), Q=2 * np.eye(n), rtol=1e-3, time_limit_s=left, box=1.0 + 1e-6)
+        found = minimise(
+            np.zeros(n), [inside], np.zeros(n), Q=2 * np.eye(n), rtol=1e-3, time_limit_s=left, box=1.0 + 1e-6
+        )
         if np.isfinite(found.lower):
             best = max(best, float(np.sqrt(free + room**2 * max(found.lower, 0.0))))
     return best

@@ -49,7 +49,9 @@ def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_l
     for floor, states in product((_NOISE_FLOOR, 10 * _NOISE_FLOOR), _around(max_states)):
         noisy = replace(problem, noise=np.maximum(problem.noise, floor * (np.abs(problem.C) @ problem.output_scale)))
         plant = mixed_plant(noisy, noise_floor=0.0)
-        require_reachable(plant, gamma)  # K does not enter T22, so that this is all there is to say about the constraint
+        require_reachable(
+            plant, gamma
+        )  # K does not enter T22, so that this is all there is to say about the constraint
         for scaling in canonical_scalings(plant):
             failed: list[str] = []
             notes: list[str] = []
@@ -58,7 +60,9 @@ def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_l
                 made = _certified(problem, noisy, min(found, key=lambda v: v.h2), notes, start)
                 best = made if best is None or _worst(made) < _worst(best) else best
                 break
-            reasons.append(f"with measurement noise of {floor:g} of the range and {states} states: {'; '.join(dict.fromkeys(failed))}")
+            reasons.append(
+                f"with measurement noise of {floor:g} of the range and {states} states: {'; '.join(dict.fromkeys(failed))}"
+            )
         if best is not None and (_worst(best) <= idle * (1 + _NOTHING) or floor > _NOISE_FLOOR):
             return best
     if best is not None:
@@ -104,7 +108,9 @@ def _without_correction(problem: ObserverProblem, nothing: StateSpace, start: fl
     )
 
 
-def _certified(problem: ObserverProblem, noisy: ObserverProblem, best: Verified, notes: list[str], start: float) -> Synthesis:
+def _certified(
+    problem: ObserverProblem, noisy: ObserverProblem, best: Verified, notes: list[str], start: float
+) -> Synthesis:
     """Certify what was found on the noisy problem for the true one."""
     controller = noisy.to_physical(best.controller)
     elapsed = time.perf_counter() - start

@@ -145,7 +145,9 @@ def _singular(plant: GeneralizedPlant, gamma: float, max_states: int, start: flo
 def _nothing_found(gamma: float, reasons: list[str]) -> SynthesisError:
     """Say why no candidate survived."""
     why = "; ".join(dict.fromkeys(reasons)) or "nothing could be tried"
-    return SynthesisError(f"Mixed synthesis: no controller survived; {why}. Raise gamma = {gamma:g}, max_states, noise or the time limit.")
+    return SynthesisError(
+        f"Mixed synthesis: no controller survived; {why}. Raise gamma = {gamma:g}, max_states, noise or the time limit."
+    )
 
 
 def performance(plant: GeneralizedPlant) -> GeneralizedPlant:
@@ -169,7 +171,9 @@ def _improved(plant: GeneralizedPlant, found: list[Verified], gamma: float, end:
     return better
 
 
-def _synthesis(best: Verified, solver: str, lower: float | None, status: Status, notes: list[str], start: float) -> Synthesis:
+def _synthesis(
+    best: Verified, solver: str, lower: float | None, status: Status, notes: list[str], start: float
+) -> Synthesis:
     """Report the best candidate with its bound."""
     useful = lower is not None and lower > 1e-9 * best.h2
     bound = min(lower, best.h2) if lower is not None else None

@@ -29,13 +29,20 @@ def regularised(plant: GeneralizedPlant) -> GeneralizedPlant:
     """Return the plant with penalty outputs at the end of z1 and noise inputs at the end of w1."""
     n, n_w, n_u, n_z, n_y = plant.sizes
     z1, w1 = plant.C1[plant.rows(1)].shape[0], plant.B1[:, plant.columns(1)].shape[1]
-    penalty = _SHARE * _sizes(plant.B2, np.vstack([plant.C1, plant.C2]), np.vstack([plant.D12, plant.D22]), plant, axis=0)
+    penalty = _SHARE * _sizes(
+        plant.B2, np.vstack([plant.C1, plant.C2]), np.vstack([plant.D12, plant.D22]), plant, axis=0
+    )
     noise = _SHARE * _sizes(np.hstack([plant.B1, plant.B2]), plant.C2, np.hstack([plant.D21, plant.D22]), plant, axis=1)
     return replace(
         plant,
         B1=np.insert(plant.B1, [w1] * n_y, np.zeros((n, n_y)), axis=1),
         C1=np.insert(plant.C1, [z1] * n_u, np.zeros((n_u, n)), axis=0),
-        D11=np.insert(np.insert(plant.D11, [w1] * n_y, np.zeros((n_z, n_y)), axis=1), [z1] * n_u, np.zeros((n_u, n_w + n_y)), axis=0),
+        D11=np.insert(
+            np.insert(plant.D11, [w1] * n_y, np.zeros((n_z, n_y)), axis=1),
+            [z1] * n_u,
+            np.zeros((n_u, n_w + n_y)),
+            axis=0,
+        ),
         D12=np.insert(plant.D12, [z1] * n_u, np.diag(penalty), axis=0),
         D21=np.insert(plant.D21, [w1] * n_y, np.diag(noise), axis=1),
         n_w1=w1 + n_y,

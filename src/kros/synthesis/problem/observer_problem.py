@@ -140,7 +140,9 @@ class ObserverProblem:
             object.__setattr__(self, name, value)
         level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
         if level.shape != (n,) or not np.all(np.isfinite(level) & (level >= 0)):
-            raise DimensionError(f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}.")
+            raise DimensionError(
+                f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}."
+            )
         object.__setattr__(self, "process_noise", level)
         if self.W_p is None:
             kept = n if self.n_original is None else self.n_original
@@ -152,11 +154,20 @@ class ObserverProblem:
                 f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default."
             )
         if self.injection is Injection.NONE:
-            raise DimensionError("Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE.")
+            raise DimensionError(
+                "Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE."
+            )
         if (self.remainder_left is None) != (self.remainder_right is None):
-            raise DimensionError("Observer problem: remainder_left and remainder_right come together, found only one of them.")
+            raise DimensionError(
+                "Observer problem: remainder_left and remainder_right come together, found only one of them."
+            )
         rows, columns = self.location.sizes(n, m)
-        sizes: dict[str, tuple[int | None, int | None]] = {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)}
+        sizes: dict[str, tuple[int | None, int | None]] = {
+            "W_L": (rows, None),
+            "W_R": (None, columns),
+            "W_u": (m, m),
+            "W_p": (None, n),
+        }
         for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
             self._check_weight(name, *size)
 
@@ -215,7 +226,9 @@ class ObserverProblem:
             form=uncertain.form,
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
-        expected, found = (system.frequency_response(freqs) for system in (uncertain.scaled_nominal(), problem.scaled_model))
+        expected, found = (
+            system.frequency_response(freqs) for system in (uncertain.scaled_nominal(), problem.scaled_model)
+        )
         if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
             raise SynthesisError(
                 f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; quantify these very models."
@@ -313,7 +326,9 @@ class ObserverProblem:
     @cached_property
     def _soundness(self) -> float:
         if self.nominal.dt == 0:
-            raise SynthesisError("Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it.")
+            raise SynthesisError(
+                "Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it."
+            )
         modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
         if modes:
             raise SynthesisError(
@@ -348,7 +363,9 @@ class ObserverProblem:
         error = {"error": eye(n), "r": eye(n)}
         wires = {"error": {"d": B, "v": np.diag(self.scaled_process_noise), "u": -self.injection_matrix}, "W_p": error}
         outputs = {"z": {"W_p": eye(self.performance.n_outputs)}, "y": {name: C for name in error} | {"n": eye(q)}}
-        system = interconnect({"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs)
+        system = interconnect(
+            {"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs
+        )
         return partitioned(system, w, {"z": self.performance.n_outputs})
 
     def error_system(self, controller: StateSpace) -> StateSpace:

@@ -32,7 +32,10 @@ _NEGLIGIBLE = 1e-10
 
 
 def reduce_controller(
-    problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis, order: int | None = None, largest_loss_percent: float = 2.0
+    problem: ObserverProblem | GeneralizedPlant,
+    synthesis: Synthesis,
+    order: int | None = None,
+    largest_loss_percent: float = 2.0,
 ) -> Synthesis:
     """Return the controller of lowest order whose certified cost is close to that of the full one.
 
@@ -71,11 +74,15 @@ def reduce_controller(
     (2, 0)
     """
     if largest_loss_percent < 0 or (order is not None and order < 0):
-        raise ConfigError(f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative.")
+        raise ConfigError(
+            f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative."
+        )
     full = synthesis.controller
     before = _cost(problem, full)
     if not np.isfinite(before):
-        raise SynthesisError("Order reduction: the controller to be reduced does not stabilise; start from one that does.")
+        raise SynthesisError(
+            "Order reduction: the controller to be reduced does not stabilise; start from one that does."
+        )
     if not full.n_states:
         return synthesis
     balancing = _balanced(problem, full)
@@ -85,7 +92,9 @@ def reduce_controller(
                 note = f"order {full.n_states} reduced to {K.n_states} by {how}: cost {value:.6g} against {before:.6g} before"
                 return _restated(problem, synthesis, K, note)
     if order is not None:
-        raise SynthesisError(f"Order reduction: no controller of order {order} that was found stabilises; ask for a higher one.")
+        raise SynthesisError(
+            f"Order reduction: no controller of order {order} that was found stabilises; ask for a higher one."
+        )
     return synthesis
 
 
@@ -106,7 +115,9 @@ def _balanced(problem: ObserverProblem | GeneralizedPlant, K: StateSpace) -> Bal
     else:
         plant = problem.channel(problem.rows(1), problem.columns(1))
     closed, n = plant.close(K), plant.sizes[0]
-    return Balancing.of(gramian_root(closed.A, closed.B, closed.dt)[n:], gramian_root(closed.A.T, closed.C.T, closed.dt)[n:])
+    return Balancing.of(
+        gramian_root(closed.A, closed.B, closed.dt)[n:], gramian_root(closed.A.T, closed.C.T, closed.dt)[n:]
+    )
 
 
 def _candidates(
@@ -131,13 +142,22 @@ def _restated(problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis,
         loop, white = problem.error_system(K), problem.nominal.n_inputs + problem.nominal.n_states
         noise = h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt))
         radius = float(loop.spectral_radius())
-        found = replace(synthesis, worst_case_h2=value, quadrature_error=error, h2_norm=noise, hinf_norm=None, spectral_radius=radius)
+        found = replace(
+            synthesis,
+            worst_case_h2=value,
+            quadrature_error=error,
+            h2_norm=noise,
+            hinf_norm=None,
+            spectral_radius=radius,
+        )
         bounded = synthesis.worst_case_h2 is not None
     else:
         value, closed, two = _cost(problem, K), problem.close(K), problem.channel(problem.rows(2), problem.columns(2))
         split = problem.n_w1 is not None or problem.n_z1 is not None
         gain = hinf_norm(two.close(K) if split else closed)
-        found = replace(synthesis, worst_case_h2=None, h2_norm=value, hinf_norm=gain, spectral_radius=stability_margin(closed))
+        found = replace(
+            synthesis, worst_case_h2=None, h2_norm=value, hinf_norm=gain, spectral_radius=stability_margin(closed)
+        )
         bounded = synthesis.method in ("h2", "mixed")
     lower, gap, notes = enclosed(value, synthesis.lower_bound) if bounded else (None, None, ())
     notes = (*synthesis.notes, note, *notes)
@@ -151,5 +171,12 @@ def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, 
     h = balancing.values
     k = min(n_states, int(np.sum(h > _NEGLIGIBLE * h[0])))
     left, right = balancing.left[:k], balancing.right[:, :k]
-    small = replace(plant, A=left @ plant.A @ right, B1=left @ plant.B1, B2=left @ plant.B2, C1=plant.C1 @ right, C2=plant.C2 @ right)
+    small = replace(
+        plant,
+        A=left @ plant.A @ right,
+        B1=left @ plant.B1,
+        B2=left @ plant.B2,
+        C1=plant.C1 @ right,
+        C2=plant.C2 @ right,
+    )
     return small, float(h[k:].sum() / h[0])

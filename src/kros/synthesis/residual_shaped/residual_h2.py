@@ -220,7 +220,11 @@ class _Scaled:
         A, G, C = self.shaped(shaping)
         q, k = len(C), G.shape[1]
         squared = predictor_bound(
-            A, np.hstack([G, np.zeros((len(A), q))]), C, np.hstack([np.zeros((q, k)), np.diag(self.noise)]), np.eye(len(self.A), len(A))
+            A,
+            np.hstack([G, np.zeros((len(A), q))]),
+            C,
+            np.hstack([np.zeros((q, k)), np.diag(self.noise)]),
+            np.eye(len(self.A), len(A)),
         )
         return None if squared is None else float(np.sqrt(squared))
 
@@ -244,7 +248,9 @@ class _Scaled:
         drive, rest = error.B[:, :n], error.B[:, n:]
         A = np.block([[error.A, drive @ shaping.C], [np.zeros((shaping.n_states, error.n_states)), shaping.A]])
         B = np.block([[drive @ shaping.D, rest], [shaping.B, np.zeros((shaping.n_states, rest.shape[1]))]])
-        return StateSpace(A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt)
+        return StateSpace(
+            A, B, np.hstack([error.C, np.zeros((n, shaping.n_states))]), np.zeros((n, B.shape[1])), self.dt
+        )
 
     @property
     def hidden(self) -> npt.NDArray[np.intp]:
@@ -257,7 +263,9 @@ class _Scaled:
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
-        return np.asarray(np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), np.finfo(float).tiny)))
+        return np.asarray(
+            np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), np.finfo(float).tiny))
+        )
 
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
         """Root mean square of the scaled error."""
@@ -299,9 +307,14 @@ class _Scaled:
             if cost.max() < best:
                 best, chosen = float(cost.max()), weights
         gain = 100 * (1 - np.sqrt(best / first))
-        return chosen, f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights"
+        return (
+            chosen,
+            f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights",
+        )
 
-    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None) -> StateSpace:
+    def reduced(
+        self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None
+    ) -> StateSpace:
         """The correction filter of lowest order within the tolerance, or of the highest one allowed."""
         most = shaping.n_states if max_order is None else max_order
         if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
@@ -318,7 +331,9 @@ class _Scaled:
 
         def of_order(k: int) -> StateSpace:
             return self.correction(
-                replace(shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k])
+                replace(
+                    shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k]
+                )
             )
 
         low, high = -1, min(usable, most) + 1

@@ -53,7 +53,9 @@ class Basis:
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
         first = np.eye(self.delays, 1)[:, 0]
-        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], np.concatenate([first, np.sqrt(1 - poles**2)])
+        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], np.concatenate(
+            [first, np.sqrt(1 - poles**2)]
+        )
 
     @property
     def size(self) -> int:
@@ -68,7 +70,9 @@ class Basis:
     def system(self, n: int) -> tuple[Array, Array]:
         """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
         A, b = self.scalar
-        return np.kron(A, np.eye(n)).reshape(n * self.size, n * self.size), np.kron(b[:, None], np.eye(n)).reshape(n * self.size, n)
+        return np.kron(A, np.eye(n)).reshape(n * self.size, n * self.size), np.kron(b[:, None], np.eye(n)).reshape(
+            n * self.size, n
+        )
 
 
 def circle_weights(f: int) -> Array:
@@ -89,7 +93,9 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     R = np.tensordot(weight, spectrum, 1).real
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):
-        raise SynthesisError("Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open loop).")
+        raise SynthesisError(
+            "Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open loop)."
+        )
     R = R + _FLOOR * largest * np.eye(n)
     response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
     k = basis.size

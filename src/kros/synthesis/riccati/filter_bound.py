@@ -54,7 +54,9 @@ def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float |
     for _ in range(_TRIES):
         lower = P - factor * down
         if _holds(F, W, lower):
-            squared = float(np.trace(Z @ lower @ Z.T) - 4 * n * _EPS * np.trace(np.abs(Z) @ np.abs(lower) @ np.abs(Z.T)))
+            squared = float(
+                np.trace(Z @ lower @ Z.T) - 4 * n * _EPS * np.trace(np.abs(Z) @ np.abs(lower) @ np.abs(Z.T))
+            )
             return squared if squared > 0 else None
         factor *= _GROWTH
     return None

@@ -104,7 +104,9 @@ def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
     if np.linalg.cond(loop) > 1e12:
-        raise SynthesisError("Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22.")
+        raise SynthesisError(
+            "Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22."
+        )
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)
 

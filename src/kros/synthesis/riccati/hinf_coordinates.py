@@ -70,7 +70,9 @@ def to_discrete(K: StateSpace, dt: float) -> StateSpace:
     """Inverse of `to_continuous`, ``s = (z - 1) / (z + 1)``; a `SynthesisError` for a pole at s = 1, whose counterpart is not causal."""
     eye = np.eye(K.n_states)
     if K.n_states and np.linalg.cond(eye - K.A) > 1e14:
-        raise SynthesisError("H-infinity synthesis: the discrete controller of this level is not causal; ask for a slightly larger gamma.")
+        raise SynthesisError(
+            "H-infinity synthesis: the discrete controller of this level is not causal; ask for a slightly larger gamma."
+        )
     solved = np.linalg.solve(eye - K.A, np.hstack([eye + K.A, K.B]))
     n = K.n_states
     output = np.linalg.solve((eye - K.A).T, K.C.T).T
@@ -89,8 +91,12 @@ def scaled(p: GeneralizedPlant) -> GeneralizedPlant:
         coupling = np.abs(q.A - np.diag(np.diag(q.A)))
         unit = max(float(np.linalg.norm(q.A)), 1e-300)
         B, C = np.hstack([q.B1, q.B2]), np.vstack([q.C1, q.C2])
-        driven = np.hypot(np.linalg.norm(coupling, axis=1), unit * np.linalg.norm(B, axis=1) / max(float(np.linalg.norm(B)), 1e-300))
-        seen = np.hypot(np.linalg.norm(coupling, axis=0), unit * np.linalg.norm(C, axis=0) / max(float(np.linalg.norm(C)), 1e-300))
+        driven = np.hypot(
+            np.linalg.norm(coupling, axis=1), unit * np.linalg.norm(B, axis=1) / max(float(np.linalg.norm(B)), 1e-300)
+        )
+        seen = np.hypot(
+            np.linalg.norm(coupling, axis=0), unit * np.linalg.norm(C, axis=0) / max(float(np.linalg.norm(C)), 1e-300)
+        )
         usable = (driven > 0) & (seen > 0)
         step = np.exp2(np.round(0.5 * np.log2(np.where(usable, driven, 1.0) / np.where(usable, seen, 1.0))))
         size = size * step

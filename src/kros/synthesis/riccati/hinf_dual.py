@@ -100,7 +100,9 @@ def _energies(M: Array, G: Array, out: Array, dt: float) -> Signals | None:
         if (np.abs(np.linalg.eigvals(M)).max() >= 1) if dt > 0 else (np.linalg.eigvals(M).real.max() >= 0):
             return None
         with warnings.catch_warnings():
-            warnings.simplefilter("error", RuntimeWarning)  # overflow, or a Lyapunov equation that was perturbed to be solved
+            warnings.simplefilter(
+                "error", RuntimeWarning
+            )  # overflow, or a Lyapunov equation that was perturbed to be solved
             unit, W, Z = (_gramian(M, F, dt) for F in (eye, G, out))
     except (LinAlgError, ValueError, RuntimeWarning):
         return None

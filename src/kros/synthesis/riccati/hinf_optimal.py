@@ -75,9 +75,13 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     ('optimal', True)
     """
     if gamma is not None and not (np.isfinite(gamma) and gamma > 0):
-        raise ConfigError(f"H-infinity synthesis: gamma should be positive, found {gamma}; leave it out for the optimum.")
+        raise ConfigError(
+            f"H-infinity synthesis: gamma should be positive, found {gamma}; leave it out for the optimum."
+        )
     if not 1e-8 <= tolerance < 1:
-        raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}; 1e-5 is the default.")
+        raise ConfigError(
+            f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}; 1e-5 is the default."
+        )
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
     if 0 in plant.sizes[2::2]:
@@ -153,7 +157,9 @@ def _optimum(plant: GeneralizedPlant, frame: Coordinates, tolerance: float) -> t
     low = lower = proven_bound(plant, best.norm, tolerance)
     if idle.norm <= lower * (1 + tolerance):
         return idle, lower, False
-    middle = lower * (1 + 0.9 * tolerance)  # where the bound is tight this is the end, and a calmer controller than that of the optimum
+    middle = lower * (
+        1 + 0.9 * tolerance
+    )  # where the bound is tight this is the end, and a calmer controller than that of the optimum
     for _ in range(_MAX_STEPS):
         trial = _level(plant, frame, middle)
         best = min((best, trial), key=lambda loop: loop.norm)
@@ -180,7 +186,9 @@ def _at(plant: GeneralizedPlant, gamma: float) -> tuple[_Loop, float]:
         return best, lower
     reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {lower:.6g}"
     if lower >= gamma:
-        raise SynthesisError(f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach; {reached}. Raise gamma.")
+        raise SynthesisError(
+            f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach; {reached}. Raise gamma."
+        )
     raise SynthesisError(
         f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {reached}. Raise gamma, or scale "
         "states, inputs and outputs to similar size."
@@ -216,7 +224,9 @@ def _without_control(plant: GeneralizedPlant, gamma: float | None) -> Synthesis:
     open_loop = StateSpace(plant.A, plant.B1, plant.C1, plant.D11, plant.dt)
     norm = hinf_norm(open_loop)
     if gamma is not None and norm > gamma:
-        raise SynthesisError(f"H-infinity synthesis: without controls or measurements the norm is {norm:.6g}, above gamma = {gamma:.6g}.")
+        raise SynthesisError(
+            f"H-infinity synthesis: without controls or measurements the norm is {norm:.6g}, above gamma = {gamma:.6g}."
+        )
     return Synthesis(
         method="hinf",
         controller=gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt),

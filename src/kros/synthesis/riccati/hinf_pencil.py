@@ -22,7 +22,12 @@ from ..generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
 
-_CUTS = (1e-12, 1e-9, 1e-6, 1e-3)  # directions of the state below this share are left out; whatever is left proves a bound
+_CUTS = (
+    1e-12,
+    1e-9,
+    1e-6,
+    1e-3,
+)  # directions of the state below this share are left out; whatever is left proves a bound
 _REACHED = 1e-10
 
 
@@ -69,16 +74,28 @@ class Side:
         outer = np.vstack([np.hstack([self.C, zero((p, n))]), np.hstack([self.C_y, zero((q, n))])])
         to_costate = np.hstack([zero((n, m)), self.C.T, -self.C_y.T])
         stationary = np.hstack([gamma * np.eye(m), -self.D.T, self.D_y.T])
-        inner = np.vstack([np.hstack([self.D, -gamma * np.eye(p), zero((p, q))]), np.hstack([self.D_y, zero((q, p + q))])])
+        inner = np.vstack(
+            [np.hstack([self.D, -gamma * np.eye(p), zero((p, q))]), np.hstack([self.D_y, zero((q, p + q))])]
+        )
         driven = np.hstack([self.B, zero((n, p + q))])
         if self.dt > 0:
             H = np.vstack([np.hstack([self.A, zero((n, n))]), np.hstack([zero((n, n)), eye]), zero((m, 2 * n)), outer])
             E = np.vstack(
-                [np.eye(n, 2 * n), np.hstack([zero((n, n)), self.A.T]), np.hstack([zero((m, n)), -self.B.T]), zero((p + q, 2 * n))]
+                [
+                    np.eye(n, 2 * n),
+                    np.hstack([zero((n, n)), self.A.T]),
+                    np.hstack([zero((m, n)), -self.B.T]),
+                    zero((p + q, 2 * n)),
+                ]
             )
         else:
             H = np.vstack(
-                [np.hstack([self.A, zero((n, n))]), np.hstack([zero((n, n)), -self.A.T]), np.hstack([zero((m, n)), self.B.T]), outer]
+                [
+                    np.hstack([self.A, zero((n, n))]),
+                    np.hstack([zero((n, n)), -self.A.T]),
+                    np.hstack([zero((m, n)), self.B.T]),
+                    outer,
+                ]
             )
             E = np.vstack([np.eye(2 * n), zero((m + p + q, 2 * n))])
         return H, E, np.vstack([driven, to_costate, stationary, inner])

@@ -109,7 +109,10 @@ class Ball:
                 if k in (0, iterations):
                     value = np.linalg.norm(error, axis=(-2, -1))
                     better = value > best_value * (1 + 1e-6)
-                    best, best_value = np.where(better[..., None, None], theta, best), np.where(better, value, best_value)
+                    best, best_value = (
+                        np.where(better[..., None, None], theta, best),
+                        np.where(better, value, best_value),
+                    )
                 theta = polar(adjoint(P) @ error @ adjoint(self.right))
         return best
 

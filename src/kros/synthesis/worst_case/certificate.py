@@ -34,7 +34,9 @@ def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Arra
     uncertain = uncertain_ball(problem, freqs_hz).bound(T)
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
-        uncertain = uncertain + spread(left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz))
+        uncertain = uncertain + spread(
+            left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
+        )
     return uncertain**2 + np.sum(np.abs(response[..., m + n :]) ** 2, axis=(-2, -1))
 
 
@@ -47,7 +49,9 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
             f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
         )
     dt = problem.nominal.dt
-    squared, error = circle_mean(lambda theta: density(problem, loop, theta / (2 * np.pi * dt)), _log_poles(problem, loop), rtol)
+    squared, error = circle_mean(
+        lambda theta: density(problem, loop, theta / (2 * np.pi * dt)), _log_poles(problem, loop), rtol
+    )
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
 

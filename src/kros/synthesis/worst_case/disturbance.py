@@ -116,7 +116,11 @@ def symmetric(problem: ObserverProblem) -> bool:
     if problem.N is None:
         return True
     location = problem.location
-    return location.sees_input and location.at_input and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
+    return (
+        location.sees_input
+        and location.at_input
+        and all(is_diagonal(s) for s in (problem.W_L, problem.W_R, problem.input_weight))
+    )
 
 
 def design_grid(problem: ObserverProblem) -> Array:
@@ -157,7 +161,10 @@ class Channels:
 
     def worst(self, controller: StateSpace) -> tuple[Array, Array]:
         """Spectrum of the element of the set that is (locally) worst for a given observer, and its contraction."""
-        T = self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.uncertainty_input] @ self.left
+        T = (
+            self.problem.error_system(controller).frequency_response(self.freqs_hz)[..., self.problem.uncertainty_input]
+            @ self.left
+        )
         theta = self.ball.worst(T)
         return self.shaped(self.ball.spectrum(theta)), theta
 
@@ -180,7 +187,9 @@ class Channels:
         energy = np.sum(np.abs(right) ** 2, axis=(-2, -1)) / max(left.shape[-1], right.shape[-2])
         return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
-    def shaping(self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any], remainder: StateSpace | None = None) -> Shaping:
+    def shaping(
+        self, spectrum: Spectrum, fit: Fit, side: str, options: dict[str, Any], remainder: StateSpace | None = None
+    ) -> Shaping:
         """Fit one rational factor a channel; those of the remainder unless they are given."""
 
         def factor(power: Array) -> StateSpace:

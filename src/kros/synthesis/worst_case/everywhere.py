@@ -48,7 +48,10 @@ class Everywhere:
         self.N = None if problem.N is None else Enclosure(problem.N)
         self.remainder: tuple[Enclosure, Enclosure] | None = None
         if problem.remainder_left is not None and problem.remainder_right is not None:
-            self.remainder = Enclosure(problem.remainder_left), Enclosure(problem.remainder_right @ problem.input_weight)
+            self.remainder = (
+                Enclosure(problem.remainder_left),
+                Enclosure(problem.remainder_right @ problem.input_weight),
+            )
 
     def lowered(self, shaping: Shaping, spectrum: Spectrum) -> Shaping:
         """Scale every filter until its power is nowhere above the spectrum's."""

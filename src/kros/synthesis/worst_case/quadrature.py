@@ -57,7 +57,9 @@ _GAUSS = np.zeros(15)
 _GAUSS[1::2] = np.concatenate([_WG, _WG[-2::-1]])
 
 
-def circle_mean(density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000) -> tuple[float, float]:
+def circle_mean(
+    density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000
+) -> tuple[float, float]:
     """Integrate an even, non-negative density over the unit circle."""
     edges = _edges(centers)
     left, right = edges[:-1], edges[1:]
@@ -101,6 +103,8 @@ def _panels(density: Callable[[Array], Array], left: Array, right: Array) -> tup
     angles[linear] = right[linear, None] * (1 + _NODES) / 2
     values = density(angles.ravel()).reshape(angles.shape)
     if not np.isfinite(values).all():
-        raise SynthesisError("Integrating the spectral density: it is not finite; is the uncertain set well posed and the loop stable?")
+        raise SynthesisError(
+            "Integrating the spectral density: it is not finite; is the uncertain set well posed and the loop stable?"
+        )
     weighted = np.where(linear[:, None], values * right[:, None] / 2, values * angles * half[:, None])
     return weighted @ _KRONROD, np.abs(weighted @ (_KRONROD - _GAUSS))

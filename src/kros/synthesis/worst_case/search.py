@@ -66,7 +66,9 @@ class Search:
                     options = {**self.asked, "max_order": order}
                     self.design(self._shaping(spectrum, options, simple.remainder), options)
         if not self.designs:
-            raise SynthesisError(f"Worst-case H2 synthesis: no design survived verification ({'; '.join(dict.fromkeys(self.reasons))}).")
+            raise SynthesisError(
+                f"Worst-case H2 synthesis: no design survived verification ({'; '.join(dict.fromkeys(self.reasons))})."
+            )
 
     def again(self, spectrum: Spectrum) -> None:
         """Design for another spectrum with filters of the kind that did best."""

@@ -99,7 +99,9 @@ def _kalman(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpac
     model = _Model.of(problem, d, r)
     A, B, _, _ = problem.scaled
     n, kd, kr = len(A), d.n_states, r.n_states
-    L, _ = predictor(model.A, model.C, model.B @ model.B.T, model.D @ model.D.T, model.B @ model.D.T, "Worst-case H2 synthesis")
+    L, _ = predictor(
+        model.A, model.C, model.B @ model.B.T, model.D @ model.D.T, model.B @ model.D.T, "Worst-case H2 synthesis"
+    )
     L_xi, L_d, L_r = L[:n], L[n : n + kd], L[n + kd : n + kd + kr]
     return StateSpace(
         np.block([[d.A, np.zeros((kd, kr))], [np.zeros((kr, kd)), r.A]]),

@@ -76,7 +76,9 @@ class UnitCheck:
         return [{"unit": unit} | {c: float(getattr(self, c)[k]) for c in columns} for k, unit in enumerate(self.units)]
 
 
-def check_units(problem: ObserverProblem, controller: StateSpace, units: StateSpace, unit_ids: Sequence[str] | None = None) -> UnitCheck:
+def check_units(
+    problem: ObserverProblem, controller: StateSpace, units: StateSpace, unit_ids: Sequence[str] | None = None
+) -> UnitCheck:
     """Compare the error of every unit's model with the certified bound.
 
     Parameters
@@ -151,4 +153,6 @@ def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p
         "W_u": {"w1": np.eye(problem.input_weight.n_inputs)},
         "W_p": {"error": eye},
     }
-    return interconnect(blocks, wires, {"w1": problem.input_weight.n_inputs}, {"z1": {"W_p": np.eye(problem.performance.n_outputs)}})
+    return interconnect(
+        blocks, wires, {"w1": problem.input_weight.n_inputs}, {"z1": {"W_p": np.eye(problem.performance.n_outputs)}}
+    )

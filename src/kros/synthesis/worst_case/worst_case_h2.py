@@ -100,7 +100,13 @@ def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
         )
     notes = ("A design alone, without certificate.",)
     return Synthesis(
-        "worst_case_h2", controller, Status.INACCURATE, problem.injection, spectral_radius=radius, solver="riccati", notes=notes
+        "worst_case_h2",
+        controller,
+        Status.INACCURATE,
+        problem.injection,
+        spectral_radius=radius,
+        solver="riccati",
+        notes=notes,
     )
 
 

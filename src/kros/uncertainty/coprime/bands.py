@@ -46,24 +46,35 @@ class BandEnergies:
     def __post_init__(self) -> None:
         edges, energy = check_edges(self.edges), np.asarray(self.energy, dtype=complex)
         if energy.ndim < 3 or energy.shape[-3] != len(edges) - 1 or energy.shape[-1] != energy.shape[-2]:
-            raise DimensionError(f"Band energies: needs (..., {len(edges) - 1}, n, n) for as many bands, found {energy.shape}.")
+            raise DimensionError(
+                f"Band energies: needs (..., {len(edges) - 1}, n, n) for as many bands, found {energy.shape}."
+            )
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "energy", energy)
 
     @classmethod
-    def of(cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike, samples: npt.ArrayLike | None = None) -> BandEnergies:
+    def of(
+        cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike, samples: npt.ArrayLike | None = None
+    ) -> BandEnergies:
         """Return energies (batch, b, n, n) of the episodes of a signal (n_samples, batch, n) that is zero before and after."""
         signal, lengths, edges = np.asarray(signal, dtype=float), np.asarray(lengths, dtype=int), check_edges(edges)
-        if signal.ndim != 3 or lengths.shape != signal.shape[1:2] or not ((lengths > 0) & (lengths <= len(signal))).all():
+        if (
+            signal.ndim != 3
+            or lengths.shape != signal.shape[1:2]
+            or not ((lengths > 0) & (lengths <= len(signal))).all()
+        ):
             raise DimensionError(
                 f"Band energies: {signal.shape} should be (n_samples, batch, n) with lengths between one and n_samples, found {lengths}."
             )
         if not np.isfinite(signal).all():
-            raise DimensionError("Band energies: the signal contains NaN or infinity; look at the recordings and the model.")
+            raise DimensionError(
+                "Band energies: the signal contains NaN or infinity; look at the recordings and the model."
+            )
         alone = np.where((np.arange(len(signal))[:, None] < lengths)[..., None], signal, 0.0)
         return cls(
             edges,
-            np.array([*_energies(alone, edges)]) / np.asarray(lengths if samples is None else samples, dtype=float)[:, None, None, None],
+            np.array([*_energies(alone, edges)])
+            / np.asarray(lengths if samples is None else samples, dtype=float)[:, None, None, None],
         )
 
     def of_units(self, units: Sequence[str]) -> BandEnergies:
@@ -98,7 +109,13 @@ def band_edges(n_samples: int, bands: int = BANDS) -> Array:
 def check_edges(edges: npt.ArrayLike) -> Array:
     """Return edges as an array, or say why they make no bands."""
     found = np.asarray(edges, dtype=float)
-    if found.ndim != 1 or len(found) < 2 or found[0] != 0 or not np.isclose(found[-1], np.pi, rtol=1e-12) or not (np.diff(found) > 0).all():
+    if (
+        found.ndim != 1
+        or len(found) < 2
+        or found[0] != 0
+        or not np.isclose(found[-1], np.pi, rtol=1e-12)
+        or not (np.diff(found) > 0).all()
+    ):
         raise DimensionError(f"Bands: edges should increase from 0 to pi rad per sample, found {found}.")
     return found
 
@@ -166,7 +183,9 @@ def _energies(signals: Array, edges: Array) -> Iterator[Array]:
         some = signals[:, start : start + many]
         size = np.sqrt(np.sum(some**2, axis=0))
         size[size == 0] = 1.0
-        for total, outer in zip(_integrals(_lags(some / size), edges), size[:, :, None] * size[:, None, :], strict=True):
+        for total, outer in zip(
+            _integrals(_lags(some / size), edges), size[:, :, None] * size[:, None, :], strict=True
+        ):
             energy = np.diff(total, axis=0) / np.pi
             values, vectors = np.linalg.eigh(energy)
             positive = (vectors * np.maximum(values, 0.0)[:, None, :]) @ adjoint(vectors)

@@ -33,7 +33,9 @@ class SignalSet:
 
     def __post_init__(self) -> None:
         if self.energies.energy.ndim != 4 or len(self.energies.energy) != len(self.unit_ids):
-            raise DimensionError(f"Signal set: {len(self.unit_ids)} units need as many energies, found {self.energies.energy.shape}.")
+            raise DimensionError(
+                f"Signal set: {len(self.unit_ids)} units need as many energies, found {self.energies.energy.shape}."
+            )
 
     @classmethod
     def of(
@@ -59,10 +61,16 @@ class SignalSet:
     def spectrum(self, n_points: int, weights: npt.ArrayLike | None = None) -> Array:
         """Return a density (n_points, n, n) from zero to Nyquist, even over every band, of the cover or of a mixture of units."""
         edges = self.energies.edges
-        energy = self.cover.energy if weights is None else np.tensordot(np.asarray(weights, dtype=float), self.energies.energy, 1)
+        energy = (
+            self.cover.energy
+            if weights is None
+            else np.tensordot(np.asarray(weights, dtype=float), self.energies.energy, 1)
+        )
         total = np.concatenate([np.zeros((1, *energy.shape[1:])), np.cumsum(energy, axis=0)])
         step = np.pi / (n_points - 1)
         cells = np.clip((np.arange(n_points + 1) - 0.5) * step, 0.0, np.pi)
         at = np.clip(np.searchsorted(edges, cells, side="right") - 1, 0, len(edges) - 2)
         share = ((cells - edges[at]) / np.diff(edges)[at])[:, None, None]
-        return np.asarray(np.diff(total[at] * (1 - share) + total[at + 1] * share, axis=0) * (np.pi / np.diff(cells))[:, None, None])
+        return np.asarray(
+            np.diff(total[at] * (1 - share) + total[at + 1] * share, axis=0) * (np.pi / np.diff(cells))[:, None, None]
+        )

@@ -78,7 +78,10 @@ class Problem:
     def joined(self, other: Problem) -> Problem:
         """Return both, frequencies increasing and none twice; of equal ones the other's stay."""
         freqs, index = np.unique(np.concatenate([other.freqs_hz, self.freqs_hz]), return_index=True)
-        both = (np.concatenate([getattr(other, x), getattr(self, x)], axis=-1)[..., index] for x in ("tau", "optimal", "ratio"))
+        both = (
+            np.concatenate([getattr(other, x), getattr(self, x)], axis=-1)[..., index]
+            for x in ("tau", "optimal", "ratio")
+        )
         tau, optimal, ratio = both
         return Problem(freqs, tau, np.concatenate([other.residuals, self.residuals], axis=1)[:, index], optimal, ratio)
 
@@ -188,7 +191,9 @@ def _lowered(joint: JointFit, found: Fitted, tolerance_db: float) -> Fitted:
         if not idles:
             break
         idle = min(idles, key=lambda i: i.span)
-        fewer = [found.sections.without(idle)] + ([found.sections.halved(idle)] if found.sections.pair[idle.zero] else [])
+        fewer = [found.sections.without(idle)] + (
+            [found.sections.halved(idle)] if found.sections.pair[idle.zero] else []
+        )
         for sections in fewer:
             lower = joint.descend(sections, _POLISH, _POLISH_STEPS, _ENOUGH * tolerance_db)
             if lower.excess_db <= tolerance_db:
@@ -212,5 +217,7 @@ def _level(values: Array, inside: Array) -> Array:
 def _smoothed(values: Array, freqs_hz: Array) -> Array:
     """Gaussian average of log values over log frequency; columns are smoothed one by one."""
     x = np.log10(np.maximum(freqs_hz, freqs_hz[freqs_hz > 0].min(initial=np.inf)))
-    kernel = np.exp(-0.5 * ((x[:, None] - x) / _SMOOTHING_DECADES) ** 2) * (np.gradient(x).clip(1e-12) if len(x) > 1 else 1.0)
+    kernel = np.exp(-0.5 * ((x[:, None] - x) / _SMOOTHING_DECADES) ** 2) * (
+        np.gradient(x).clip(1e-12) if len(x) > 1 else 1.0
+    )
     return np.exp(kernel @ np.log(values) / kernel.sum(axis=1, keepdims=True))

@@ -29,7 +29,9 @@ _LOG = logging.getLogger(__name__)
 _FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
 _POINTS = 150  # of the grid in the first programs
 _ROUNDS = 6
-_PROGRAMS = 150  # for one order, half as many while a higher one is allowed; more than 200 were never seen to gain anything
+_PROGRAMS = (
+    150  # for one order, half as many while a higher one is allowed; more than 200 were never seen to gain anything
+)
 _EXCHANGE = 10**0.002 - 1  # 0.02 dB of squared magnitude
 _HOPELESS = 2.0  # an order whose overbound is beyond this many tolerances is not polished while a higher one is allowed
 _UNPROVEN_DB = 0.5  # a fit farther than this from what is proven to be the best is compared with those that start from lower orders
@@ -201,7 +203,9 @@ class _Problem:
     values: Array
     dt: float
 
-    def fit(self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool) -> tuple[FittedMagnitude | None, _Bound | None]:
+    def fit(
+        self, order: int, tolerance_db: float, lower: _Bound | None, *, last: bool
+    ) -> tuple[FittedMagnitude | None, _Bound | None]:
         """Fit one order, starting from the bound of a lower order; None where the programs fail."""
         tau = bilinear_squared(self.freqs, self.dt)
         targets = self.values**2  # to stay above
@@ -212,7 +216,9 @@ class _Problem:
             return None, lower
         try:
             return self._finish(found.rational, unit, tolerance_db), found
-        except KrosError as error:  # positive on the grid and zero at Nyquist: no system with an inverse, another order is
+        except (
+            KrosError
+        ) as error:  # positive on the grid and zero at Nyquist: no system with an inverse, another order is
             _LOG.debug("Magnitude fit: order %d has no spectral factor (%s)", order, error)
             return None, lower
 
@@ -222,7 +228,9 @@ class _Problem:
         system = spectral_factor(bound, self.dt)
         ratio = np.abs(system.frequency_response(self.freqs)[:, 0, 0]) / self.values
         if not (ratio.min() > 0 and np.isfinite(ratio).all()):
-            raise KrosError("Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order.")
+            raise KrosError(
+                "Magnitude fit: the system vanishes or is infinite at a frequency of the grid; try another order."
+            )
         touch = (1 + 1e-12) / ratio.min()
         system = StateSpace(system.A, system.B, system.C * touch, system.D * touch, system.dt)
         overbound = float(20 * np.log10(ratio.max() / ratio.min()))
@@ -241,7 +249,9 @@ class _Bound:
 def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopeless: float) -> _Bound | None:
     """Best n / d of one order above the targets, positive on the whole axis; `lower` is the best of an order less."""
     if order == 0:
-        return _Bound(RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min()))
+        return _Bound(
+            RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), float(targets.max() / targets.min())
+        )
     programs = Programs(_PROGRAMS if np.isinf(hopeless) else _PROGRAMS // 2)
     best = _exchange(tau, targets, np.exp(log_knots(tau, np.log(targets), order, 0.05)), lower, hopeless, programs)
     for even in (1.0, 0.3):
@@ -252,7 +262,9 @@ def _minimax(tau: Array, targets: Array, order: int, lower: _Bound | None, hopel
     return best
 
 
-def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float, programs: Programs) -> _Bound | None:
+def _exchange(
+    tau: Array, targets: Array, knots: Array, lower: _Bound | None, hopeless: float, programs: Programs
+) -> _Bound | None:
     """Solve on part of the grid, and add the points at which the bound found there is worse; a ratio beyond `hopeless` is left as it is."""
     chosen = np.unique(np.linspace(0, len(tau) - 1, _POINTS).round().astype(int))
     cuts = np.zeros(0)
@@ -271,13 +283,18 @@ def _exchange(tau: Array, targets: Array, knots: Array, lower: _Bound | None, ho
         n, d = phi @ rational.numerator, phi @ rational.denominator
         ratio = np.where((n > 0) & (d > 0), n / (targets * np.where(d > 0, d, 1.0)), 0.0)
         try:
-            bad = sorted(on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0]))
+            bad = sorted(
+                on_half_line(roots(rational.numerator, knots)[0]) + on_half_line(roots(rational.denominator, knots)[0])
+            )
         except KrosError as error:  # multiple roots: this order is left to what was found before
             _LOG.debug("Magnitude fit: %s", error)
             return best
         if not bad and ratio.min() > 0 and (best is None or ratio.max() / ratio.min() < best.ratio):
             best, start = (
-                _Bound(RationalMagnitude(rational.numerator / ratio.min(), rational.denominator, knots), float(ratio.max() / ratio.min())),
+                _Bound(
+                    RationalMagnitude(rational.numerator / ratio.min(), rational.denominator, knots),
+                    float(ratio.max() / ratio.min()),
+                ),
                 d,
             )
         worse = np.setdiff1d(_extremes(ratio, 1.0, float(ratio[chosen].max())), chosen)
@@ -300,7 +317,9 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     """Return magnitudes with a relative floor."""
     values = np.asarray(magnitude, float)
     if values.shape != freqs.shape:
-        raise DimensionError(f"Magnitude fit: needs one magnitude for each of {len(freqs)} frequencies, found shape {values.shape}.")
+        raise DimensionError(
+            f"Magnitude fit: needs one magnitude for each of {len(freqs)} frequencies, found shape {values.shape}."
+        )
     if not (np.isfinite(values) & (values >= 0)).all():
         where = int(np.argmin(np.isfinite(values) & (values >= 0)))
         raise DataError(

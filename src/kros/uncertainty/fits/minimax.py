@@ -60,7 +60,9 @@ class Grid:
         """Evaluate the basis on a grid."""
         phi, programs.active = basis(tau, knots), None
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
-        return cls(targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest, programs)
+        return cls(
+            targets, knots, phi, basis(np.concatenate([[0.0], cuts, [np.inf]]), knots), phi[nearest], nearest, programs
+        )
 
     def best(self, starts: Sequence[Array], enough: float) -> RationalMagnitude | None:
         """Return the best bound from several first denominators, shape (n_points,) each, or the first whose ratio is below `enough`."""
@@ -125,7 +127,9 @@ class Grid:
         n = d / self.targets[:, None]
         return self._solve(n, d, [(n / gamma, -d, -1.0), (-n, d, 0.0)], scale)
 
-    def _solve(self, n: Array, d: Array, blocks: Sequence[tuple[Array, Array, float]], scale: Array) -> tuple[Array, Array] | None:
+    def _solve(
+        self, n: Array, d: Array, blocks: Sequence[tuple[Array, Array, float]], scale: Array
+    ) -> tuple[Array, Array] | None:
         """Minimise t over (a, b, t) under blocks of rows, the normalisation and the edges."""
         if self.programs.left <= 0:
             return None
@@ -134,7 +138,10 @@ class Grid:
         edge = (_EDGE * self.inner - self.end) / scale[self.nearest, None]
         none = np.zeros_like(edge)
         rows = [np.hstack([x, y, np.full((len(x), 1), t)]) for x, y, t in blocks]
-        rows += [np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]), np.hstack([none, edge, none[:, :1]])]
+        rows += [
+            np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]),
+            np.hstack([none, edge, none[:, :1]]),
+        ]
         with np.errstate(all="ignore"):
             unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
             table = np.vstack(rows) * unit

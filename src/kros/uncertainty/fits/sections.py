@@ -51,8 +51,17 @@ class Sections:
             for i, x in enumerate(values)
             for sign in (1.0, -1.0)
         ]
-        entry, sign, pair, corner = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0),) * 4
-        return cls(np.zeros(len(corners)), entry.astype(int), sign, pair.astype(bool), corner.astype(float), np.full(len(rows), width))
+        entry, sign, pair, corner = (
+            (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0),) * 4
+        )
+        return cls(
+            np.zeros(len(corners)),
+            entry.astype(int),
+            sign,
+            pair.astype(bool),
+            corner.astype(float),
+            np.full(len(rows), width),
+        )
 
     def like(self, entries: Array, magnitude: RationalMagnitude) -> Sections:
         """Return the same with poles, zeros and level of a magnitude in some entries."""
@@ -125,7 +134,9 @@ class Sections:
         n, k = len(self.level), len(self.corner)
         width = self.width.copy()
         width[self.pair] = np.clip(width[self.pair] + step[n + k :], _NARROW, _WIDE)
-        return replace(self, level=self.level + step[:n], corner=np.clip(self.corner + step[n : n + k], *ends), width=width)
+        return replace(
+            self, level=self.level + step[:n], corner=np.clip(self.corner + step[n : n + k], *ends), width=width
+        )
 
     def lifted(self, entries: slice, by: float) -> Sections:
         """Return sections with the levels of some entries raised."""
@@ -196,7 +207,9 @@ class Sections:
         if not np.isfinite(span).any():
             return None
         i, j = np.unravel_index(int(span.argmin()), span.shape)
-        return Idle(entry, int(zeros[i]), int(poles[j]), float(span[i, j]), float(both[i, j].max() + both[i, j].min()) / 2)
+        return Idle(
+            entry, int(zeros[i]), int(poles[j]), float(span[i, j]), float(both[i, j].max() + both[i, j].min()) / 2
+        )
 
     def without(self, idle: Idle) -> Sections:
         """Return the magnitudes without poles and zeros that cancel each other."""
@@ -226,7 +239,11 @@ class Idle:
 def _paired(found: list[complex]) -> list[tuple[bool, float, float]]:
     """Return sections of roots, negated: complex pairs, real ones with their neighbours, and the middle one alone where their number is odd."""
     real = sorted(r.real for r in found if abs(r.imag) <= _REAL * abs(r))
-    rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in found if r.imag > _REAL * abs(r)]
+    rows = [
+        (True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in found if r.imag > _REAL * abs(r)
+    ]
     if len(real) % 2:
         rows.append((False, 2 * np.log(real.pop(len(real) // 2)), 0.0))
-    return rows + [(True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in zip(real[::2], real[1::2], strict=True)]
+    return rows + [
+        (True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in zip(real[::2], real[1::2], strict=True)
+    ]

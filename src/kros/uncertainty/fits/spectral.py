@@ -192,7 +192,9 @@ def _pair(zeros: list[complex], poles: list[complex]) -> list[tuple[list[complex
     for p in pole_pairs:
         near_pair = min(zero_pairs, key=lambda q: _distance(q, p), default=None)
         near_reals = sorted(zero_reals, key=lambda q: _distance(q, p))[:2]
-        if near_pair is None or (len(near_reals) == 2 and max(_distance(q, p) for q in near_reals) < _distance(near_pair, p)):
+        if near_pair is None or (
+            len(near_reals) == 2 and max(_distance(q, p) for q in near_reals) < _distance(near_pair, p)
+        ):
             zero_reals = _without(zero_reals, near_reals)
             sections.append((near_reals, [p, np.conj(p)]))
         else:
@@ -211,7 +213,9 @@ def _split(values: list[complex]) -> tuple[list[complex], list[complex]]:
     real = [v for v in values if abs(v.imag) <= _REAL * abs(v)]
     upper = [v for v in values if v not in real and v.imag > 0]
     if len(real) + 2 * len(upper) != len(values):
-        raise KrosError(f"Spectral factor: complex roots should come in conjugate pairs, found {values}; try another order.")
+        raise KrosError(
+            f"Spectral factor: complex roots should come in conjugate pairs, found {values}; try another order."
+        )
     return upper, [complex(v.real) for v in real]
 
 

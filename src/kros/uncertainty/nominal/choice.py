@@ -84,7 +84,9 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     form, G = as_form(form), check_responses(responses)
     broken = ~np.isfinite(G).all(axis=(1, 2, 3))
     if broken.any():
-        raise DimensionError(f"Nominal: responses of units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out.")
+        raise DimensionError(
+            f"Nominal: responses of units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out."
+        )
     geometry = Geometry.of(form, (G.shape[2], G.shape[3]))
     index, bound, scores, evaluated = search(geometry, geometry.plants(G))
     with np.errstate(divide="ignore"):

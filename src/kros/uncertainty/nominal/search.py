@@ -78,7 +78,9 @@ class Geometry:
         if self.form is Form.INVERSE_ADDITIVE:
             first, second = (nominal, units) if self.wide else (units, nominal)
             return sigma_max_first(multiply(multiply(_known(first.P), D), _known(second.L)))
-        base = units if self.form in (Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE) else nominal
+        base = (
+            units if self.form in (Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE) else nominal
+        )
         if self.form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE):
             return sigma_max_first(multiply(_known(base.P), D))
         return sigma_max_first(multiply(D, _known(base.L)))

@@ -84,7 +84,9 @@ def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances
 def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:
     """Return the entries of units' residuals that are largest for their typical size, each at its own frequency."""
     nominal, perturbed = responses[found.nominals[:, None], rows], responses[units, rows]
-    size = np.abs(residual(form, nominal, perturbed[None])) / found.left[rows][:, :, None] / found.right[rows][:, None, :]
+    size = (
+        np.abs(residual(form, nominal, perturbed[None])) / found.left[rows][:, :, None] / found.right[rows][:, None, :]
+    )
     own = found.nominals[:, None] == units
     middle = _median(size, own)
     entries = [np.unravel_index(int(np.argmax(m)), m.shape) for m in middle]

@@ -99,7 +99,9 @@ class OutlierModel:
     nominal_ids: tuple[str, ...]
     by_nominal_db: Array
 
-    def score(self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None) -> OutlierScore:
+    def score(
+        self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
+    ) -> OutlierScore:
         """Score a new unit.
 
         Parameters
@@ -126,7 +128,9 @@ class OutlierModel:
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < _FEWEST:
-            raise DataError(f"Scoring unit {unit}: {len(rows)} others are left to compare with, two are needed; record more units.")
+            raise DataError(
+                f"Scoring unit {unit}: {len(rows)} others are left to compare with, two are needed; record more units."
+            )
         G = np.asarray(response)
         if G.shape != self.responses.shape[1:]:
             raise DimensionError(
@@ -140,11 +144,22 @@ class OutlierModel:
         known = self.n_units >= FEWEST_UNITS
         margin = float(margins(found.levels, ~last, self.false_alarm_rate)[1][-1]) if known else -np.inf
         level = found.levels[-1]
-        beyond_motion = np.maximum(10 ** (level / 20) - (0.0 if motion_db is None else 10 ** (motion_db / 20)), _LEAST_LEVEL)
+        beyond_motion = np.maximum(
+            10 ** (level / 20) - (0.0 if motion_db is None else 10 ** (motion_db / 20)), _LEAST_LEVEL
+        )
         certain = margin - float(level.max() - 20 * np.log10(beyond_motion.max()))
         summary = Nominals.of(found, ~last, self.false_alarm_rate)
         (score,) = scores_of(
-            self.form, everyone, self.freqs_hz, found, ~last, (margin,), (unit,), self.threshold_db, summary, [len(last) - 1]
+            self.form,
+            everyone,
+            self.freqs_hz,
+            found,
+            ~last,
+            (margin,),
+            (unit,),
+            self.threshold_db,
+            summary,
+            [len(last) - 1],
         )
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
 
@@ -154,7 +169,9 @@ class OutlierModel:
         Responses have the shape (unit, frequency, p, m); the median over the units counts. Halves scatter twice as much as the whole, in variance.
         """
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
-        return np.asarray(np.median(scaled_levels(self.form, first, second, self._known, self.freqs_hz), axis=0) - _HALVES_DB)
+        return np.asarray(
+            np.median(scaled_levels(self.form, first, second, self._known, self.freqs_hz), axis=0) - _HALVES_DB
+        )
 
     @property
     def n_units(self) -> int:
@@ -263,7 +280,11 @@ def score_outliers(
     rows = _scored(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     given = output_scale is not None or input_scale is not None
-    scales = (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])) if given else balance(G)
+    scales = (
+        (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3]))
+        if given
+        else balance(G)
+    )
     return _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
 
 
@@ -276,7 +297,9 @@ def _scored(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, _FREQUENCIES).round().astype(int))
 
 
-def _compared(G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: float, scales: tuple[Array, ...]) -> OutlierModel:
+def _compared(
+    G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: float, scales: tuple[Array, ...]
+) -> OutlierModel:
     """Score units whose estimates are equally good, responses in scaled coordinates."""
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)

@@ -38,12 +38,16 @@ def score_population(
         found[places[condition]] = outliers
         for score, count in zip(outliers.scores, samples, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
-            seconds = count * scored[condition].sample_period_s * (1 + len(keys) / len(used))  # episodes that are held out, like the others
+            seconds = (
+                count * scored[condition].sample_period_s * (1 + len(keys) / len(used))
+            )  # episodes that are held out, like the others
             rows.append(score_row(score, condition, len(keys) + len(used), seconds))
     return found, rows
 
 
-def score_condition(factors: EpisodeFactors, models: ModelSet, settings: UncertaintySettings) -> tuple[OutlierModel, list[int]]:
+def score_condition(
+    factors: EpisodeFactors, models: ModelSet, settings: UncertaintySettings
+) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
     freqs = scored_frequencies(models.frequencies(settings.n_freqs))
     recorded = Recorded.of(factors, models, freqs)
@@ -70,8 +74,16 @@ def score_condition(factors: EpisodeFactors, models: ModelSet, settings: Uncerta
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
     """Return a score as a row of metrics, with what was recorded (episodes, held-out ones too, and seconds) and what is needed."""
-    row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db, "outlier": score.outlier}
-    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")}
+    row = {
+        "unit": score.unit,
+        "condition": condition,
+        "score": score.score_db,
+        "threshold": score.threshold_db,
+        "outlier": score.outlier,
+    }
+    row |= {
+        key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")
+    }
     row |= {"status": score.status, "detectable": score.detectable_percent}
     row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
     needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}

@@ -67,7 +67,9 @@ class Recorded:
         for unit in models.unit_ids:
             own = factors.rows_of(unit)
             factor = Factor(f.R[own], f.peak[own], f.n_samples[own])
-            units[unit] = Evidence.of(factor, models, {k: float(v[models.index(unit)]) for k, v in models.parameters.items()})
+            units[unit] = Evidence.of(
+                factor, models, {k: float(v[models.index(unit)]) for k, v in models.parameters.items()}
+            )
         return cls(models, units, freqs_hz)
 
     @cached_property
@@ -77,9 +79,14 @@ class Recorded:
 
     def response(self, evidence: Sequence[Evidence]) -> Array:
         """Return responses of estimates, shape (estimate, frequency, n, m), each regularised as if it had the usual number of samples."""
-        joined = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples) for e in evidence]
+        joined = [
+            combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples)
+            for e in evidence
+        ]
         found = self.models.fit(np.stack(joined))
-        return replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).responses(self.freqs_hz)
+        return replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).responses(
+            self.freqs_hz
+        )
 
     def halves(self) -> tuple[Array, Array] | None:
         """Return the responses of all units from every second episode, and from the others; None where no unit has two episodes."""
@@ -108,7 +115,9 @@ class Recorded:
 
     def same_recordings(self, factor: Factor) -> set[str]:
         """Return units of the study that have an episode in common with some, by their factors."""
-        return {unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in range(len(factor.R)))}
+        return {
+            unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in range(len(factor.R)))
+        }
 
 
 def _marks(factor: Factor, first: int, count: int) -> list[tuple[float, ...]]:

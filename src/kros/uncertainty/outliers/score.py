@@ -110,4 +110,6 @@ def room_db(detectable_db: float, detectable_percent: float) -> float:
     """Return by how much a bound could be higher before the absence of an alarm means nothing, dB; negative where it means nothing already."""
     if not (np.isfinite(detectable_db) and np.isfinite(detectable_percent)):
         return float("-inf")
-    return float(min(LARGEST_DB - detectable_db, 20 * np.log10(LARGEST_PERCENT / max(detectable_percent, np.finfo(float).tiny))))
+    return float(
+        min(LARGEST_DB - detectable_db, 20 * np.log10(LARGEST_PERCENT / max(detectable_percent, np.finfo(float).tiny)))
+    )

@@ -32,7 +32,9 @@ def covers(levels: Array, inliers: Flags) -> Array:
     """Return the largest level of all inliers but the unit itself, over all frequencies, shape (unit,)."""
     peaks = levels.max(axis=1)
     first, second = -np.sort(-peaks[inliers])[:2]
-    return np.where(inliers & (np.arange(len(peaks)) == np.flatnonzero(inliers)[peaks[inliers].argmax()]), second, first)
+    return np.where(
+        inliers & (np.arange(len(peaks)) == np.flatnonzero(inliers)[peaks[inliers].argmax()]), second, first
+    )
 
 
 def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:

@@ -63,7 +63,9 @@ class Certificate:
     margin: float  # by level sets no frequency exceeds ``(1 + margin) * peak``; NaN on a grid, which proves nothing of the kind
 
 
-def certify(ratio: Ratio, freqs_hz: Array, left: StateSpace, right: StateSpace, systems: ResidualSystems | None = None) -> Certificate:
+def certify(
+    ratio: Ratio, freqs_hz: Array, left: StateSpace, right: StateSpace, systems: ResidualSystems | None = None
+) -> Certificate:
     """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, and by level sets where the systems are known."""
     known = ratio(freqs_hz)
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))

@@ -53,7 +53,9 @@ class Checks:
         """Return the frequencies at which the bound has to hold to begin with."""
         return checking_grid(freqs_hz, sample_period_s, 1) if self.sampled else self.grid(freqs_hz, sample_period_s)
 
-    def proof(self, ratio: Callable[[Array], Array], claimed_hz: Array, left: StateSpace, right: StateSpace) -> Certificate:
+    def proof(
+        self, ratio: Callable[[Array], Array], claimed_hz: Array, left: StateSpace, right: StateSpace
+    ) -> Certificate:
         """Return the largest ratio wherever the bound is claimed."""
         if not self.sampled:
             return certify(ratio, claimed_hz, left, right, self.systems)
@@ -61,7 +63,9 @@ class Checks:
         return Certificate(Method.GRID, float(known.max()), float(claimed_hz[known.argmax()]), float("nan"))
 
 
-def checking_grid(freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None, *, filled: bool = False) -> Array:
+def checking_grid(
+    freqs_hz: Array, sample_period_s: float, density: int, also_hz: Array | None = None, *, filled: bool = False
+) -> Array:
     """Return a dense grid that goes on from its ends to DC and Nyquist, in decades of tau: a fit is free to bend wherever nobody looks."""
     dense = dense_grid(freqs_hz, sample_period_s, density)
     inner = dense[(dense > 0) & (bilinear_squared(dense, sample_period_s) < np.inf)]
@@ -81,7 +85,10 @@ def joined(freqs_hz: Array, others_hz: Array) -> tuple[Array, Array]:
     both = np.concatenate([freqs_hz, others_hz])
     others = np.unique(others_hz, return_index=True)[1]
     at = np.searchsorted(freqs_hz, others_hz[others]).clip(1, max(len(freqs_hz) - 1, 1))
-    near = np.minimum(np.abs(others_hz[others] - freqs_hz[at - 1]), np.abs(others_hz[others] - freqs_hz[np.minimum(at, len(freqs_hz) - 1)]))
+    near = np.minimum(
+        np.abs(others_hz[others] - freqs_hz[at - 1]),
+        np.abs(others_hz[others] - freqs_hz[np.minimum(at, len(freqs_hz) - 1)]),
+    )
     index = np.concatenate([np.arange(len(freqs_hz)), len(freqs_hz) + others[near > _SAME * others_hz[others]]])
     index = index[np.argsort(both[index], kind="stable")]
     return both[index], index

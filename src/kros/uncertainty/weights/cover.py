@@ -92,7 +92,10 @@ def as_structure(structure: Structure | str) -> Structure:
 
 
 def optimal_cover(
-    E: Array, structure: Structure | str = Structure.DIAGONAL, pull: float = _PULL, squarings: tuple[int, ...] = _SQUARINGS
+    E: Array,
+    structure: Structure | str = Structure.DIAGONAL,
+    pull: float = _PULL,
+    squarings: tuple[int, ...] = _SQUARINGS,
 ) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') with the smallest mean log magnitudes; a larger pull makes it smoother."""
     first = entries_first(E)
@@ -124,7 +127,11 @@ def _descend(first: Array, size: Array, p: int, pull: float, squarings: tuple[in
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, max(60, _ENTRIES // (first.shape[0] * first.shape[1]))).round().astype(int))]
+    chosen = alive[
+        np.unique(
+            np.linspace(0, len(alive) - 1, max(60, _ENTRIES // (first.shape[0] * first.shape[1]))).round().astype(int)
+        )
+    ]
     E = first[..., chosen] / size[chosen]
     E = E[:, :, _largest(sigma_max_first(E))]
     x = np.zeros((n, len(chosen)))
@@ -155,7 +162,9 @@ class _Smooth:
         """Return the cost, shape (frequency,), and its gradient, shape of x."""
         p, m = self.p, len(x) - self.p
         M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
-        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))  # no smaller than the largest singular value, and at most four times
+        top = np.sqrt(
+            squared(M).sum(axis=(0, 1)).max(axis=0)
+        )  # no smaller than the largest singular value, and at most four times
         M = M / top
         wide = p <= m
         power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
@@ -165,7 +174,13 @@ class _Smooth:
         marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
         total = marginal.sum(axis=(0, 1))
         q = 2**self.squarings + 1
-        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + self.pull / 2 * (x**2).sum(axis=0) + x[p:].mean(axis=0)
+        cost = (
+            x[:p].mean(axis=0)
+            + np.log(top)
+            + np.log(total) / (2 * q)
+            + self.pull / 2 * (x**2).sum(axis=0)
+            + x[p:].mean(axis=0)
+        )
         gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
         return cost, gradient + self.pull * x
 

@@ -96,7 +96,9 @@ def _fit_entries(
     def fit(i: int, j: int) -> Weight:
         systems = None if checks.systems is None else replace(checks.systems, entry=(i, j))
         entry = replace(checks, systems=systems)
-        return _fit_checked(lambda f: residuals(f)[:, :, i : i + 1, j : j + 1], freqs_hz, dt, Structure.SCALAR, limits, entry)[0]
+        return _fit_checked(
+            lambda f: residuals(f)[:, :, i : i + 1, j : j + 1], freqs_hz, dt, Structure.SCALAR, limits, entry
+        )[0]
 
     fits = [fit(i, j) for i, j in np.ndindex(p, m)]
     sizes = np.abs(E).max(axis=0).reshape(len(freqs_hz), p * m)
@@ -211,7 +213,10 @@ class _Fitter:
     def diagonal(self, grid: _Sampled, checked: _Sampled) -> Weight:
         """Joint fit, and again with the frequencies and units at which it is exceeded or costs more than it should."""
         best = self.cover(grid)
-        size, beyond = optimal_cover(grid.E, Structure.SCALAR).left[:, 0], np.flatnonzero(~self.inside(checked.freqs_hz))
+        size, beyond = (
+            optimal_cover(grid.E, Structure.SCALAR).left[:, 0],
+            np.flatnonzero(~self.inside(checked.freqs_hz)),
+        )
         cost = np.where(best.left.min(axis=1) > 0, np.sqrt(np.maximum(10 ** (best.cost_db() / 10), 0.0)), 0.0)
         chosen = np.union1d(_marked(grid.freqs_hz, size, _POINTS // 2), _marked(grid.freqs_hz, cost, _POINTS // 2))
 
@@ -230,8 +235,15 @@ class _Fitter:
             excess = (used.cost_db() - best.cost_db()) - found.excess_db
             if ratio.max() <= _LIFT and not (excess > _MISSED_DB).any():
                 break
-            _LOG.debug("Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit", ratio.max(), excess.max())
-            exceeded, costly = _peaks(ratio.max(axis=0)), _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20))
+            _LOG.debug(
+                "Weight: exceeded %.3f times, by %.2f dB in cost between the points of the fit",
+                ratio.max(),
+                excess.max(),
+            )
+            exceeded, costly = (
+                _peaks(ratio.max(axis=0)),
+                _peaks(10 ** (np.nan_to_num(excess, nan=0.0, posinf=0.0) / 20)),
+            )
             worst = checked.chosen(bends, seen[exceeded])
             problem = problem.joined(problem_at(worst, ratio[:, exceeded])).joined(problem_at(grid.some(costly)))
             found = refit(problem, found.sections)
@@ -253,7 +265,13 @@ class _Fitter:
         near = known[np.searchsorted(grid_hz[known], freqs_hz).clip(0, len(known) - 1)]
         ratio = cover_ratio(E, best.left[near], best.right[near]) if ratio is None else ratio
         some = np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0
-        return Problem(freqs_hz[some], bilinear_squared(freqs_hz[some], self.sample_period_s), E[:, some], optimal[some], ratio[:, some])
+        return Problem(
+            freqs_hz[some],
+            bilinear_squared(freqs_hz[some], self.sample_period_s),
+            E[:, some],
+            optimal[some],
+            ratio[:, some],
+        )
 
 
 def _marked(freqs_hz: Array, size: Array, count: int) -> Array:

@@ -92,7 +92,9 @@ class Descriptor:
         right[:n, :n], right[n : 2 * n, n : 2 * n] = self.F, self.F.T
         for _ in range(6):
             for axis in (0, 1):
-                size = np.maximum(np.abs(left).max(axis=axis, keepdims=True), np.abs(right).max(axis=axis, keepdims=True))
+                size = np.maximum(
+                    np.abs(left).max(axis=axis, keepdims=True), np.abs(right).max(axis=axis, keepdims=True)
+                )
                 scale = 2.0 ** -np.round(np.log2(np.where(size > 0, size, 1.0)) / 2)
                 left, right = left * scale, right * scale
         with np.errstate(all="ignore"):
@@ -116,7 +118,10 @@ def ratio_systems(systems: ResidualSystems, left: StateSpace, right: StateSpace)
     first, last = invert(right), invert(left)
     if systems.entry is not None:
         rows, columns = (np.eye(size) for size in residual_shape(form, nominal.n_outputs, nominal.n_inputs))
-        first, last = gain(columns[:, [systems.entry[1]]], right.dt) @ first, last @ gain(rows[[systems.entry[0]]], left.dt)
+        first, last = (
+            gain(columns[:, [systems.entry[1]]], right.dt) @ first,
+            last @ gain(rows[[systems.entry[0]]], left.dt),
+        )
     if form in _OUTPUT_SIDE:
         first, last = _transposed(last), _transposed(first)
     before, after = (Descriptor.of(to_continuous(w)) for w in (first, last))
@@ -133,7 +138,10 @@ def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -
     inverted = inverted or [Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE]
     forms = inverted if form is Form.INVERSE_ADDITIVE else [form]
     residual = ResidualSystems(form, systems.nominal, systems.units)
-    plants = [to_continuous(s).poles() for s in (systems.nominal, *(systems.units[k] for k in range(systems.units.batch_shape[0])))]
+    plants = [
+        to_continuous(s).poles()
+        for s in (systems.nominal, *(systems.units[k] for k in range(systems.units.batch_shape[0])))
+    ]
     modes = np.concatenate([part.poles() for f in forms for part in _of_units(residual, f)] + plants).astype(complex)
     light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
     at_hz = np.arctan(light.imag) / (np.pi * sample_period_s)

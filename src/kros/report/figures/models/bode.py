@@ -42,7 +42,9 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
             lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
             panel.autoscale_view()
             if nominal in models.unit_ids:
-                panel.plot(freqs, lines[models.index(nominal)], color=Tone.INK.light, lw=1.1, label=f"nominal, unit {nominal}")
+                panel.plot(
+                    freqs, lines[models.index(nominal)], color=Tone.INK.light, lw=1.1, label=f"nominal, unit {nominal}"
+                )
         name = models.lifting.names[i]
         row[0].set_ylabel(f"{name if len(name) <= 14 else shorten(name.partition('(')[0], 11) + '(…)'}\n(dB)")
     for panel, name in zip(axes[0], models.inputs, strict=True):

@@ -25,12 +25,18 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
 
 
 def _caption(run: RunFolder, chosen: list[str]) -> str:
-    text = "The whole held-out episode from the true first state and the recorded inputs alone, no measurement fed back. "
+    text = (
+        "The whole held-out episode from the true first state and the recorded inputs alone, no measurement fed back. "
+    )
     lifted = [n for n in chosen if is_koopman(n)]
     if lifted and len(chosen) == 2 and _reproduces(run, chosen):
         text += "The linear model follows the average; the Koopman model reproduces the gearbox oscillation as well. "
     free = run.evaluation["free_run"]
-    parts = [f"{model_label(n)} " + ", ".join(f"{c} {number(v['median'])} %" for c, v in free[n].items()) for n in chosen if n in free]
+    parts = [
+        f"{model_label(n)} " + ", ".join(f"{c} {number(v['median'])} %" for c, v in free[n].items())
+        for n in chosen
+        if n in free
+    ]
     return text + (f"Median error over units: {'; '.join(parts)}." if parts else "")
 
 

@@ -23,7 +23,11 @@ def design_figure(design: Design, models: IdentifiedModels | None = None) -> Fig
     proof = design.certificate
     running = f"gain {number(proof.gain)}" if proof.certified else "not certified"
     error = design.facts.get("hidden_error_percent")
-    facts = {**certificate_of(design.synthesis), "as it runs": running, "training error": "–" if error is None else f"{number(error)} %"}
+    facts = {
+        **certificate_of(design.synthesis),
+        "as it runs": running,
+        "training error": "–" if error is None else f"{number(error)} %",
+    }
     return observer_figure(design.observer, "certificate", facts)
 
 
@@ -41,7 +45,15 @@ def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
         truth, look = batch.states[:, 0, i], Look(Tone.BLUE.light)
         draw_lines(panel, time_s, [("recorded", truth, TRUTH), (observer_label(observer.name), estimate[:, i], look)])
         clip_to(panel, truth, 0.15)
-        note(panel, "measured" if channel.measured else "not measured", (1, 1), (-2, -2), ha="right", va="top", color=Tone.SOFT.light)
+        note(
+            panel,
+            "measured" if channel.measured else "not measured",
+            (1, 1),
+            (-2, -2),
+            ha="right",
+            va="top",
+            color=Tone.SOFT.light,
+        )
     axes[0, 0].set_title(episode_title(key))
     label_rows(axes[:, 0], channels)
     hide_times(axes[:-1, 0])

@@ -33,7 +33,9 @@ def draw(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
 
 def error_lines(episode: Shown, names: Sequence[str], state: int) -> list[Line]:
     """Return recorded minus estimated values of a state, a line an observer."""
-    return [(observer_label(n), episode.states[:, state] - episode.observers[n][:, state], observer_look(n)) for n in names]
+    return [
+        (observer_label(n), episode.states[:, state] - episode.observers[n][:, state], observer_look(n)) for n in names
+    ]
 
 
 def kept_episodes(run: RunFolder) -> list[Shown]:

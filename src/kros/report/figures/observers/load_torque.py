@@ -32,13 +32,18 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     for (label, names), (time, spectrum) in zip(ways, axes, strict=True):
         looks = {n: Look((Tone.BLUE if n.startswith("koopman") else Tone.ORANGE).light) for n in reversed(names)}
         estimates = {n: arrays[f"estimate/{n}"].astype(float) for n in looks}
-        lines = [("declared load", truth, TRUTH), *((model_label(n.partition("/")[0]), estimates[n], look) for n, look in looks.items())]
+        lines = [
+            ("declared load", truth, TRUTH),
+            *((model_label(n.partition("/")[0]), estimates[n], look) for n, look in looks.items()),
+        ]
         draw_lines(time, times, lines, width=1.0)
         clip_to(time, truth, 0.35)
         time.set_ylabel(label)
         spectrum.plot(freqs[1:], density[1:], color=TRUTH.colour, alpha=TRUTH.opacity, lw=TRUTH.weight)
         for n, look in looks.items():
-            spectrum.plot(freqs[1:], error_spectrum(estimates[n] - truth, run.sample_period_s, _SEGMENT)[1][1:], color=look.colour)
+            spectrum.plot(
+                freqs[1:], error_spectrum(estimates[n] - truth, run.sample_period_s, _SEGMENT)[1][1:], color=look.colour
+            )
         logarithmic(spectrum)
         spectrum.set_ylim(bottom=_LOWEST * density.max())
         frequency_axis(spectrum, freqs[freqs <= _HIGHEST / run.sample_period_s], "")

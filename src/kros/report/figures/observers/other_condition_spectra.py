@@ -19,4 +19,6 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     rows = [observer_row(f"{whose},\nlinear scale", {n: spectra[n] for n in pair}) for whose, pair in pairs]
     rows.append(observer_row("all of them,\nlog scale", spectra, logarithmic=True))
     text = f"Power spectral densities of the errors in the episode above ({condition_label(shown.key.condition)})."
-    return spectra_figure(run, rows, 1.3, columns=2), text + share_sentence(run, spectra, paper, names, "in this episode")
+    return spectra_figure(run, rows, 1.3, columns=2), text + share_sentence(
+        run, spectra, paper, names, "in this episode"
+    )

@@ -29,7 +29,9 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     figure, axes = grid(-(-(len(kinds) + 1) // _COLUMNS), _COLUMNS, 1.75, sharey=True)
     panels = axes.ravel()
     for panel, kind in zip(panels, kinds, strict=False):
-        _panel(panel, kind, {n: found[n][kind][channel] for n in names if channel in found[n].get(kind, {})}, run.deployed)
+        _panel(
+            panel, kind, {n: found[n][kind][channel] for n in names if channel in found[n].get(kind, {})}, run.deployed
+        )
     for panel in axes[:, 0]:
         panel.set_ylabel("error (% of the\nlargest value)")
     smallest = min(float(found[n][k][channel].errors[0]) for n in names for k in found[n] if channel in found[n][k])

@@ -20,7 +20,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     first = next(iter(found.values()))
     flagged = sorted({s.unit for m in found.values() for s in m.scores if s.outlier}, key=natural_key)
     rate, units = number(100 * first.false_alarm_rate, 2), len(first.unit_ids)
-    caveat = f"; {units} units alone cannot show so rare an event, so the rate rests on that model" if first.extrapolated else ""
+    caveat = (
+        f"; {units} units alone cannot show so rare an event, so the rate rests on that model"
+        if first.extrapolated
+        else ""
+    )
     text = (
         f"By how much the largest {form_label(first.form.value)} residual of every unit exceeds those of all the others: the median over all nominal units, "
         f"and as a bar the range with each of them as the only nominal. Dashed: threshold at a nominal false-alarm rate of {rate} % for "
@@ -53,7 +57,9 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         low, high = referred_range(score)
         axes.plot([place, place], [low, high], color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
-        name_units(axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)[0], [score.unit])
+        name_units(
+            axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)[0], [score.unit]
+        )
         if score.outlier:
             note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
     if np.isfinite(model.threshold_db):

@@ -10,7 +10,16 @@ from ...canvas import Figure, grid, legend
 from ...names import Look, axis_label, episode_title
 from ...run_folder import RunFolder
 from ...theme import Tone
-from ..episodes import clip_to, draw_lines, hide_times, label_rows, recorded_episodes, reference_columns, shade, steady_window
+from ..episodes import (
+    clip_to,
+    draw_lines,
+    hide_times,
+    label_rows,
+    recorded_episodes,
+    reference_columns,
+    shade,
+    steady_window,
+)
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light)
 _ZOOM = 400  # samples
@@ -49,7 +58,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     text = "A held-out episode as recorded" + (", in both conditions of the same unit." if len(shown) == 2 else ".")
     if zoomed is not None:
         text += f" Bottom: reference minus recorded {zoomed} at constant speed"
-        text += ", where the gearbox shows as a steady oscillation that no linear model can produce." if run.calibrated else "."
+        text += (
+            ", where the gearbox shows as a steady oscillation that no linear model can produce."
+            if run.calibrated
+            else "."
+        )
     return figure, text
 
 

@@ -26,7 +26,14 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     top = 0.5 / run.sample_period_s
     for multiple in range(1, min(6, int(top / frequency)) + 1):
         axes[0, 0].axvline(multiple * frequency, color=Tone.SOFT.light, lw=0.7, ls=":", zorder=1)
-        note(axes[0, 0], f"{multiple * frequency:.0f} Hz", (multiple * frequency, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
+        note(
+            axes[0, 0],
+            f"{multiple * frequency:.0f} Hz",
+            (multiple * frequency, 1),
+            (3, -2),
+            xycoords=("data", "axes fraction"),
+            va="top",
+        )
     axes[0, 0].set_xlim(0, min(top, 6.6 * frequency))
     axes[0, 0].set_xlabel("frequency (Hz)")
     unit = next(c.unit for c in run.channels if c.name == spec.measured)

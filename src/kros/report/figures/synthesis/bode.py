@@ -25,7 +25,8 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         raise NotShownError("no robust observer has been synthesized")
     figure, axes = grid(1, len(chosen), 3.1, sharey=True)
     ends = [
-        _panel(panel, run, m, {n: s for n, s in robust.items() if n.startswith(f"{m}/")}) for panel, m in zip(axes[0], chosen, strict=True)
+        _panel(panel, run, m, {n: s for n, s in robust.items() if n.startswith(f"{m}/")})
+        for panel, m in zip(axes[0], chosen, strict=True)
     ]
     limit_decibels(axes[0, 0], _FLOOR_DB)
     for panel, labels in zip(axes[0], ends, strict=True):
@@ -49,7 +50,14 @@ def _panel(axes: Axes, run: RunFolder, name: str, syntheses: dict[str, Synthesis
         curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN.light, "--"))
     for observer, synthesis in syntheses.items():
         look = observer_look(observer)
-        curves.append((f"K {method_label(observer)}", scaled_filter(synthesis, models).frequency_response(freqs), look.colour, look.style))
+        curves.append(
+            (
+                f"K {method_label(observer)}",
+                scaled_filter(synthesis, models).frequency_response(freqs),
+                look.colour,
+                look.style,
+            )
+        )
     ends = []
     for label, response, colour, line in curves:
         size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))

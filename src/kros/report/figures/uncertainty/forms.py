@@ -23,7 +23,10 @@ FORM_TONES = {
     Form.INVERSE_INPUT_MULTIPLICATIVE: Tone.BLUE,
     Form.INVERSE_OUTPUT_MULTIPLICATIVE: Tone.ORANGE,
 }
-_PAPER_FORMS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input ones agree with ours for tall plants
+_PAPER_FORMS = (
+    Form.OUTPUT_MULTIPLICATIVE,
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE,
+)  # the input ones agree with ours for tall plants
 
 
 def draw(run: RunFolder) -> tuple[Figure, str]:
@@ -37,7 +40,11 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         f"{form_label(first.form.value)}."
     )
     text += _beyond(chosen)
-    text += " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do." if variants else ""
+    text += (
+        " Dashed: the paper's variants of both output forms, 0 dB and more everywhere whatever the units do."
+        if variants
+        else ""
+    )
     figure, axes = grid(1, len(chosen), 3.3, sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
@@ -47,7 +54,10 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
     limits = [window(model) for model in chosen.values()]
     axes[0, 0].set_ylim(min(low for low, _ in limits), max(high for _, high in limits))
     last = list(chosen.values())[-1]
-    ends = [(float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light) for form, bound in last.bounds.items()]
+    ends = [
+        (float(decibel(bound)[-1]), form_label(form.value), FORM_TONES[form].light)
+        for form, bound in last.bounds.items()
+    ]
     end_labels(axes[0, -1], ends, spacing=0.06)
     return figure, text
 

@@ -33,7 +33,12 @@ def draw(run: RunFolder) -> tuple[Figure, str]:
         found = {}
     text += " Last column: every unit over the weights; at most 0 dB, so all are covered." if found else ""
     square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in chosen.values())
-    titles = ["left weight", "right weight", *(["product"] if square else []), *(["units over weights"] if found else [])]
+    titles = [
+        "left weight",
+        "right weight",
+        *(["product"] if square else []),
+        *(["units over weights"] if found else []),
+    ]
     figure, axes = grid(len(chosen), len(titles), 2.0, sharex=True)
     for row, (name, model) in zip(axes, chosen.items(), strict=True):
         _draw_row(row, model, names[name], square)
@@ -61,7 +66,9 @@ def _draw_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] |
     for panel, magnitudes, below in ((row[0], fitted.left, cover.left), (row[1], fitted.right, cover.right)):
         _draw_entries(panel, model.freqs_hz, magnitudes, below, names)
     if square:
-        loop = model.weight.right.frequency_response(model.freqs_hz) @ model.weight.left.frequency_response(model.freqs_hz)
+        loop = model.weight.right.frequency_response(model.freqs_hz) @ model.weight.left.frequency_response(
+            model.freqs_hz
+        )
         _draw_product(row[2], model.freqs_hz, sigma_max(loop), (cover.left * cover.right).max(axis=1))
 
 

@@ -134,8 +134,6 @@ def demo(
 
     with make_progress(quiet) as progress:
         result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress, set_ or ())
-    if any(facts.get("memory", {}).get("effort") == "quick" for facts in result.metrics["observers"].values()):
-        _say("Predictors: quick effort; --set predictor.effort=full makes them more accurate and takes longer.", quiet)
     _finish(result, quiet)
 
 

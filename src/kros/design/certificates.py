@@ -24,11 +24,12 @@ from ..observer import (
     SignalBound,
     dropout_bound,
     relift_certificate,
+    run_observer,
     run_observers,
     signal_bound,
 )
 from ..observer.certificate.report import ReliftRow, course, relift_report
-from ..observer.predictor.driven import with_internal
+from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
 from ..uncertainty.coprime.bands import BandEnergies
@@ -100,7 +101,13 @@ def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[R
     """Certify observers of one kind of model; `task` is that of any of them, and what could not be made is left out."""
     observers = [found.observer for found in results if found.observer is not None]
     data, others = certified_on(task), other_conditions(task)
-    found = {r.name: r for group in by_lifting(observers) for r in running_of(group, data, task, others)}
+    facts = {r.name: r.facts for r in results}
+    found = {
+        r.name: r
+        for group in by_lifting([o for o in observers if o.bank is None])
+        for r in running_of(group, data, task, others)
+    }
+    found |= {o.name: running_filters(o, data, task, others, facts[o.name]) for o in observers if o.bank is not None}
     return [found[observer.name] for observer in observers]
 
 
@@ -127,7 +134,7 @@ def _beginnings(training: TrainingSet) -> ValidationSet:
 
 
 def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
-    """Return observers in groups that can run side by side: predictors have states of their own."""
+    """Return observers in groups that can run side by side: some have been fitted to their own liftings."""
     groups: dict[Lifting, list[Observer]] = {}
     for observer in observers:
         groups.setdefault(observer.lifting, []).append(observer)
@@ -164,6 +171,32 @@ def running_of(
     return [Running(o.name, c, r, float(h), float(d), b, o.measured, p, g) for o, c, r, h, d, b, p, g in found]
 
 
+def running_filters(
+    observer: Observer, data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet], facts: dict[str, Any]
+) -> Running:
+    """Certify a filter bank; its errors in training are raised to those on units that were left out."""
+    batch, n, measured = data.batch, len(observer.recorded), observer.measured
+    estimates = run_observer(observer, data.measurements(measured), batch.inputs, observer.own(batch.parameters))
+    missed = estimates[..., :n] - batch.states
+    inside = (np.arange(len(missed))[:, None] < batch.lengths)[..., None]
+    square = np.sum(np.where(inside, missed, 0.0) ** 2, axis=0) / batch.lengths[:, None]
+    units = list(dict.fromkeys(batch.units))
+    errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
+    sizes = task.models.output_scale[:n]
+    scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
+    growth = facts["left_out_to_training"]
+    grown = np.array([growth.get(name, 1.0) for name in observer.recorded])
+    percents = [data.compare([estimates])[0], *(other.percent(observer) for other in others)]
+    hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * grown, measured)) for percent in percents])))
+    dropout = float(dropout_error_percent([observer], data)[0])
+    certificate = filter_certificate(observer, scales)
+    bound = left_out_bound(observer, sizes, units, errors, facts["left_out_worst_percent"])
+    by = factors(observer, {})[0]
+    scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
+    certificate = replace(certificate, scales=scales)
+    return Running(observer.name, certificate, [], hidden, dropout, bound.in_sizes(by[:n]), measured)
+
+
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
     """Return the sizes that every observer's gain refers to: ranges, the residual of its own model in this population, quantisation."""
     known: dict[bytes, ReliftScales] = {}
@@ -171,12 +204,8 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
         model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
         if model not in known:
             batch, values = data.batch, observer.own(data.batch.parameters)
-            driven = with_internal(observer, batch.states, batch.inputs, values)
-            residual = one_step_residual(observer.lifting, observer.A, observer.B, driven, batch.inputs, values)[
-                ..., :n
-            ]
-            typical = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
-            known[model] = typical.with_internal(observer.lifting.n_states - n)
+            residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
+            known[model] = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 

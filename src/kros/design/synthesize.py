@@ -25,7 +25,7 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..identify.kinds import kind_of
 from ..lifting import Lifting
-from ..observer import Observer, ReliftCertificate, Sensor
+from ..observer import EstimatorSettings, Observer, ReliftCertificate, Sensor
 from ..observer.limits import Limit, Limits, limits_of
 from ..observer.sensor import Sensors, require_measured
 from ..observer.units import in_sizes
@@ -35,7 +35,7 @@ from .about import about
 from .certificates import DIVERGED, Running, certify_running
 from .methods.table import BY_NAME, preferred, slowest_first, suitable
 from .monitor import fit_monitor, monitor_facts
-from .settings import BASELINES, ObserverSettings, PredictorSettings, SynthesisSettings
+from .settings import BASELINES, ObserverSettings, SynthesisSettings
 from .task import DesignResult, DesignTask, is_robust, split_name
 from .validation import TrainingSet
 
@@ -129,7 +129,7 @@ def synthesize(
     method: str | None = None,
     *,
     observer: Mapping[str, Any] | None = None,
-    predictor: Mapping[str, Any] | None = None,
+    estimator: Mapping[str, Any] | None = None,
     sensor: Mapping[str, Any] | None = None,
     limits: Mapping[str, Any] | None = None,
     robust: bool = False,
@@ -145,8 +145,8 @@ def synthesize(
     method : str, optional
         A method such as ``worst_case_h2``, for the first kind of model that it is for, or a name such as ``koopman_edmd/mixed``. Default: all are
         tried, and the most accurate one on training episodes that is certified as it runs and tolerates dropouts is returned.
-    observer, predictor : mapping, optional
-        As ``[observer]`` and ``[predictor]`` of a study.
+    observer, estimator : mapping, optional
+        As ``[observer]`` and ``[estimator]`` of a study.
     sensor : mapping of str to mapping, optional
         What the sensors of measured states are like, as ``[sensor.<state>]`` of a study: ``{"position": {"noise": 1e-5, "delay_samples": 1}}``, see
         `kros.observer.Sensor`.
@@ -184,7 +184,7 @@ def synthesize(
     asked = SynthesisSettings.of(settings, "Synthesize")
     among, of = (
         ObserverSettings.of(observer or {}, "Synthesize, observer"),
-        PredictorSettings.of(predictor or {}, "Synthesize, predictor"),
+        EstimatorSettings.of(estimator or {}, "Synthesize, estimator"),
     )
     told = {name: Sensor.of(own, f"Synthesize, sensor.{name}") for name, own in (sensor or {}).items()}
     kept = {name: Limit.of(own, f"Synthesize, limits.{name}") for name, own in (limits or {}).items()}
@@ -206,7 +206,7 @@ def synthesize_all(
     uncertain: UncertainModels,
     settings: SynthesisSettings | None = None,
     observer: ObserverSettings | None = None,
-    predictor: PredictorSettings | None = None,
+    estimator: EstimatorSettings | None = None,
     sensor: Sensors | None = None,
     limits: Limits | None = None,
     *,
@@ -214,17 +214,17 @@ def synthesize_all(
     work: Work | None = None,
 ) -> Designs:
     """Design all observers that settings ask for, certify them, and choose the one that is deployed."""
-    settings, observer, predictor, work = (
+    settings, observer, estimator, work = (
         settings or SynthesisSettings(),
         observer or ObserverSettings(),
-        predictor or PredictorSettings(),
+        estimator or EstimatorSettings(),
         work or Work(),
     )
     wanted = {*observer.baselines, *settings.methods}
     tasks = [
         task
         for kind in uncertain.models.kinds
-        for task in tasks_of(uncertain, kind, wanted, settings, predictor, sensor, limits)
+        for task in tasks_of(uncertain, kind, wanted, settings, estimator, sensor, limits)
     ]
     results = designed(tasks, work)
     for task, found in zip(tasks, results, strict=True):
@@ -277,7 +277,7 @@ def tasks_of(
     kind: str,
     wanted: Iterable[str],
     settings: SynthesisSettings,
-    predictor: PredictorSettings,
+    estimator: EstimatorSettings,
     sensor: Sensors | None = None,
     limits: Limits | None = None,
 ) -> list[DesignTask]:
@@ -285,7 +285,6 @@ def tasks_of(
     from .uncertain_set import usable_problem
 
     identified = uncertain.models
-    predictor.require_hidden(identified.population.states, identified.population.measured)
     require_measured(sensor or {}, identified.population.measured)
     recorded, own = identified.models(kind), uncertain.sets[kind]
     training, whole = (
@@ -306,11 +305,10 @@ def tasks_of(
         "max_order": uncertain.max_order,
         "pooled": uncertain.pooled,
         "settings": settings,
-        "predictor": predictor,
+        "estimator": estimator,
     }
     if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
         shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}
-        shared["at_limits"] = TrainingSet.at_limits(identified, recorded, sensor).normalised(recorded)
     methods = suitable(wanted, kind, kind_of(kind).refined)
     return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
 

@@ -13,11 +13,11 @@ from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import Observer, Runtime
+from ..observer import EstimatorSettings, Observer, Runtime
 from ..observer.limits import Limits, sides
 from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
-from .settings import PredictorSettings, SynthesisSettings
+from .settings import SynthesisSettings
 from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
@@ -38,9 +38,8 @@ class DesignTask:
     covered: tuple[str, ...] = ()
     max_order: int = 4
     settings: SynthesisSettings = field(default_factory=SynthesisSettings)
-    predictor: PredictorSettings = field(default_factory=PredictorSettings)
+    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     limits: Limits = field(default_factory=dict)
-    at_limits: TrainingSet | None = None
     pooled: bool = True
     recordings: TrainingSet | None = None
 

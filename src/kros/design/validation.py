@@ -25,7 +25,6 @@ T = TypeVar("T")
 TUNING_UNITS = 12
 TUNING_EPISODES = 3
 TUNING_SAMPLES, SHORT_SAMPLES = 10_000, 2_000  # of an episode, at most, and below which more episodes take part
-TUNING_EPISODES_AT_LIMITS = 72
 SIDE_BY_SIDE = 20  # keeps a study of twelve units below 200 MB
 
 
@@ -73,17 +72,6 @@ class TrainingSet:
             sensor or {},
         )
 
-    @classmethod
-    def at_limits(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
-        """Take some training episodes of all conditions, first those of units that were seen at a limit."""
-        every, seen = (
-            cls.whole(identified, models, sensor),
-            {u for limit in identified.facts.limits.values() for u in limit.units},
-        )
-        return replace(
-            every, keys=tuple(sorted(every.keys, key=lambda k: k.unit not in seen))[:TUNING_EPISODES_AT_LIMITS]
-        )
-
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
         outputs, inputs = models.output_scale[list(models.measured)], models.input_scale[: len(models.recorded_inputs)]
@@ -108,17 +96,9 @@ class TrainingSet:
         """Read the episodes."""
         return self._shown(self.keys)
 
-    def within(self, n_samples: int, groups: int) -> TrainingSet:
-        """Return as many whole episodes as have about so many samples, the first ones; of so many units and conditions at most, and two of each of these."""
-        own = list(dict.fromkeys((key.unit, key.condition) for key in self.keys))
-        units = set(
-            spread(list(dict.fromkeys(unit for unit, _ in own)), max(2, groups * len({u for u, _ in own}) // len(own)))
-        )
-        keys = [key for key in self.keys if key.unit in units]
-        count = max(
-            2 * len([group for group in own if group[0] in units]), n_samples // len(self.population.read(keys[0]))
-        )
-        return replace(self, keys=tuple(keys[:count]))
+    def read_one(self, key: EpisodeKey) -> EpisodeBatch:
+        """Read an episode, whole, without the bias."""
+        return replace(self, sensor=_without(self.sensor, "bias"))._shown([key]).batch
 
     def one_by_one(self) -> Iterator[ValidationSet]:
         """Read every episode by itself, whole, without the bias: its size is declared, and its sign nobody can learn."""

@@ -46,7 +46,7 @@ class Lifting:
     inputs : tuple of str
         Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes through.
     input_functions : tuple of str
-        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``.
+        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``; ``1`` makes it affine.
     sizes : tuple of (str, float)
         Sizes of states, inputs and functions by name, see `in_sizes`; one where none is given.
 
@@ -91,7 +91,7 @@ class Lifting:
                     f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
                 )
         for formula in self.input_formulas:
-            if not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
+            if formula.used and not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
                 raise ConfigError(
                     f"Lifting: the input function {formula.text!r} depends on no input ({', '.join(self.inputs) or 'none are named'}); "
                     "a function of states alone belongs to the lifted functions."

@@ -41,7 +41,7 @@ typedef struct {
     whole q;
     whole own;         /* every machine has a map of its own: one observer, map (batch, rows, columns) */
     whole late;        /* measurements are so many samples old, and so are the inputs of their time */
-    whole starts;      /* samples of corrections after a start */
+    whole overwrite;   /* measurements take the place of estimates before these are lifted */
     whole begins;
     whole width;       /* of the corrections that have limits; 0 where none has */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
@@ -51,9 +51,7 @@ typedef struct {
     const uint8_t *moving;    /* (samples, batch); all where there is none */
     const int32_t *begin;     /* (samples, batch): one more than the row of `begun` that a machine starts from; none */
     const double *begun;      /* (observers, begins, n) */
-    const whole *begun_since; /* (begins) */
     const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
-    const double *start;      /* (starts, n, q) */
     const double *lower;      /* (n, batch); none where estimates go on without limits */
     const double *upper;
     const double *limit;      /* (width): largest corrections */
@@ -68,7 +66,6 @@ typedef struct {
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
     double *past;             /* (observers, batch, earlier), moved on */
     uint8_t *fresh;           /* (batch): earlier values equal the present ones, moved on */
-    whole *since;             /* (batch): samples since a start, moved on */
     double *states;           /* (samples, observers, n, batch): x before every sample; none */
     double *innovation;       /* (samples, batch, q) of the first observer; none */
     double *before;           /* (samples, batch, earlier) of the first observer, before every sample; none */
@@ -379,10 +376,9 @@ int kros_relift(const formulas *f, const relift_job *s)
         for (whole o = 0; o < s->observers; o++) {
             double *state = s->column + o * columns * batch + first, *past = s->past ? s->past + (o * batch + first) * ne : NULL;
             uint8_t fresh[WIDE * MOST] = {0}, waiting[WIDE * MOST] = {0}, on[WIDE * MOST];
-            whole since[WIDE * MOST] = {0}, used = 0;
+            whole used = 0;
             if (s->fresh) memcpy(fresh, s->fresh + first, (size_t)lanes);
             if (s->waiting) memcpy(waiting, s->waiting + o * batch + first, (size_t)lanes);
-            if (s->since) memcpy(since, s->since + first, (size_t)lanes * sizeof(whole));
             for (whole i = 0; i < n; i++) gather(reg + i * MOST, state + i * batch, 1, lanes);
             for (whole i = 0; i < order; i++) gather(c + i * MOST, state + (f->n_lifted + i) * batch, 1, lanes);
             for (whole e = 0; e < ne; e++) gather(reg + (n + e) * MOST, past + e, ne, lanes);
@@ -417,7 +413,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                     if (begin[b]) {
                         for (whole i = 0; i < n; i++) LANES(reg + i * MOST)[b] = s->begun[(o * s->begins + begin[b] - 1) * n + i];
                         for (whole i = 0; i < order; i++) LANES(c + i * MOST)[b] = 0.0;
-                        fresh[b] = 1, waiting[b] = 0, since[b] = s->begun_since[begin[b] - 1];
+                        fresh[b] = 1, waiting[b] = 0;
                     }
                 whole going = moving ? 0 : lanes;
                 for (whole b = 0; moving && b < lanes; b++) going += moving[b];
@@ -432,6 +428,7 @@ int kros_relift(const formulas *f, const relift_job *s)
                     if (s->innovation && o == 0) scatter(s->innovation + at * q + j, nu + j * MOST, q, lanes);
                 }
                 if (!going) continue;
+                for (whole j = 0; j < q && s->overwrite; j++) memcpy(reg + s->measured[j] * MOST, y + j * MOST, MOST * sizeof(vec));
                 for (whole j = 0; j < m; j++) gather(reg + (n + ne + j) * MOST, s->u + (then * m + j) * batch + first, 1, lanes);
                 for (whole e = 0; e < ne; e++)
                     for (whole b = 0; b < lanes; b++)
@@ -439,15 +436,6 @@ int kros_relift(const formulas *f, const relift_job *s)
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, used, column, next, rows, w);
-                for (whole b = 0; s->starts && b < lanes; b++)
-                    if (since[b] < s->starts) {
-                        for (whole i = 0; i < n; i++) {
-                            double more = 0.0;
-                            for (whole j = 0; j < q; j++) more += s->start[(since[b] * n + i) * q + j] * LANES(nu + j * MOST)[b];
-                            LANES(next + i * MOST)[b] += more;
-                        }
-                        since[b] += moving ? moving[b] : 1;
-                    }
                 if (s->width) limit_corrections(s, n, c, nu, next, w);
                 if (s->lower) limit_states(s, n, next, first, lanes);
                 shifted(f, reg, older);
@@ -470,10 +458,7 @@ int kros_relift(const formulas *f, const relift_job *s)
             for (whole i = 0; i < order; i++) scatter(state + (f->n_lifted + i) * batch, c + i * MOST, 1, lanes);
             for (whole e = 0; e < ne; e++) scatter(past + e, reg + (n + e) * MOST, ne, lanes);
             if (s->waiting) memcpy(s->waiting + o * batch + first, waiting, (size_t)lanes);
-            if (o == s->observers - 1) {
-                if (s->fresh) memcpy(s->fresh + first, fresh, (size_t)lanes);
-                if (s->since) memcpy(s->since + first, since, (size_t)lanes * sizeof(whole));
-            }
+            if (o == s->observers - 1 && s->fresh) memcpy(s->fresh + first, fresh, (size_t)lanes);
         }
     }
     free(reg), free(c), free(y), free(nu), free(next), free(older), free(each), free(map), free(column);

@@ -5,7 +5,7 @@ there are. What is regressed is the part that can be seen (`without_level`), of 
 
 .. math:: \tau_s, \qquad i - (\tau - \tau_s).
 
-The past of what is seen then needs one lag with the same forgetting: the integral of the tracking error, which the drive's controller holds.
+The estimator's bank has one lag with the same forgetting: the integral of the tracking error, which the drive's controller holds.
 """
 
 from __future__ import annotations
@@ -20,13 +20,11 @@ from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
-from ..observer.predictor.moments import PastMoments
-from ..synthesis.residual_shaped.shaping_filter import Basis
 from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]
 LOAD = "load"
-_LOADED, _UNLOADED, _DELAYS = "loaded", "unloaded", 20
+_LOADED, _UNLOADED = "loaded", "unloaded"
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,10 +33,11 @@ class LoadCalibration:
 
     Parameters
     ----------
-    past : PastMoments
-        Of the recorded states and the load, its "units" the two kinds of recordings.
+    lifting : Lifting
+        Of the recorded states and the load.
+    measured : tuple of int
     batch : EpisodeBatch
-        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its "units" are the kinds.
+        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its conditions are "loaded" and "unloaded".
     level_s : float
         Time after which a constant load is forgotten.
     used, left_out : tuple of int
@@ -58,7 +57,8 @@ class LoadCalibration:
     ((0, 1), ())
     """
 
-    past: PastMoments
+    lifting: Lifting
+    measured: tuple[int, ...]
     batch: EpisodeBatch
     level_s: float
     used: tuple[int, ...]
@@ -137,7 +137,9 @@ def calibrate_load(
     if current is not None:
         widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, dt)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
-    keys = tuple(EpisodeKey(_LOADED if found else _UNLOADED, "", str(i)) for i, found in zip(used, loaded, strict=True))
-    seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened)
-    past = PastMoments.of(with_load, tuple(measured), seen_batch, Basis(_DELAYS, (float(np.exp(-dt / level_s)),)))
-    return LoadCalibration(past, seen_batch, level_s, tuple(used.tolist()), tuple(np.flatnonzero(at_limit).tolist()))
+    keys = tuple(
+        EpisodeKey(batch.keys[i].unit, _LOADED if on else _UNLOADED, str(i)) for i, on in zip(used, loaded, strict=True)
+    )
+    seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened, shown=None, lost=None)
+    at = tuple(np.flatnonzero(at_limit).tolist())
+    return LoadCalibration(with_load, tuple(measured), seen_batch, level_s, tuple(used.tolist()), at)

@@ -19,11 +19,11 @@ from .certificate.error import ReliftScales
 from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import ReliftStatus
+from .estimator import EstimatorSettings, Recordings, identify_estimator
+from .filter_bank import FilterBank
 from .guard import Guard
 from .monitor import Monitor
 from .observer import Observer
-from .predictor.build import identify_predictor
-from .predictor.moments import PastMoments
 from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
 from .samples import SampleStatus
@@ -35,12 +35,14 @@ from .tracking import Tracked, track_parameter
 __all__ = [
     "DropoutBound",
     "Estimate",
+    "EstimatorSettings",
     "ExtendedKalman",
+    "FilterBank",
     "FilteredDifference",
     "Guard",
     "Monitor",
     "Observer",
-    "PastMoments",
+    "Recordings",
     "ReliftCertificate",
     "ReliftScales",
     "ReliftStatus",
@@ -52,7 +54,7 @@ __all__ = [
     "SignalBound",
     "Tracked",
     "dropout_bound",
-    "identify_predictor",
+    "identify_estimator",
     "relift_certificate",
     "run_observer",
     "run_observers",

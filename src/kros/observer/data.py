@@ -27,11 +27,11 @@ from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
+from .filter_bank import FilterBank
 from .guard import Guard
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensors, require_measured
-from .start import Start
 
 Array = npt.NDArray[np.float64]
 
@@ -61,16 +61,12 @@ class ObserverData:
         Delay of the measurement, limits, and the gain of filtered estimates.
     seen : Seen, optional
         Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none by default.
-    replaces : bool
-        Whether a measurement takes the place of the estimate of the measured state: the correction is a gain, equal to these states' columns of A.
-    internal : int
-        So many states at the end are the observer's own (`predictor`): recordings do not hold them.
     sensor : mapping of str to Sensor
         What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
     monitor : Monitor, optional
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
-    start_in_motion : Start, optional
-        What a machine's motion at the first samples says of its hidden states; without it the observer starts as from rest.
+    bank : FilterBank, optional
+        Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the correction is zero.
     guard : Guard, optional
         Bounds of its states beyond which it starts again; by default it does so where one is not finite.
     about : mapping of str to JSON values
@@ -79,7 +75,7 @@ class ObserverData:
     Raises
     ------
     DimensionError
-        When sizes do not fit, or the correction is not what `replaces` says.
+        When sizes do not fit, or a filter bank has a correction.
     ConfigError
         When a sensor is that of a state that is not measured.
     """
@@ -96,11 +92,9 @@ class ObserverData:
     parameters: Mapping[str, float] = field(default_factory=dict)
     runtime: Runtime = field(default_factory=Runtime)
     seen: Seen | None = None
-    replaces: bool = False
-    internal: int = 0
     sensor: Sensors = field(default_factory=dict)
     monitor: Monitor | None = None
-    start_in_motion: Start | None = None
+    bank: FilterBank | None = None
     guard: Guard | None = None
     about: Mapping[str, Any] = field(default_factory=dict)
 
@@ -131,19 +125,15 @@ class ObserverData:
             raise DimensionError(
                 f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of {len(self.monitor.size)}."
             )
-        if not 0 <= self.internal <= n or any(i >= n - self.internal for i in self.measured):
-            raise DimensionError(
-                f"Observer {self.name}: {self.internal} internal states at the end of {n} should leave out the measured ones."
-            )
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
-        if self.start_in_motion is not None:
-            self.start_in_motion.require_fit(self.name, n, len(self.measured), len(self.inputs))
+        if self.bank is not None:
+            self.bank.require_fit(self.name, len(self.recorded), n, self.A.shape[0] + self.B.shape[1])
+            if K.D.any() or K.n_states:
+                raise DimensionError(
+                    f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
+                )
         if self.guard is not None:
             self.guard.require_fit(self.name, n, K.n_states)
-        if self.replaces and not measurement_replaces(self):
-            raise DimensionError(
-                f"Observer {self.name}: where measurements replace estimates, the correction is a gain equal to the measured states' columns of A."
-            )
 
     def __repr__(self) -> str:
         """Say what kind of observer it is, in a line."""
@@ -151,6 +141,11 @@ class ObserverData:
         functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
         y = ", ".join(self.lifting.states[i] for i in self.measured)
         return f"<Observer {self.name}: {states}{own}{functions} from {y}; correction of order {self.controller.n_states}, {self.sample_period_s:g} s>"
+
+    @property
+    def internal(self) -> int:
+        """Number of states at the end that recordings do not hold: those of a filter bank."""
+        return 0 if self.bank is None else self.lifting.n_states - len(self.bank.forget)
 
     @property
     def into(self) -> Array:
@@ -163,9 +158,11 @@ class ObserverData:
 
         It follows from the correction: the direct correction of the next estimate is that of this one, carried
         through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
-        states of the correction and slopes of lifted functions are left out.
+        states of the correction and slopes of lifted functions are left out. A filter bank takes the measurement.
         """
         n = self.lifting.n_states
+        if self.bank is not None:
+            return np.eye(n)[:, list(self.measured)]
         return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)
 
     @property
@@ -185,22 +182,21 @@ class ObserverData:
     def initial(
         self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
     ) -> Array:
-        """Return the first estimate: the first measurement where there is one, other states zero; shape (..., n)."""
+        """Return the first estimate: the first measurement, other states zero or as the filter bank starts; shape (..., n)."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
-        n = self.lifting.n_states
-        x = np.zeros((*y.shape[:-1], n))
+        x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y
-        if self.replaces and self.lifting.functions and not self.lifting.history:
-            others = [i for i in range(n) if i not in self.measured]
-            held = self.lifting.lift(x, {**self.parameters, **(parameters or {})})[..., n:] @ self.A[others, n:].T
-            still = np.eye(len(others)) - self.A[np.ix_(others, others)]
-            x[..., others] = solve_balanced(still, held.reshape(-1, len(others)).T).T.reshape(held.shape)
-        return (
-            x
-            if self.start_in_motion is None or u is None
-            else x + self.start_in_motion.moved(first, np.asarray(u, dtype=float))
+        if self.bank is None:
+            return x
+        values = self.values(parameters)
+        inputs = (
+            np.zeros((*y.shape[:-1], len(self.inputs)))
+            if u is None
+            else np.broadcast_to(u, (*y.shape[:-1], len(self.inputs)))
         )
+        lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
+        return np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""
@@ -239,11 +235,3 @@ class ObserverData:
                     f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}."
                 )
         return values
-
-
-def measurement_replaces(observer: ObserverData) -> bool:
-    """Whether a correction lets measurements take the place of the measured states' estimates."""
-    columns, gain = observer.A[:, list(observer.measured)], observer.into @ observer.controller.D
-    return observer.controller.n_states == 0 and np.allclose(
-        columns, gain, rtol=1e-9, atol=1e-12 * float(np.abs(columns).max(initial=0.0))
-    )

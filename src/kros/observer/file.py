@@ -24,15 +24,15 @@ from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData
+from .filter_bank import FilterBank
 from .guard import Guard
 from .monitor import Monitor
 from .runtime import Runtime, Seen
 from .sensor import Sensor
-from .start import Start
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
-SCHEMA, KIND = 2, "observer"
+SCHEMA, KIND = 3, "observer"
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:
@@ -58,9 +58,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
             if observer.seen is None
             else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}
         ),
-        "measurement_replaces_estimate": observer.replaces,
-        "internal_states": observer.internal,
-        **({} if observer.start_in_motion is None else {"start_in_motion": observer.start_in_motion.content()}),
+        **({} if observer.bank is None else {"filter_bank": observer.bank.content()}),
         **({} if observer.guard is None else {"guard": observer.guard.content()}),
         **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
         **({"about": observer.about} if observer.about else {}),
@@ -133,17 +131,13 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
         _seen(content.get("seen"), q, len(content["inputs"]), where),
         sensor=_sensor(content.get("sensor", {}), where),
         monitor=_monitor(content.get("monitor"), q, where),
-        start_in_motion=_start(content.get("start_in_motion"), lifting.n_states, q, len(content["inputs"]), where),
         guard=_guard(content.get("guard"), lifting.n_states, order, where),
     )
-    optional = ("runtime", "sensor", "start_in_motion", "lifting_inputs", "input_functions", "about", CHECKSUM)
+    optional = ("runtime", "sensor", "filter_bank", "lifting_inputs", "input_functions", "about", CHECKSUM)
     _known(content, [*observer_content(observer), *optional], where)
     about = content.get("about", {})
     _require(isinstance(about, dict), f"{where}: about should be an object", about)
-    replaces, internal = content["measurement_replaces_estimate"], content["internal_states"]
-    _require(type(replaces) is bool, f"{where}: measurement_replaces_estimate should be true or false", replaces)
-    _require(type(internal) is int, f"{where}: internal_states should be a whole number", internal)
-    return replace(observer, replaces=replaces, internal=internal, about=about)
+    return replace(observer, bank=_bank(content.get("filter_bank"), lifting.n_states, n + m, where), about=about)
 
 
 def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
@@ -234,20 +228,19 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
     return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
 
 
-def _start(found: Any, n: int, measured: int, inputs: int, where: str) -> Start | None:
+def _bank(found: Any, n: int, columns: int, where: str) -> FilterBank | None:
     if found is None:
         return None
-    _known(found, ("gain", "corrections", "rest"), f"{where}: start_in_motion")
-    gain, rows = matrix(found["gain"], (n, measured + inputs), f"{where}: start_in_motion.gain"), found["corrections"]
-    _require(isinstance(rows, list), f"{where}: start_in_motion.corrections should be a list of gains", rows)
-    each = [matrix(own, (n, measured), f"{where}: start_in_motion.corrections[{k}]") for k, own in enumerate(rows)]
-    rest = found.get("rest", [])
-    _require(isinstance(rest, list), f"{where}: start_in_motion.rest should be a list of rows", rest)
-    return Start(
-        gain,
-        np.array(each).reshape(len(each), n, measured),
-        matrix(rest, (len(rest), measured + inputs), f"{where}: start_in_motion.rest"),
-    )
+    _known(found, FilterBank.__dataclass_fields__, f"{where}: filter_bank")
+    count = len(found["levels"]) if isinstance(found["levels"], list) else 0
+    recorded = len(found["forget"]) if isinstance(found["forget"], list) else 0
+    shapes = {"forget": (1, recorded), "levels": (1, count)}
+    rows = {k: matrix([found[k]], shape, f"{where}: filter_bank.{k}")[0] for k, shape in shapes.items()}
+    start = matrix(found["start"], (n, columns), f"{where}: filter_bank.start")
+    shares = matrix(found["shares"], (count, recorded), f"{where}: filter_bank.shares")
+    _require(type(found["filters"]) is int, f"{where}: filter_bank.filters should be a whole number", found["filters"])
+    _require(_is_finite(found["memory"]), f"{where}: filter_bank.memory should be a number", found["memory"])
+    return FilterBank(found["filters"], start, rows["forget"], float(found["memory"]), rows["levels"], shares)
 
 
 def _guard(found: Any, n: int, order: int, where: str) -> Guard | None:

@@ -251,7 +251,7 @@ class RunningObserver:
         first, self._fresh = self._fresh, False
         if first and not (samples.held.since > LONGEST).any():
             self._held = replace(samples.held, stale=np.zeros(1, dtype=bool))
-            if self.observer.start_in_motion is not None and samples.starts[0, 0]:
+            if self.observer.bank is not None and samples.starts[0, 0]:
                 self._begin(samples.y[0], samples.u[0])
         elif samples.starts[0, 0]:
             self._begin(samples.y[0], samples.u[0])

@@ -137,7 +137,7 @@ def run_some_at_a_time(
         )
     late = first.runtime.delay
     alone = any(
-        o.start_in_motion is not None
+        o.bank is not None
         or o.runtime.delay != late
         or not o.runtime.clips_alike(first.runtime)
         or not Screen.of(o).same_as(Screen.of(first))
@@ -154,33 +154,14 @@ def run_some_at_a_time(
             yield _run(some, samples, parameters)
 
 
-def started(
-    observer: ObserverData, y: Array, u: Array, parameters: Parameters | None = None, *, cut: bool = False
-) -> tuple[Array, Array]:
-    """Return the first estimate, (batch, n), and what the start adds to later ones, (count, batch, n)."""
-    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    batch, start, late = samples.starts.shape[1], observer.start_in_motion, observer.runtime.delay
-    steps = Steps([observer], batch, values)
-    steps.begin(samples.y[0])
-    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
-    first, count = steps.x[0].copy(), 0 if start is None else min(len(start), len(samples.y) - late)
-    added = np.zeros((max(count, len(samples.y) - 1 if cut else 0), batch, observer.lifting.n_states))
-    for k in range(len(added)):
-        arrived = samples.y[k + late]
-        if start is not None and k < count:
-            added[k] = start.correction(steps.since, steps.innovation(arrived)[0])
-        steps.step(arrived, samples.u[k], ~np.isfinite(arrived))
-        if cut:
-            added[k] += steps.cut[0]
-    return first, added
-
-
 def _run(
     observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, status: Bits | None = None
 ) -> Array:
     """Run observers on screened samples, shape (observer, n_samples, batch, n); bits of those that start again go into `status`."""
     if len(observers) > 1 and library() is None:
         return np.concatenate([_run([o], samples, parameters) for o in observers])
+    if observers[0].bank is not None and (gaps := _with_gaps(samples)) is not None:
+        return _run_apart(observers, samples, parameters, status, gaps)
     observer, d = observers[0], observers[0].runtime.delay
     (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
     steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
@@ -205,6 +186,30 @@ def _run(
                     status[:, machines] = again.status
         if observer.runtime.binding:
             observer.runtime.clip_estimates(found)
+    return found
+
+
+def _with_gaps(samples: Screened) -> Whole | None:
+    """Return the machines of which a measurement is missing, where there are others too; None where the compiled loop takes all or none."""
+    gaps = ~np.isfinite(samples.y).all(axis=(0, 2))
+    return np.flatnonzero(gaps) if gaps.any() and not gaps.all() else None
+
+
+def _run_apart(
+    observers: Sequence[ObserverData],
+    samples: Screened,
+    parameters: Parameters | None,
+    status: Bits | None,
+    gaps: Whole,
+) -> Array:
+    """Run machines with gaps and those without one after the other."""
+    values, batch = observers[0].values(parameters, samples.starts.shape[1:]), samples.starts.shape[1]
+    found = np.empty((len(observers), *samples.y.shape[:2], observers[0].lifting.n_states))
+    for machines in (gaps, np.setdiff1d(np.arange(batch), gaps)):
+        own = None if status is None else status[:, machines].copy()
+        found[:, :, machines] = _run(observers, samples.of(machines), _values_of(values, machines), own)
+        if status is not None and own is not None:
+            status[:, machines] = own
     return found
 
 

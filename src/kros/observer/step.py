@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..loops import formulas, library, tape_of
 from .data import ObserverData
+from .filter_bank import Gaps
 from .guard import bounds
 from .origin import Origins
 from .runtime import Runtime
@@ -41,9 +42,11 @@ class Steps:
         self._plain = not (lifting.history or lifting.input_functions)
         self._earlier = np.zeros((len(observers), batch, len(lifting.window.earlier)))
         self._fresh = np.ones(batch, dtype=bool)
-        self._start, self._starting, self._since = observer.start_in_motion, False, np.zeros(batch, dtype=int)
         self._limits = observer.runtime if observer.runtime.limited else None
         self._origins = Origins(observer, batch)
+        self._gaps: Gaps | None = None
+        if observer.bank is not None:
+            self._gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
         self.correction: Array | None = None
         self.cut = np.zeros(self._next_x.shape)
         self._low, self._high = (
@@ -68,11 +71,8 @@ class Steps:
         self._x_c[:, rows] = 0.0
         self._fresh[rows] = True
         self.waiting[:, rows] = False
-        self._since[rows] = 0
-        if self._start is not None and u is not None:  # at rest there is nothing to find out
-            resting = self._start.at_rest(y, u)
-            self._since[rows] = np.where(resting, len(self._start), 0)[rows]
-        self._starting = self._start is not None and bool(self._since.min() < len(self._start))
+        if self._gaps is not None:
+            self._gaps.begin(rows)
 
     def _first(self, observer: ObserverData, y: Array, u: Array | None, values: Parameters, machines: Any) -> Array:
         """First estimates of some machines, relative to their origins."""
@@ -82,9 +82,6 @@ class Steps:
         moved = origins.states[machines]
         moved[..., self._at] = 0.0  # what is measured starts at the measurement
         first = observer.initial(y - origins.at[machines, None], values) - moved
-        if observer.start_in_motion is not None and u is not None:
-            assert origins.shift is not None
-            first = first + observer.start_in_motion.moved(y, u, (origins.at[machines], origins.shift.whole))
         return self._relifted(observer.runtime, first, machines)
 
     def _relifted(self, limits: Runtime, x: Array, machines: Any) -> Array:
@@ -102,12 +99,6 @@ class Steps:
         self.waiting[...] = False
         self.near[...], self._x_c[...], self._earlier[...], self._fresh[:] = x, 0.0, earlier, False
         self._origins.follow(self.near)
-        self._starting = False
-
-    @property
-    def since(self) -> npt.NDArray[np.int64]:
-        """Samples since the start in motion, shape (batch,)."""
-        return self._since
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values that the lifting reads, shape (observer, batch, n_earlier); after a start they equal the present ones."""
@@ -130,6 +121,10 @@ class Steps:
         """Take measurements, shape (batch, q), and inputs, shape (batch, m); missing (batch, q), moving (batch,)."""
         lifting, following_earlier = self.lifting, None
         y, u = self._origins.take_off(y, u)
+        if self._gaps is not None:
+            absent = np.zeros(y.shape, dtype=bool) if missing is None else missing
+            self._gaps.fill(self.near[0], y, absent)
+            y, missing = self.near[0][..., self._at], None
         if self._plain:
             lifting.lift_into(self._lifted, self.values)
             self._u[...] = u
@@ -144,10 +139,8 @@ class Steps:
         if missing is not None:  # what is predicted stands for what is missing, so that it corrects nothing
             np.copyto(self._y, self.near[..., self._at], where=missing)
         np.matmul(self.map, self._column, out=self._next)
-        if self._start is not None and self._starting:
-            self._next_x[0] += self._start.correction(self._since, (self._y - self.near[..., self._at])[0])
-            self._since += True if moving is None else moving
-            self._starting = bool(self._since.min() < len(self._start))
+        if self._gaps is not None:
+            self._gaps.follow(self.near[0], self._next_x[0], absent)
         if self._limits is not None:
             self._limit()
         moving = self._guarded(moving)
@@ -161,6 +154,13 @@ class Steps:
             np.copyto(self._earlier, following_earlier, where=True if moving is None else moving[..., None])
             self._fresh &= False if moving is None else ~moving.all(axis=0)
         self._origins.follow(self.near)
+
+    def alternatives(self, y: Array, u: Array, missing: Flags) -> tuple[Array, Array, Array]:
+        """Take a step as a filter bank, and return what filters and fallback estimate, (batch, n) each, and the level (batch,)."""
+        gaps = self._gaps
+        assert gaps is not None
+        self.step(y, u, missing)
+        return gaps.filtered, gaps.expected, gaps.level
 
     def _guarded(self, moving: Flags | None) -> Flags | None:
         """Return which observers and machines take the step, shape (observer, batch): none that wait, and none that would leave the bounds."""
@@ -188,7 +188,8 @@ class Steps:
         before: tuple[Array, Whole] | None = None,
     ) -> None:
         """Take many samples, compiled where there is a compiler; y (n_samples, batch, q), u (n_samples, batch, m)."""
-        if library() is None:
+        gaps = self._gaps is not None and y is not None and not np.isfinite(y).all()
+        if library() is None or gaps:
             self._one_by_one(y, u, late, moving, starts, states, innovation, before)
         elif self._origins.at is None and (y is None or not self._origins.beyond(y)):
             self._compiled(y, u, late, moving, starts, states, innovation, before, self._begins(y, u, starts))
@@ -259,15 +260,13 @@ class Steps:
             "origin": None if self._origins.at is None else self._origins.states.T,
             "waiting": self.waiting.view(np.uint8),
             "restart": self.restart.view(np.uint8),
-            "since": self._since,
+            "overwrite": int(self._gaps is not None),
             "states": states,
             "innovation": innovation,
         }
         if before is not None:
             job |= {"before": before[0], "pending": before[1]}
         job |= begins or {}
-        if self._start is not None and (self._starting or "begin" in job):
-            job |= {"starts": len(self._start), "start": self._start.corrections}
         if limits is not None:
             K, n = observer.controller, lifting.n_states
             if limits.correction is not None:
@@ -290,7 +289,6 @@ class Steps:
             formulas(lifting, tape_of(lifting, u.shape[2]), self.values, u.shape[2], batch),
             ("relift_job", job),
         )
-        self._starting = self._start is not None and "starts" in job and bool(self._since.min() < len(self._start))
 
     def _begins(self, y: Array | None, u: Array, starts: Flags | None) -> dict[str, Any]:
         """Estimates of machines that start after the first sample, and which they are; nothing where none does."""
@@ -307,10 +305,7 @@ class Steps:
         }
         first = y[rows, machines], u[rows, machines]
         begun = np.stack([self._first(o, *first, own, machines) for o in self.observers])
-        since = np.zeros(len(rows), dtype=np.int64)
-        if self._start is not None:
-            since[self._start.at_rest(*first)] = len(self._start)
-        return {"begin": number, "begun": begun, "begins": len(rows), "begun_since": since}
+        return {"begin": number, "begun": begun, "begins": len(rows)}
 
     def _one_by_one(
         self,

@@ -13,8 +13,9 @@ from pydantic import Field, field_validator
 from ..core.errors import ConfigError
 from ..core.files import parse_toml, read_toml, shortened
 from ..core.settings import Settings
-from ..design.settings import ObserverSettings, PredictorSettings, SynthesisSettings
+from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
+from ..observer import EstimatorSettings
 from ..observer.limits import Limit
 from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
@@ -122,7 +123,6 @@ class LoadConfig(Settings):
     angle: str = Field("position", description="state that is the angle")
     current: str = Field("current", description="state that is the current")
     limit: float | None = Field(None, gt=0, description="of the current, in its unit of measure")
-    memories: int = Field(8, ge=0, description="states of the load observer besides the recorded ones")
     level_s: float = Field(10.0, gt=0, description="time constant of the leak against drift of the load's level")
 
 
@@ -142,7 +142,7 @@ class StudyConfig(Settings):
     >>> from kros.study import validate_config
     >>> study = validate_config({"data": {"source": "recordings", "reader": "parquet"}}, Path())
     >>> study.name, study.synthesis.methods
-    ('study', ('mixed', 'worst_case_h2', 'residual_h2', 'memory'))
+    ('study', ('mixed', 'worst_case_h2', 'residual_h2', 'estimator'))
     """
 
     name: str = Field("study", description="of the study")
@@ -153,7 +153,7 @@ class StudyConfig(Settings):
     identify: IdentifySettings = IdentifySettings()
     uncertainty: UncertaintySettings = UncertaintySettings()
     synthesis: SynthesisSettings = SynthesisSettings()
-    predictor: PredictorSettings = PredictorSettings()
+    estimator: EstimatorSettings = EstimatorSettings()
     sensor: dict[str, Sensor] = Field(default_factory=dict)
     limits: dict[str, Limit] = Field(default_factory=dict)
     observer: ObserverSettings = ObserverSettings()

@@ -6,21 +6,20 @@ from collections.abc import Callable
 
 from ...core.errors import SynthesisError
 from ..task import DesignResult, DesignTask
+from .estimator import design_estimator
 from .gains import design_kalman_tuned, design_open_loop
-from .predictor import design_predictor
 from .published import design_published
 from .residual_shaped import design_residual_h2
-from .robust import design_mixed
-from .sets import design_worst_case
+from .robust import design_mixed, design_worst_case_h2
 
 DESIGNS: dict[str, Callable[[DesignTask], DesignResult]] = {
     "open_loop": design_open_loop,
     "kalman_tuned": design_kalman_tuned,
     "mixed": design_mixed,
     "paper": design_published,
-    "worst_case_h2": design_worst_case,
+    "worst_case_h2": design_worst_case_h2,
     "residual_h2": design_residual_h2,
-    "memory": design_predictor,
+    "estimator": design_estimator,
 }
 
 

@@ -33,7 +33,7 @@ METHODS = (
     Method("paper", 1.5, 10, not_refined=_LIFTED),
     Method("worst_case_h2", 4.0, 1),
     Method("residual_h2", 2.0, 4),
-    Method("memory", 5.0, 5, refined_only=_FITTED),
+    Method("estimator", 5.0, 0, refined_only=_FITTED),
 )
 BY_NAME = {method.name: method for method in METHODS}
 

@@ -141,8 +141,7 @@ class Source:
             "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in lifting.parameters])),
             "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
             "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
-            "held_start": self.held_start(),
-            "start": self.start_in_motion(),
+            "bank": self.bank(),
             "tracked": self.tracked(),
             "load": self.load_torque(),
             "shift": self.shift,
@@ -249,17 +248,30 @@ class Source:
         """Return the literal of a channel's factor; None where it is one."""
         return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
 
-    def held_start(self) -> dict[str, Any]:
-        """Return how the observer starts (`ObserverData.initial`): other states at rest, or where the lifted functions hold them."""
-        o, n = self.observer, self.observer.lifting.n_states
-        if not (o.replaces and o.lifting.functions and not o.lifting.history):
-            return {"others": [], "held": None}
-        others = [i for i in range(n) if i not in o.measured]
-        still = np.eye(len(others)) - o.A[np.ix_(others, others)]
-        from ...core.linalg import solve_balanced
-
-        held = solve_balanced(still, o.A[others, n:])
-        return {"others": others, "held": self.matrix(held)}
+    def bank(self) -> dict[str, Any] | None:
+        """Return what a filter bank starts with and does in gaps; None where the observer is none."""
+        own, o = self.observer.bank, self.observer
+        if own is None:
+            return None
+        first, places = len(o.recorded), list(o.measured)
+        z = slice(first, first + own.filters)
+        slopes = np.diff(own.shares, axis=0) / np.diff(own.levels)[:, None]
+        return {
+            "filters": own.filters,
+            "first": first,
+            "fallback": o.lifting.n_states - first,
+            "start": self.sums(self.realised.start),
+            "forget": self.numbers(own.forget),
+            "memory": self.precision.literal(own.memory),
+            "rest": self.precision.literal(1 - own.memory),
+            "levels": self.numbers(own.levels[:-1]),
+            "shares": self.matrix(own.shares[:-1]),
+            "slopes": self.matrix(slopes),
+            "ramp": self.sums(o.A[z, z]),
+            "into": self.matrix(self.realised.into),
+            "one": self.precision.literal(1.0),
+            "measured": places,
+        }
 
     def monitor(self) -> dict[str, Any] | None:
         """Return what the monitor computes with; None where the observer has none."""
@@ -297,33 +309,6 @@ class Source:
         low, high = (np.clip(side, -most, most) for side in bounds(own, n, order))
         wide = {"lower": self.wide(low[:n]), "upper": self.wide(high[:n])}
         return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
-
-    def start_in_motion(self) -> dict[str, Any] | None:
-        """Return what motion at the first samples adds to hidden states; rows of zeros are left out."""
-        start, q = self.observer.start_in_motion, len(self.observer.measured)
-        if start is None or not len(start):
-            return None
-        rows, places = (
-            np.flatnonzero(np.any(start.gain, axis=1) | np.any(start.corrections, axis=(0, 2))),
-            self.observer.measured,
-        )
-        assert self.realised.start_gain is not None
-        gain, less = (
-            self.realised.start_gain[rows],
-            [(j, places.index(i), factor) for j, i, factor in self.realised.less],
-        )
-        rest = start.rest.reshape(-1, gain.shape[1]).copy()
-        for j, i, factor in less:
-            rest[:, i] += factor * rest[:, q + j]
-        corrections = start.corrections[:, rows].reshape(len(start), -1)
-        return {
-            "rest": self.matrix(rest),
-            "rows": rows.tolist(),
-            "count": len(start),
-            "gain": self.matrix(gain),
-            "corrections": self.matrix(corrections),
-            "less": [(j, i, None if factor == 1 else Precision().literal(factor)) for j, i, factor in less],
-        }
 
     def symbol(self, name: str) -> str:
         """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""

@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from ...observer import Observer
 from ...observer.origin import OriginShift, find_shift
-from ...observer.predictor.driven import in_coordinates
 
 Array = npt.NDArray[np.float64]
 _ALIKE = 1e4  # condition of the modes, by which rounding grows
@@ -35,17 +34,21 @@ class Realised:
     model: Array  # (n, n_lifted + m)
     less: tuple[tuple[int, int, float], ...]
     shift: OriginShift | None
-    start_gain: Array | None  # (n, q + m)
+    start: Array  # (n, n_lifted + m), of a filter bank
+    into: Array  # (filters, q), from measurements to the filters of a bank
 
     @classmethod
     def of(cls, observer: Observer) -> Realised:
         """Realise an observer."""
         n, less, A = observer.lifting.n_states, differences(observer), observer.A.copy()
+        start = np.zeros((n, 0)) if observer.bank is None else observer.bank.start.copy()
         for j, i, factor in less:
             A[:, i] += factor * observer.B[:, j]
-        turn, shift, gain = to_modes(observer), find_shift(observer), _start_gain(observer, less)
+            if observer.bank is not None:
+                start[:, i] += factor * start[:, len(A) + j]
+        turn, shift = to_modes(observer), find_shift(observer)
         if turn is None:
-            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, shift, gain)
+            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, shift, start, _into(observer))
         turned = in_coordinates(observer, turn)
         first, own = len(observer.recorded), turned.A.copy()
         measured = list(observer.measured)
@@ -54,9 +57,16 @@ class Realised:
         own[first:n, first:n][block < 1e-12 * block.max()] = 0.0
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
-        if shift is not None:
-            shift = replace(shift, states=turn[:n, :n] @ shift.states)
-        return cls(replace(turned, A=own), model, less, shift, None if gain is None else turn[:n, :n] @ gain)
+        turned = replace(turned, A=own)
+        return cls(turned, model, less, shift, turn[:n, :n] @ start, _into(turned))
+
+
+def _into(observer: Observer) -> Array:
+    """Return the gains from measurements to the filters of a bank."""
+    if observer.bank is None:
+        return np.zeros((0, len(observer.measured)))
+    first = len(observer.recorded)
+    return observer.A[first : first + observer.bank.filters][:, list(observer.measured)]
 
 
 def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
@@ -77,22 +87,20 @@ def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
     return tuple(found)
 
 
-def _start_gain(observer: Observer, less: tuple[tuple[int, int, float], ...]) -> Array | None:
-    """Return the gain of the start in motion for differences in place of inputs, shape (n, q + m)."""
-    if observer.start_in_motion is None:
-        return None
-    gain, places = observer.start_in_motion.gain.copy(), observer.measured
-    for j, i, factor in less:
-        gain[:, places.index(i)] += factor * gain[:, len(places) + j]
-    return gain
-
-
 def to_modes(observer: Observer) -> Array | None:
-    """Return the coordinates of the modes of internal states, shape (n_lifted, n_lifted); one for real modes, pairs for complex ones."""
-    n, first = observer.lifting.n_states, len(observer.recorded)
-    if first == n:
+    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted): one for real modes, pairs for complex ones; None where there are none."""
+    if observer.bank is None:
         return None
-    values, vectors = np.linalg.eig(observer.A[first:n, first:n])
+    n, first, last = observer.lifting.n_states, len(observer.recorded), len(observer.recorded) + observer.bank.filters
+    turn = np.eye(observer.lifting.n_lifted)
+    for begin, end in ((first, last), (last, n - first)):
+        turn[begin:end, begin:end] = _modes(observer.A[begin:end, begin:end])
+    return turn
+
+
+def _modes(A: Array) -> Array:
+    """Return the coordinates of the modes of a matrix; the identity where their vectors are nearly alike."""
+    values, vectors = np.linalg.eig(A)
     columns = [
         part
         for i, v in enumerate(values)
@@ -100,8 +108,19 @@ def to_modes(observer: Observer) -> Array | None:
         for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
     ]
     basis = np.array(columns).T
-    if basis.shape != (n - first, n - first) or np.linalg.cond(basis) > _ALIKE:
-        return None
-    turn = np.eye(observer.lifting.n_lifted)
-    turn[first:n, first:n] = np.linalg.inv(basis)
-    return turn
+    if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > _ALIKE:
+        return np.eye(len(A))
+    return np.asarray(np.linalg.inv(basis))
+
+
+def in_coordinates(observer: Observer, turn: Array) -> Observer:
+    """The observer in lifted coordinates ``turn @ theta`` that leave the recorded states and the lifted functions alone."""
+    n = observer.lifting.n_states
+    bank, guard = observer.bank, observer.guard
+    return replace(
+        observer,
+        A=turn @ observer.A @ np.linalg.inv(turn),
+        B=turn @ observer.B,
+        bank=None if bank is None else bank.turned(turn[:n, :n]),
+        guard=None if guard is None else guard.turned(turn[:n, :n]),
+    )

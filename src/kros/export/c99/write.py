@@ -163,11 +163,8 @@ def c_files(
         if context["tracked"] is None
         else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
     )
-    begins = (
-        0
-        if observer.start_in_motion is None
-        else sum(getattr(observer.start_in_motion, part).size for part in ("gain", "corrections", "rest"))
-    )
+    bank = context["bank"]
+    begins = 0 if bank is None else sum(map(len, bank["start"])) + 2 * observer.bank.shares.size
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = (
         None
@@ -253,8 +250,9 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
         + context["delay"] * context["m"]
     )
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
+    reals += context["recorded"] + 1 + context["q"] * (context["bank"]["filters"] + 1) if context["bank"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 + 1 if context["monitor"] else 0
-    words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor", "start")) + 2
+    words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor")) + 2
     words += 1 if context["monitor"] and context["monitor"]["conditions"] else 0
     size = 8 * doubles + real * reals + 4 * words
     align = 8 if doubles or real == 8 else 4

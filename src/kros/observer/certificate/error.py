@@ -92,17 +92,11 @@ class ReliftScales:
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
         return cls(np.asarray(ranges, dtype=float), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
 
-    def with_internal(self, count: int) -> ReliftScales:
-        """Return the scales for an observer with so many internal states: they have no residual, and their errors do not count."""
-        return ReliftScales(
-            np.append(self.error, np.full(count, np.inf)), np.append(self.residual, np.zeros(count)), self.noise
-        )
-
     @classmethod
     def ones(cls, observer: ObserverData) -> ReliftScales:
         """Return the scales that change nothing."""
         n = len(observer.recorded)
-        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured))).with_internal(observer.lifting.n_states - n)
+        return cls(np.ones(n), np.ones(n), np.ones(len(observer.measured)))
 
 
 @dataclass(frozen=True, eq=False)

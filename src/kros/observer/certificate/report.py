@@ -13,10 +13,9 @@ from ...core.errors import DimensionError
 from ...data import EpisodeBatch
 from ...loops import recursion
 from ..data import ObserverData
-from ..predictor.driven import with_internal
 from ..residual.one_step import one_step_residual
 from ..screen import screened
-from ..simulate import run_observer, started
+from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .error import ErrorSystem
 
@@ -112,7 +111,7 @@ class Course:
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
-def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None, *, cut: bool = False) -> Course:
+def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
     """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.within(batch.states)
@@ -127,19 +126,15 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
         estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     taken = screened(observer, y, inputs).y
-    start, early = started(observer, y, inputs, values, cut=cut)
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - due[:-1]
     noise[:late] = 0.0
-    truth = with_internal(observer, states, observer.runtime.clip_inputs(inputs), values, start, early)
-    omega, recorded = held_residual(observer, truth, inputs, values), len(observer.recorded)
-    omega[: len(early), :, :recorded] -= early[
-        : len(omega), :, :recorded
-    ]  # what is corrected beside the observer's gain
+    omega = held_residual(observer, states, inputs, values)
+    start = observer.runtime.relifted(observer.initial(taken[0], values))
     return Course(
         omega,
         noise,
-        first_error(observer, truth[0] - start),
-        truth - estimates,
+        first_error(observer, states[0] - start),
+        states - estimates,
         batch.lengths,
         inputs,
         y,

@@ -66,9 +66,7 @@ class SignalBound:
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
     within : bool, optional
-        Of an observer that goes on from limits: whether these change no estimate of the recordings, and the bound is for signals that keep it so. If
-        not, what they cut off along the recordings counts as residual. None where there are no such limits, or they may bind at any sample: with a delay.
-        Energies say nothing of peaks, and a gain that brings internal states back would make a bound as much larger as it makes their excess smaller.
+        Of an observer that goes on from limits: true where these change no estimate of the recordings, and the bound is for signals that keep it so.
 
     Examples
     --------
@@ -198,8 +196,6 @@ def signal_bound(
         free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
         if _alike(free, observer, batch, seen):
             observer, within = free, True
-        elif not observer.runtime.delay:
-            seen, observer, within = course(observer, batch, estimates, cut=True), free, False
     units = list(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)

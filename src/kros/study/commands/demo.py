@@ -85,7 +85,6 @@ def run_demo(
     raw = {
         "name": "demo",
         "data": {"source": str(out / _RECORDINGS), "reader": "parquet"},
-        "predictor": {"effort": "quick"},
     }
     config = validate_config(raw, out, overrides=overrides)
     with open_run(out, config) as store, open_executor(workers) as executor:

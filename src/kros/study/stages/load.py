@@ -61,9 +61,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     for kind, lifting in study.liftings().items():
         try:
             calibration = study.calibration(lifting)
-            observer = load_observer(
-                f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories
-            )
+            observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs)
             observer = replace(observer, seen=seen_by(context.identified, observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
@@ -74,7 +72,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             observer, study.measured(study.test), study.test.inputs, study.parameters(observer, study.test)
         )
         found = study.level(observer, calibration, estimate)
-        facts[f"{kind}/load"] = {"order": len(observer.lifting.states), "episodes_left_out": len(calibration.left_out)}
+        facts[f"{kind}/load"] = {"order": observer.internal, "episodes_left_out": len(calibration.left_out)}
         rows.append(study.row(f"{kind}/load", found))
         curves[f"{kind}/load"] = found
     for name in (f"{kind}/{_UNAWARE}" for kind in study.liftings() if f"{kind}/{_UNAWARE}" in observers):

@@ -70,7 +70,6 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
     resolve_phase(
         config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
     )
-    config.predictor.require_hidden(population.states, population.measured)
     require_measured(config.sensor, population.measured)
     limits_of(config.limits, {}, population.states)
 

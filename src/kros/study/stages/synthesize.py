@@ -18,7 +18,7 @@ def run(context: Context) -> None:
         context.uncertain,
         config.synthesis,
         config.observer,
-        config.predictor,
+        config.estimator,
         config.sensor,
         config.limits,
         robust=config.require.robust,

@@ -1,0 +1,131 @@
+r"""The bank: delays and first-order lags of channels, and the decaying values of the first sample.
+
+For a channel v the bank holds
+
+.. math:: v_k, \quad m_i - m_{i+1}, \quad m_i = \operatorname{mean}(v_{k-t_i}, \dots, v_{k-t_{i+1}+1}), \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
+
+with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first sample everything is taken to equal it.
+As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from .channels import Channels
+from .settings import EstimatorSettings
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Bank:
+    """Filters of `channels` signals, the last of which is the constant one."""
+
+    channels: int
+    linear: int  # the first so many channels are linear in measurements and inputs
+    memoryless: int  # so many channels before the constant have no delays
+    taps: tuple[int, ...]  # where blocks of delays begin, in samples, from zero on, and where the last one ends
+    lags: tuple[float, ...]  # samples
+    starts: tuple[float, ...]  # samples
+
+    @classmethod
+    def of(cls, channels: Channels, length: float, settings: EstimatorSettings) -> Bank:
+        """Return the bank for a median episode of so many samples."""
+        lags = settings.lags(length)
+        blocks = settings.blocks(length)
+        return cls(len(channels), channels.linear, channels.nonlinear, blocks, lags, (*settings.start, *lags))
+
+    @property
+    def delayed(self) -> int:
+        """Number of channels with delays, the first ones."""
+        return self.channels - 1 - self.memoryless
+
+    def __len__(self) -> int:
+        moving = self.channels - 1
+        return (
+            moving
+            + self.delayed * (len(self.taps) - 2)
+            + moving * len(self.lags)
+            + self.channels * len(self.starts)
+            + 1
+        )
+
+    def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
+        """Return the bank at some samples of an episode's signals, v (n_samples, channels); shape (len(at), len(self))."""
+        from scipy.signal import lfilter
+
+        moving, past = v[:, :-1], v[:, : self.delayed]
+        before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
+        sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
+        ends = at + self.taps[-1] + 1
+        means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in zip(self.taps, self.taps[1:], strict=False)]
+        parts = [moving[at], *(one - other for one, other in zip(means, means[1:], strict=False))]
+        for tau in self.lags:
+            a = np.exp(-1 / tau)
+            parts.append(lfilter([1 - a], [1, -a], moving, axis=0, zi=a * moving[:1])[0][at])
+        parts += [np.exp(-at / tau)[:, None] * v[0] for tau in self.starts]
+        return np.hstack([*parts, np.ones((len(at), 1))])
+
+    def sizes(self, rms: Array) -> Array:
+        """Return the sizes that entries are divided by, from their RMS: for the start that of its constant, so that rest is no small size."""
+        size, count = rms.copy(), len(self.starts) * self.channels
+        size[-1 - count : -1] = np.repeat(rms[-1 - count : -1].reshape(-1, self.channels)[:, -1], self.channels)
+        return np.maximum(size, 1e-9 * size.max())
+
+    def trust(self, settings: EstimatorSettings) -> Array:
+        """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
+        linear = np.arange(self.channels - 1) < self.linear
+        own = np.where(linear, 0.0, settings.nonlinear_trust)
+        first = np.append(np.where(linear, settings.linear_trust, settings.start_trust), 0.0)
+        parts = [
+            own,
+            *[own[: self.delayed]] * (len(self.taps) - 2),
+            *[own] * len(self.lags),
+            *[first] * len(self.starts),
+        ]
+        return np.concatenate([*parts, [0.0]])
+
+    @property
+    def fine(self) -> Bank:
+        """The bank with every delay up to the longest."""
+        return replace(self, taps=tuple(range(self.taps[-1] + 1)))
+
+    def refined(self, coefficients: Array) -> Array:
+        """Return coefficients (p, n) of this bank as those of `fine`."""
+        moving, blocks, last = self.channels - 1, len(self.taps) - 1, self.taps[-1]
+        means = np.zeros((blocks, last))
+        for i, (a, b) in enumerate(zip(self.taps, self.taps[1:], strict=False)):
+            means[i, a:b] = 1 / (b - a)
+        steps = (means[:-1] - means[1:]) @ -np.tril(np.ones((last, last - 1)), -1)  # v_{k-j} = v_k - sum of steps
+        count = (blocks - 1) * self.delayed
+        each = coefficients[moving : moving + count].reshape(blocks - 1, -1)
+        fine = (steps.T @ each).reshape(-1, coefficients.shape[1])
+        return np.concatenate([coefficients[:moving], fine, coefficients[moving + count :]])
+
+    def system(self) -> tuple[Array, Array, Array]:
+        """Return A (p, p), B (p, channels) and S (p, channels) of a bank with every delay."""
+        p, c, moving, delayed = len(self), self.channels, self.channels - 1, self.delayed
+        A, B, S = np.zeros((p, p)), np.zeros((p, c)), np.zeros((p, c))
+        B[range(moving), range(moving)] = S[range(moving), range(moving)] = 1.0
+        place = moving
+        for i in range(self.taps[-1] - 1):
+            rows = np.arange(place, place + delayed)
+            if i == 0:
+                B[rows, range(delayed)], A[rows, range(delayed)] = 1.0, -1.0
+            else:
+                A[rows, rows - delayed] = 1.0
+            place += delayed
+        for tau in self.lags:
+            rows, a = np.arange(place, place + moving), np.exp(-1 / tau)
+            A[rows, rows], B[rows, range(moving)], S[rows, range(moving)] = a, 1 - a, 1.0
+            place += moving
+        for tau in self.starts:
+            rows, a = np.arange(place, place + c), np.exp(-1 / tau)
+            A[rows, rows], S[rows, range(c)] = a, 1 / a
+            place += c
+        B[-1, -1] = S[-1, -1] = 1.0
+        return A, B, S

@@ -1,0 +1,258 @@
+"""From recordings to an observer: family of channels, readouts, reduction, start and gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.lti import gain
+from ...lifting import Lifting
+from ...synthesis.result import Injection
+from ..filter_bank import FilterBank
+from ..observer import Observer
+from .bank import Bank
+from .channels import FAMILIES, Channels, channels_of
+from .gaps import forgetting, shares_of
+from .reduction import Filters, reduced
+from .regression import Design, Readout, Recordings
+from .settings import EstimatorSettings
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """An estimator with what was found on the way."""
+
+    observer: Observer
+    readout: Readout
+    family: str
+    facts: dict[str, Any]
+
+
+def identify_estimator(
+    name: str,
+    lifting: Lifting,
+    measured: Sequence[int],
+    inputs: Sequence[str],
+    recordings: Recordings,
+    sample_period_s: float,
+    parameters: Mapping[str, float] | None = None,
+    settings: EstimatorSettings | None = None,
+) -> Identified:
+    """Identify the estimator of a population.
+
+    Parameters
+    ----------
+    name : str
+    lifting : Lifting
+        Functions of measured states and of inputs become channels; functions of states that are not measured are left out.
+    measured : sequence of int
+    inputs : sequence of str
+    recordings : Recordings
+        Training episodes of all units.
+    sample_period_s : float
+    parameters : mapping of str to float, optional
+        Default values of the lifting's parameters.
+    settings : EstimatorSettings, optional
+
+    Returns
+    -------
+    Identified
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer.estimator import Recordings, identify_estimator
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
+    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001)
+    >>> found.observer.recorded
+    ('position', 'velocity', 'current')
+    """
+    settings, measured = settings or EstimatorSettings(), tuple(measured)
+    n = lifting.n_states
+    hidden = [i for i in range(n) if i not in measured] or list(measured)
+    readout, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
+    channels = readout.design.channels
+    blind_channels = channels.without_measurements()
+    blind_bank = Bank.of(blind_channels, recordings.length, settings)
+    blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
+    filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
+    first = first_estimate(channels, recordings)
+    observer = assembled(name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {})
+    forget = forgetting(observer, recordings, settings)
+    observer = replace(
+        observer, bank=replace(observer.bank, forget=forget, memory=settings.memory(readout.design.bank.taps[-1]))
+    )
+    observer = replace(observer, bank=shares_of(observer, recordings, settings))
+    states = lifting.states
+    errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
+    growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
+    worst = np.sqrt(np.max(list(readout.unit_errors().values()), axis=0))
+    facts = {
+        "channels": family,
+        "filters": len(filters.A),
+        "input_filters": len(fallback.A),
+        "bank": len(readout.design.bank),
+        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
+        "penalties": dict(zip(states, readout.penalties.tolist(), strict=True)),
+        "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
+        "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
+        "left_out_worst_percent": dict(zip(states, (100 * worst).tolist(), strict=True)),
+        "settle_samples": settle_samples(filters, fallback, observer.bank),
+    }
+    return Identified(observer, readout, family, facts)
+
+
+def best_family(
+    lifting: Lifting,
+    measured: tuple[int, ...],
+    inputs: Sequence[str],
+    recordings: Recordings,
+    settings: EstimatorSettings,
+    hidden: Sequence[int],
+) -> tuple[Readout, str]:
+    """Return the readout of the first family of channels after which the next is not better by the margin on left-out units."""
+    ranges = ranges_of(lifting, measured, inputs, recordings)
+    best: Readout | None = None
+    chosen = FAMILIES[0]
+    for family in FAMILIES:
+        channels = channels_of(lifting, measured, inputs, family, ranges, settings)
+        if best is not None and len(channels) == len(best.design.channels):
+            break
+        design = Design(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+        readout = Readout.of(design)
+        if best is not None and not is_better(readout, best, hidden, settings.margin):
+            break
+        best, chosen = readout, family
+    assert best is not None
+    return best, chosen
+
+
+def is_better(one: Readout, other: Readout, states: Sequence[int], margin: float) -> bool:
+    """Whether the left-out errors of one are smaller by so many paired standard errors over folds of units."""
+    difference = one.by_fold(states) - other.by_fold(states)
+    if len(difference) < 2:
+        return bool(difference.mean() < 0)
+    return bool(difference.mean() + margin * difference.std(ddof=1) / np.sqrt(len(difference)) < 0)
+
+
+def errors_of(readout: Readout) -> Array:
+    """Return the typical left-out error of every state in its unit, shape (n,)."""
+    return np.exp(np.log(readout.left_out).mean(axis=0) / 2) * readout.design.recordings.size
+
+
+def ranges_of(
+    lifting: Lifting, measured: Sequence[int], inputs: Sequence[str], recordings: Recordings
+) -> dict[str, tuple[float, float]]:
+    """Return the least and largest value of measured states and inputs in the units that formulas are written in."""
+    batches = [recordings.read(key) for key in recordings.some(150).keys]
+    found = {}
+    names = [lifting.states[i] for i in measured]
+    for name, size in zip([*names, *inputs], lifting.sizes_of([*names, *inputs]), strict=True):
+        if name in names:
+            values = [b.measurements([lifting.states.index(name)])[..., 0] for b in batches]
+        else:
+            values = [b.inputs[..., list(inputs).index(name)] for b in batches]
+        found[name] = (float(size * min(np.nanmin(v) for v in values)), float(size * max(np.nanmax(v) for v in values)))
+    return found
+
+
+def first_estimate(channels: Channels, recordings: Recordings) -> tuple[Array, Array]:
+    """Return the maps from the first sample's channels, (n, channels), and from those of inputs alone, to the first state."""
+    blind = channels.without_measurements()
+    v, w, x = [], [], []
+    for key in recordings.keys:
+        batch = recordings.read(key)
+        y, u = batch.measurements(channels.measured)[0], batch.inputs[0]
+        v.append(channels.signals(y, u, batch.parameters)[0])
+        w.append(blind.signals(y, u, batch.parameters)[0])
+        x.append(batch.states[0, 0])
+    units = np.array([key.unit for key in recordings.keys])
+    some = np.array([*range(channels.linear), len(channels) - 1])
+    found = np.zeros((x[0].size, len(channels)))
+    found[:, some] = _ridge(np.array(v)[:, some], np.array(x), units).T
+    found[list(channels.measured)] = np.eye(len(channels.measured), len(channels))
+    return found, _ridge(np.array(w), np.array(x), units).T
+
+
+def _ridge(X: Array, T: Array, units: npt.NDArray[Any]) -> Array:
+    """Return ridge coefficients with the penalty that is best on units that are left out; the last column, a constant, has none."""
+    size = np.sqrt(np.mean(X**2, axis=0))
+    X = X / np.where(size > 0, size, 1.0)
+
+    def solved(rows: npt.NDArray[np.bool_], penalty: float) -> Array:
+        rest = np.sqrt(penalty * rows.sum()) * np.eye(X.shape[1])
+        rest[-1] = 0.0
+        stacked = np.vstack([T[rows], np.zeros((X.shape[1], T.shape[1]))])
+        return np.asarray(np.linalg.lstsq(np.vstack([X[rows], rest]), stacked, rcond=None)[0])
+
+    def score(penalty: float) -> float:
+        errors = [((T[units == u] - X[units == u] @ solved(units != u, penalty)) ** 2).mean(axis=0) for u in set(units)]
+        return float(np.log(np.mean(errors, axis=0) + 1e-30).sum())
+
+    every, several = np.ones(len(units), dtype=bool), len(set(units)) > 1
+    best = min((10.0**d for d in range(-8, 3)), key=score) if several else 1e-4
+    return solved(every, best) / np.where(size > 0, size, 1.0)[:, None]
+
+
+def assembled(
+    name: str,
+    lifting: Lifting,
+    inputs: Sequence[str],
+    channels: Channels,
+    filters: Filters,
+    fallback: Filters,
+    first: tuple[Array, Array],
+    sample_period_s: float,
+    parameters: Mapping[str, float],
+) -> Observer:
+    """Write filters with their readouts into the model of an observer."""
+    n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
+    bare = channels.lifting
+    own = [*(f"filter_{i + 1}" for i in range(r)), *(f"input_filter_{i + 1}" for i in range(s))]
+    widened = replace(bare, states=(*bare.states, *own, *(f"{state}_from_inputs" for state in bare.states)))
+    total, columns = widened.n_states, widened.n_lifted + len(inputs) + len(bare.input_functions)
+    places = [c if c < n else c + total - n for c in channels.columns]
+    blind = [c + total - n for c in channels.without_measurements().columns]
+    z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
+    model, start = np.zeros((total, columns)), np.zeros((total, columns))
+    model[np.ix_(range(n), z)], model[np.ix_(range(n), places)] = filters.C, filters.D
+    model[np.ix_(z, z)], model[np.ix_(z, places)] = filters.A, filters.B
+    model[np.ix_(w, w)], model[np.ix_(w, blind)] = fallback.A, fallback.B
+    model[np.ix_(u, w)], model[np.ix_(u, blind)] = fallback.C, fallback.D
+    model[list(channels.measured), list(channels.measured)] += 1.0
+    start[np.ix_(range(n), places)], start[np.ix_(z, places)] = first[0], filters.S
+    start[np.ix_(w, blind)], start[np.ix_(u, blind)] = fallback.S, first[1]
+    model = np.vstack([model, np.zeros((len(bare.functions), columns))])
+    A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
+    bank = FilterBank(r, start, np.ones(n), 0.0, np.array([0.0, 1.0]), np.zeros((2, n)))
+    none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
+    own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
+    return Observer(
+        name,
+        widened,
+        A,
+        B,
+        channels.measured,
+        tuple(inputs),
+        none,
+        Injection.STATE,
+        sample_period_s,
+        own_values,
+        bank=bank,
+    )
+
+
+def settle_samples(filters: Filters, fallback: Filters, bank: FilterBank | None) -> int:
+    """Return the samples after which what a disturbance left is below one percent: five of the slowest time constants."""
+    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in (filters, fallback)]
+    slowest = max([*poles, bank.memory if bank is not None else 0.0])
+    return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

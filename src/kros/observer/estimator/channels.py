@@ -1,0 +1,121 @@
+"""Channels of the bank: measurements, functions of them, inputs, and functions of both, as one lifting."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ...lifting import Lifting
+from .settings import EstimatorSettings
+
+Array = npt.NDArray[np.float64]
+Ranges = Mapping[str, tuple[float, float]]  # of measured states and inputs in training, in the recordings' units
+_QUADRATURE = {"sin": "cos", "cos": "sin"}
+CONSTANT = "1"
+FAMILIES = ("linear", "products", "products and random features")
+
+
+@dataclass(frozen=True, eq=False)
+class Channels:
+    """Signals that filters see: ``v = [y; sigma(y); u; gamma(u, y); 1]``, those of the lifting's columns that `columns` selects."""
+
+    lifting: Lifting
+    measured: tuple[int, ...]
+    n_inputs: int
+    linear: int  # so many channels are linear: measurements, the user's functions and inputs
+    nonlinear: int = 0  # so many after them are functions with lags but no delays
+    inputs_only: bool = False  # whether they leave measurements out: for gaps
+
+    @property
+    def columns(self) -> list[int]:
+        """Columns of [theta(x); inputs; functions of inputs] that are channels."""
+        n, p, m = self.lifting.n_states, self.lifting.n_lifted, self.n_inputs + len(self.lifting.input_functions)
+        if self.inputs_only:
+            return [*range(p, p + self.n_inputs), p + m - 1]
+        return [*self.measured, *range(n, p), *range(p, p + m)]
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def without_measurements(self) -> Channels:
+        """Return the inputs and the constant alone."""
+        return replace(self, linear=self.n_inputs, nonlinear=0, inputs_only=True)
+
+    def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+        """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""
+        x = np.zeros((*y.shape[:-1], self.lifting.n_states))
+        x[..., list(self.measured)] = y
+        own = {name: parameters[name] for name in self.lifting.parameters}
+        lifted = self.lifting.lift(x, own)
+        return np.concatenate([lifted, self.lifting.lift_inputs(u, x, own)], axis=-1)[..., self.columns]
+
+
+def channels_of(
+    lifting: Lifting,
+    measured: Sequence[int],
+    inputs: Sequence[str],
+    family: str,
+    ranges: Ranges,
+    settings: EstimatorSettings,
+) -> Channels:
+    """Return the channels of a family; functions of the lifting that read states which are not measured are left out."""
+    states = {lifting.states[i] for i in measured}
+    known = states | set(lifting.parameters)
+    functions = [f.text for f in lifting.formulas if f.used <= known]
+    functions += [text for f in lifting.formulas if (text := quadrature(f.text, f.used, lifting)) and f.used <= known]
+    of_inputs = [f.text for f in lifting.input_formulas if f.used <= known | set(inputs)]
+    functions = list(dict.fromkeys(functions))
+    linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
+    names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
+    if family in FAMILIES[1:]:
+        nonlinear += products(names[: len(measured)], inputs, ranges, settings.beyond)
+    if family in FAMILIES[2:]:
+        nonlinear += random_features(names, inputs, ranges, settings)
+    bare = replace(
+        lifting, functions=tuple(functions), inputs=tuple(inputs), input_functions=(*of_inputs, *nonlinear, CONSTANT)
+    )
+    return Channels(bare, tuple(measured), len(inputs), linear, len(nonlinear))
+
+
+def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:
+    """Return the cosine that belongs to a sine of a calibrated angle and the other way round: a bank sees the angle itself."""
+    outer = text.strip().partition("(")[0]
+    if outer in _QUADRATURE and used & set(lifting.parameters) and text.strip().endswith(")"):
+        return _QUADRATURE[outer] + text.strip()[len(outer) :]
+    return ""
+
+
+def clipped(name: str, ranges: Ranges, beyond: float) -> str:
+    """Return the formula of a quantity that is cut off beyond its range in training."""
+    low, high = ranges[name]
+    low, high = low - beyond * (high - low), high + beyond * (high - low)
+    return f"((abs({name} - {low!r}) - abs({name} - {high!r}) + {low + high!r})/2)".replace("- -", "+ ")
+
+
+def products(measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, beyond: float) -> list[str]:
+    """Return u|u|, u^2 and y u of every input and measurement."""
+    y, u = ([clipped(name, ranges, beyond) for name in names] for names in (measured, inputs))
+    return [f"{a}*abs({a})" for a in u] + [f"{a}**2" for a in u] + [f"{a}*{b}" for a in u for b in y]
+
+
+def random_features(
+    names: Sequence[str], inputs: Sequence[str], ranges: Ranges, settings: EstimatorSettings
+) -> list[str]:
+    """Return hyperbolic tangents of random combinations of measurements and inputs, of size one."""
+    rng = np.random.default_rng(settings.seed)
+    if not inputs:
+        return []
+    size = np.array([max(abs(low), abs(high)) / np.sqrt(3) for low, high in (ranges[name] for name in names)])
+    size[size == 0] = 1.0
+    weights, offsets = (
+        rng.standard_normal((settings.features, len(names))) / size,
+        rng.standard_normal(settings.features),
+    )
+    variables = [clipped(name, ranges, settings.beyond) for name in names]
+    return [
+        "tanh(" + " + ".join(f"{w!r}*{x}" for w, x in zip(row.tolist(), variables, strict=True)) + f" + {b!r})"
+        for row, b in zip(weights, offsets.tolist(), strict=True)
+    ]

@@ -1,0 +1,298 @@
+r"""Ridge regression of all states on the bank, its penalty chosen on units and episodes that are left out.
+
+Rows :math:`\xi_k` of the bank, divided by their sizes, have principal directions and singular values :math:`\sigma_i`. In whitened directions the
+penalty of the bank's own coefficients is :math:`\lambda / \sigma_i^2`. Rows with target zero say how far an entry may be wrong. Moments of units,
+conditions and parts of the episodes are summed once; leaving some out is a difference of moments. Units often follow the same references: errors are
+those of coefficients that know neither the unit nor its episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import DataError
+from ...core.linalg import qr_triangle
+from ...data import EpisodeBatch
+from ...data.population import EpisodeKey
+from .bank import Bank
+from .channels import Channels
+from .settings import EstimatorSettings
+
+Array = npt.NDArray[np.float64]
+Read = Callable[[EpisodeKey], EpisodeBatch]
+_DECADES = np.arange(-22.0, 0.5, 2.0)  # of the penalty; below, rounding decides
+_SMALLEST = 5e4 * np.finfo(float).eps  # of singular values: what is smaller is rounding
+
+
+@dataclass(frozen=True)
+class Group:
+    """Episodes whose moments are summed: a part of those of a fold of units in a condition."""
+
+    fold: int
+    condition: str
+    part: int
+
+
+@dataclass(frozen=True, eq=False)
+class Recordings:
+    """Training episodes, read one by one."""
+
+    keys: tuple[EpisodeKey, ...]
+    lengths: tuple[int, ...]
+    read: Read
+    size: Array  # (n,), sizes of the recorded states
+
+    @classmethod
+    def of(cls, keys: Sequence[EpisodeKey], read: Read) -> Recordings:
+        """Return the episodes with their lengths and the sizes of their states."""
+        batches = [read(key) for key in keys]
+        size = np.max([np.abs(b.states[: b.lengths[0]]).max(axis=(0, 1)) for b in batches], axis=0)
+        size[size == 0] = 1.0
+        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size)
+
+    @property
+    def length(self) -> float:
+        """Median length of an episode in samples."""
+        return float(np.median(self.lengths))
+
+    def some(self, count: int) -> Recordings:
+        """Return some episodes, spread over all."""
+        if len(self.keys) <= count:
+            return self
+        at = np.unique(np.linspace(0, len(self.keys) - 1, count).round().astype(int))
+        return Recordings(tuple(self.keys[i] for i in at), tuple(self.lengths[i] for i in at), self.read, self.size)
+
+    def groups(self, folds: int, parts: int) -> list[Group]:
+        """Return the group of every episode: those of one name are in one part, and a unit is in one fold."""
+        names, units = sorted({key.episode for key in self.keys}), sorted({key.unit for key in self.keys})
+        return [
+            Group(units.index(key.unit) % folds, key.condition, names.index(key.episode) % parts) for key in self.keys
+        ]
+
+
+@dataclass(frozen=True)
+class Thinning:
+    """Which samples of an episode are rows, and for how many each stands: all at the start, then every `step`-th."""
+
+    first: int
+    step: int
+    first_step: int = 1
+
+    @classmethod
+    def of(cls, lengths: Sequence[int], rows: int, first: int) -> Thinning:
+        """Return the thinning that leaves about so many rows."""
+        first = min(first, min(lengths) - 1)
+        first_step = max(1, -(-3 * len(lengths) * first // rows))
+        left = max(1, rows - len(lengths) * (first // first_step))
+        return cls(first, max(1, -(-sum(lengths) // left)), first_step)
+
+    def at(self, length: int, number: int) -> tuple[npt.NDArray[np.int64], Array]:
+        """Return the samples of episode `number`, each of which has a sample after it, and their weights."""
+        early = np.arange(number % self.first_step, self.first, self.first_step)
+        late = np.arange(self.first + number % self.step, length - 1, self.step)
+        weights = np.repeat([float(self.first_step), float(self.step)], [len(early), len(late)])
+        return np.concatenate([early, late]), weights
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """A bank of channels with the recordings that it is fitted to: the rows of the regression."""
+
+    channels: Channels
+    bank: Bank
+    recordings: Recordings
+    settings: EstimatorSettings
+
+    def rows(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
+        """Yield episode, bank rows, targets and weights of every episode; targets are states at the next sample, of measured ones their change."""
+        thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
+        measured = list(self.channels.measured)
+        for number, (key, length) in enumerate(zip(recordings.keys, recordings.lengths, strict=True)):
+            batch = recordings.read(key)
+            y = interpolated(batch.measurements(measured)[:length, 0])
+            v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
+            at, weights = thinning.at(length, number)
+            targets = batch.states[at + 1, 0] / recordings.size
+            if not self.channels.inputs_only:
+                targets[:, measured] -= y[at] / recordings.size[measured]
+            yield key, self.bank.rows(v, at), targets, weights
+
+    @cached_property
+    def groups(self) -> dict[EpisodeKey, Group]:
+        """The group of every episode."""
+        found = self.recordings.groups(self.settings.folds, self.settings.parts)
+        return dict(zip(self.recordings.keys, found, strict=True))
+
+    @cached_property
+    def sample(self) -> tuple[Array, Array]:
+        """Thinned rows of the bank with every delay, and weights that sum to one."""
+        parts = list(self.rows(self.recordings.some(150), self.settings.sample))
+        weights = np.concatenate([w for *_, w in parts])
+        return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()
+
+
+def interpolated(y: Array) -> Array:
+    """Return measurements (n_samples, q) with straight lines over those that are missing."""
+    if np.isfinite(y).all():
+        return y
+    filled = y.copy()
+    for column in filled.T:
+        there = np.isfinite(column)
+        if not there.any():
+            raise DataError("Estimator: no sample of a measurement arrives in a training episode; leave it out.")
+        column[~there] = np.interp(np.flatnonzero(~there), np.flatnonzero(there), column[there])
+    return filled
+
+
+@dataclass(frozen=True, eq=False)
+class Whitening:
+    """Principal directions of the bank."""
+
+    directions: Array  # (p, r)
+    penalty: Array  # (r,), 1 / sigma^2
+    trust: Array  # (r, r), moments of the rows that say how far entries may be wrong
+
+    @classmethod
+    def of(cls, design: Design) -> Whitening:
+        """Find the directions from thinned rows."""
+        X, weights = design.sample
+        size = design.bank.sizes(np.sqrt(weights @ (X * X)))
+        trust = np.diag(design.bank.trust(design.settings))
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
+        count = int(np.sum(sigma > _SMALLEST * sigma[0]))
+        directions = V[:count].T / sigma[:count] / size[:, None]
+        rows = trust @ (directions * size[:, None])
+        return cls(directions, sigma[:count] ** -2.0, rows.T @ rows)
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Second moments of every group in whitened directions."""
+
+    groups: tuple[Group, ...]
+    gram: Array  # (groups, r, r)
+    cross: Array  # (groups, r, n)
+    power: Array  # (groups, n)
+
+    @classmethod
+    def of(cls, design: Design, whitening: Whitening) -> Moments:
+        """Sum the rows of every group."""
+        sums: dict[Group, list[Array]] = {}
+        groups = design.groups
+        for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
+            group = groups[key]
+            F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
+            t = targets * np.sqrt(weights)[:, None]
+            parts = [F.T @ F, F.T @ t, (t * t).sum(axis=0), np.array(weights.sum())]
+            known = sums.get(group)
+            sums[group] = parts if known is None else [a + b for a, b in zip(known, parts, strict=True)]
+        gram, cross, power = (np.array([s[i] / s[3] for s in sums.values()]) for i in range(3))
+        return cls(tuple(sums), gram, cross, power)
+
+    def of_groups(self, what: str) -> npt.NDArray[Any]:
+        """Return fold, condition or part of every group."""
+        return np.array([getattr(group, what) for group in self.groups])
+
+    def errors(self, coefficients: Array, groups: npt.NDArray[np.int64]) -> Array:
+        """Return the mean squared errors of coefficients (r, n) in some groups, shape (len(groups), n)."""
+        quadratic = np.einsum("in,gin->gn", coefficients, self.gram[groups] @ coefficients)
+        found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
+        return np.maximum(found, 1e-30)
+
+    def solved(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
+        """Yield ridge coefficients (r, n) of groups with weights, for every penalty."""
+        from scipy.linalg import cho_factor, cho_solve
+
+        weights = weights / weights.sum()
+        gram = np.tensordot(weights, self.gram, 1) + whitening.trust
+        cross = np.tensordot(weights, self.cross, 1)
+        for penalty in penalties:
+            A = gram + np.diag(penalty * whitening.penalty)
+            q = 1 / np.sqrt(np.diag(A))
+            yield q[:, None] * cho_solve(cho_factor(A * q[:, None] * q, check_finite=False), q[:, None] * cross)
+
+    def known(self, group: Group) -> npt.NDArray[np.bool_]:
+        """Return which groups know neither the units nor the episodes of one; of one fold or one part there is no other."""
+        folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
+        for known in (folds & parts, folds, parts):
+            if known.any():
+                return known
+        return np.ones(len(folds), dtype=bool)
+
+    def without(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
+        """Return the coefficients that do not know a group, for every group and penalty."""
+        found: dict[tuple[int, int], list[Array]] = {}
+        for group in self.groups:
+            if (group.fold, group.part) not in found:
+                rest = np.where(self.known(group), weights, 0.0)
+                found[group.fold, group.part] = list(self.solved(whitening, rest, penalties))
+        return {group: found[group.fold, group.part] for group in self.groups}
+
+
+@dataclass(frozen=True, eq=False)
+class Readout:
+    """Coefficients of all states on a bank, in the channels' units, with errors of coefficients that know neither unit nor episodes."""
+
+    design: Design
+    coefficients: Array  # (p, n)
+    left_out: Array  # (groups, n), mean squared errors over the squared sizes
+    trained: Array  # (groups, n), of the coefficients that are returned
+    penalties: Array  # (n,)
+    folds: npt.NDArray[np.int64]  # (groups,)
+    others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
+
+    @classmethod
+    def of(cls, design: Design) -> Readout:
+        """Fit all states: conditions count inversely to their errors, and the penalty of a state is best on what is left out."""
+        whitening = Whitening.of(design)
+        moments = Moments.of(design, whitening)
+        weights, penalties = condition_weights(moments, whitening), 10.0**_DECADES
+        others = moments.without(whitening, weights, penalties)
+        errors = np.array(
+            [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
+        )
+        best = np.argmin(np.log(errors).mean(axis=0), axis=0)
+        n = np.arange(errors.shape[2])
+        coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
+        return cls(
+            design,
+            whitening.directions @ coefficients * design.recordings.size,
+            errors[:, best, n],
+            moments.errors(coefficients, np.arange(len(weights))),
+            penalties[best],
+            moments.of_groups("fold"),
+            {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
+        )
+
+    def by_fold(self, states: Sequence[int]) -> Array:
+        """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
+        log = np.log(self.left_out[:, list(states)]).mean(axis=1)
+        return np.array([log[self.folds == fold].mean() for fold in np.unique(self.folds)])
+
+    def unit_errors(self) -> dict[tuple[str, str], Array]:
+        """Return the left-out mean squared errors (n,) over the squared sizes of every unit and condition."""
+        sums: dict[tuple[str, str], list[Any]] = {}
+        for key, rows, targets, weights in self.design.rows(self.design.recordings, self.design.settings.rows):
+            missed = targets - rows @ self.others[self.design.groups[key]]
+            own = sums.setdefault((key.unit, key.condition), [0.0, 0.0])
+            own[0], own[1] = own[0] + weights @ missed**2, own[1] + weights.sum()
+        return {name: total / weight for name, (total, weight) in sums.items()}
+
+
+def condition_weights(moments: Moments, whitening: Whitening) -> Array:
+    """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
+    conditions = moments.of_groups("condition")
+    weights = np.ones(len(conditions))
+    if len(set(conditions)) == 1:
+        return weights
+    (first,) = moments.solved(whitening, weights, [1e-12])
+    errors = np.exp(np.log(moments.errors(first, np.arange(len(weights)))).mean(axis=1))
+    for condition in set(conditions):
+        weights[conditions == condition] = 1 / errors[conditions == condition].mean()
+    return weights

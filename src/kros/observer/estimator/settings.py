@@ -1,0 +1,92 @@
+"""Every number of the estimator."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydantic import Field
+
+from ...core.settings import Settings
+
+
+class EstimatorSettings(Settings):
+    """The filter-bank estimator. Lengths are in samples or in shares of the median training episode.
+
+    Examples
+    --------
+    >>> from kros.observer import EstimatorSettings
+    >>> EstimatorSettings(dense=2, longest=8).blocks(6000), EstimatorSettings(first_lag=500.0).lags(6000)
+    ((0, 1, 2, 4, 6, 8), (300.0, 600.0, 1200.0, 2400.0))
+    """
+
+    dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
+    longest: int = Field(
+        100, ge=1, description="longest delay, in samples; a short episode allows a quarter of its length"
+    )
+    growth: float = Field(1.3, gt=1, description="ratio of the widths of blocks of delays beyond the dense ones")
+    first_lag: float = Field(16.0, gt=0, description="shortest time constant of the first-order lags, in samples")
+    lag_ratio: float = Field(2.0, gt=1, description="ratio of successive time constants")
+    last_lag: float = Field(0.4, gt=0, description="longest time constant, as a share of the median training episode")
+    start: tuple[float, ...] = Field((2.0, 8.0, 32.0), description="further time constants of the start, in samples")
+    features: int = Field(32, ge=0, description="random features of the richest family of channels")
+    margin: float = Field(
+        1.0, ge=0, description="standard errors over left-out units by which a richer family has to be better"
+    )
+    beyond: float = Field(
+        0.25,
+        ge=0,
+        description="share of the training span that nonlinear channels may go beyond it; they are cut off there",
+    )
+    rows: int = Field(100_000, ge=1000, description="rows of the regression; more are thinned evenly")
+    sample: int = Field(12_000, ge=1000, description="rows from which principal directions and covariances are found")
+    parts: int = Field(3, ge=1, description="parts of the episodes, of which the one that is judged on is left out")
+    folds: int = Field(6, ge=2, description="folds of units that are left out in turn, at most")
+    directions: int = Field(
+        400, ge=10, description="principal directions of the bank that the regression sees, at most"
+    )
+    linear_trust: float = Field(1e-6, ge=0, description="relative error of a linear start value: rows with target zero")
+    nonlinear_trust: float = Field(
+        1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
+    )
+    start_trust: float = Field(
+        1e-2, ge=0, description="relative error of a nonlinear start value: rows with target zero"
+    )
+    order: int | None = Field(
+        None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
+    )
+    loss: float = Field(0.01, gt=0, lt=1, description="share by which reduction may increase an error")
+    measured_loss: float = Field(
+        10.0,
+        ge=1,
+        description="how many times less an error of a measured state counts in the reduction than one of a hidden state",
+    )
+    memory_share: float = Field(
+        0.25,
+        gt=0,
+        description="time constant of the level of losses, as a share of the longest delay; the level decides how far the fallback counts",
+    )
+    gap_samples: int = Field(
+        2000, ge=100, description="samples of an episode on which losses are simulated in training"
+    )
+    gap_episodes: int = Field(12, ge=1, description="episodes on which losses are simulated")
+    gap_rounds: int = Field(2, ge=1, description="rounds in which the shares of the fallback are fitted")
+    seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
+
+    def lags(self, length: float) -> tuple[float, ...]:
+        """Return the time constants of the lags in samples, for a median episode of so many samples."""
+        last = self.last_lag * length
+        count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - 1e-9)))
+        return tuple(last / self.lag_ratio**i for i in range(count, -1, -1))
+
+    def blocks(self, length: float) -> tuple[int, ...]:
+        """Return where blocks of delays begin, and the end of the last one, in samples."""
+        longest = max(2, min(self.longest, int(length // 4)))
+        edges = list(range(min(self.dense, longest) + 1))
+        width = 1.0
+        while edges[-1] < longest:
+            width *= self.growth
+            edges.append(min(longest, edges[-1] + int(np.ceil(width))))
+        return tuple(edges)
+
+    def memory(self, longest: int) -> float:
+        """Return the pole of the level of losses, for a longest delay in samples."""
+        return float(np.exp(-1 / max(1.0, self.memory_share * longest)))

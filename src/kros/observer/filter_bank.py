@@ -1,0 +1,151 @@
+r"""What makes an observer a filter bank: how it starts, and what stands for measurements that are missing.
+
+A filter bank feeds nothing back that it estimates. Behind the recorded states x its internal states are the filters z of measurements and inputs, and
+the filters w of inputs alone with their own estimate :math:`x^u` of all recorded states. While measurements arrive, the estimate is that of z. The
+fallback
+
+.. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
+
+continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. It stands for measurements that are missing. When one
+returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is corrected by
+:math:`r (y - f) / (g + 1)` after g samples. With the level :math:`m_{k+1} = \lambda m_k + (1 - \lambda) [\text{missing}]` the estimate changes over
+from z to the fallback by shares :math:`\beta(m)` that training chose. All of this is stable for any pattern of losses: every recursion is a
+contraction driven by bounded signals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, DimensionError
+
+Array = npt.NDArray[np.float64]
+_ARRAYS = ("start", "forget", "levels", "shares")
+
+
+@dataclass(frozen=True, eq=False)
+class FilterBank:
+    """Start and gaps of an observer that is a filter bank.
+
+    Parameters
+    ----------
+    filters : int
+        Number of filters z, the first internal states; those of inputs alone follow, and the estimates of these, one for every recorded state.
+    start : ndarray, shape (n_states, n_lifted + inputs)
+        First estimate from the lifted first sample: ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, states that are not measured taken as zero.
+    forget : ndarray, shape (n,)
+        rho of every recorded state, between zero and one.
+    memory : float
+        lambda, between zero and one.
+    levels : ndarray, shape (k,)
+        Levels m, increasing from zero to one.
+    shares : ndarray, shape (k, n)
+        beta at these levels, between zero and one; on straight lines between them.
+
+    Raises
+    ------
+    DataError
+        When a number is not finite or outside its range.
+    """
+
+    filters: int
+    start: Array
+    forget: Array
+    memory: float
+    levels: Array
+    shares: Array
+
+    def __post_init__(self) -> None:
+        for name in _ARRAYS:
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        shares = [self.forget, self.shares, self.levels, np.array(self.memory)]
+        if not np.isfinite(self.start).all() or not all(((v >= 0) & (v <= 1)).all() for v in shares):
+            raise DataError(
+                f"Filter bank: the start should be finite, and forget {self.forget}, memory {self.memory}, levels and shares between 0 and 1."
+            )
+        if not (len(self.levels) == len(self.shares) and (np.diff(self.levels) > 0).all()):
+            raise DataError(f"Filter bank: levels {self.levels} should increase, with shares for each.")
+
+    def require_fit(self, name: str, recorded: int, n: int, columns: int) -> None:
+        """Refuse arrays of another size than the observer's."""
+        sizes = (self.start.shape, self.forget.shape, self.shares.shape[1:])
+        if sizes != ((n, columns), (recorded,), (recorded,)) or not 0 <= self.filters <= n - 2 * recorded:
+            raise DimensionError(
+                f"Observer {name}: its filter bank should have a start {(n, columns)} and {recorded} values of forget and shares, found {sizes}, and "
+                f"at most {n - 2 * recorded} filters, found {self.filters}."
+            )
+
+    def share(self, level: Array) -> Array:
+        """Return beta, shape (..., n), at levels."""
+        at = np.clip(np.searchsorted(self.levels, level, side="right") - 1, 0, len(self.levels) - 2)
+        part = (level - self.levels[at]) / (self.levels[at + 1] - self.levels[at])
+        return np.asarray(self.shares[at] + part[..., None] * (self.shares[at + 1] - self.shares[at]))
+
+    def times(self, x: Array, columns: Array) -> FilterBank:
+        """Return the bank in other units of measure, by the factors of all states and of the columns of `start`."""
+        return replace(self, start=self.start * x[:, None] / columns)
+
+    def turned(self, turn: Array) -> FilterBank:
+        """Return the bank for states ``turn @ x``, shape (n, n), which leaves recorded states and fallback alone."""
+        return replace(self, start=turn @ self.start)
+
+    def content(self) -> dict[str, Any]:
+        """Return what an observer's file holds of it."""
+        return {name: getattr(self, name).tolist() for name in _ARRAYS} | {
+            "filters": self.filters,
+            "memory": self.memory,
+        }
+
+    @classmethod
+    def from_content(cls, content: Mapping[str, Any]) -> FilterBank:
+        """Read what `content` returned."""
+        return cls(**content)
+
+
+class Gaps:
+    """State of the gaps of filter banks over a batch of machines."""
+
+    def __init__(self, bank: FilterBank, A: Array, measured: tuple[int, ...], recorded: int, batch: int) -> None:
+        n, q, first = len(A), len(measured), recorded
+        self.bank, self.measured, self.recorded = bank, list(measured), recorded
+        self.filters = slice(first, first + bank.filters)
+        self.fallback = slice(n - recorded, n)
+        self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
+        self.offset, self.level = np.zeros((batch, recorded)), np.zeros(batch)
+        self.filtered = self.expected = np.zeros((batch, recorded))  # by filters and by the fallback, after a step
+        self.ramp, self.count = np.zeros((batch, bank.filters, q)), np.zeros((batch, q))
+
+    def begin(self, rows: Any) -> None:
+        """Start some machines: nothing is missing."""
+        for values in (self.offset, self.level, self.ramp, self.count):
+            values[rows] = 0.0
+
+    def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> Array:
+        """Put measurements (batch, q) and what stands for missing ones into states (batch, n), bridge gaps that end; return the states before."""
+        expected = (x[:, self.fallback] + self.offset)[:, self.measured]
+        ends = ~missing & (self.count > 0)
+        if ends.any():
+            jump = np.where(ends, (np.where(missing, 0.0, y) - expected) / (self.count + 1), 0.0)
+            x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
+        x[:, self.measured] = np.where(missing, expected, y)
+        return expected
+
+    def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
+        """Change over to the fallback in the next states (batch, n), and move levels, ramps and offsets on; x as `fill` left it."""
+        bank, some = self.bank, missing.any(axis=1)
+        offset = bank.forget * (x[:, : self.recorded] - x[:, self.fallback])
+        level = bank.memory * self.level + (1 - bank.memory) * some
+        count = np.where(missing, self.count + 1, 0.0)
+        share = bank.share(level)
+        fallback = following[:, self.fallback] + offset
+        self.filtered, self.expected = following[:, : self.recorded].copy(), fallback
+        following[:, : self.recorded] += share * (fallback - following[:, : self.recorded])
+        if some.any() or self.count.any():
+            ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
+            self.ramp[moving] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)[moving]
+        self.offset[moving], self.level[moving], self.count[moving] = offset[moving], level[moving], count[moving]

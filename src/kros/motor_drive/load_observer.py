@@ -19,7 +19,7 @@ def load_observer(
     calibration : LoadCalibration
     inputs : sequence of str
     settings : EstimatorSettings, optional
-        By default with one lag, as slow as the level of a load is forgotten.
+        By default with lags up to the time after which the level of a load is forgotten.
 
     Returns
     -------
@@ -42,8 +42,8 @@ def load_observer(
     batch = calibration.batch
     place = {key: i for i, key in enumerate(batch.keys)}
     recordings = Recordings.of(batch.keys, lambda key: batch.take([place[key]]).head(int(batch.lengths[place[key]])))
-    slow = recordings.length * batch.sample_period_s / calibration.level_s
-    settings = settings or EstimatorSettings(slow=(slow,))
+    longest = calibration.level_s / batch.sample_period_s / recordings.length
+    settings = settings or EstimatorSettings(last_lag=longest)
     found = identify_estimator(
         name, calibration.lifting, calibration.measured, inputs, recordings, batch.sample_period_s, None, settings
     )

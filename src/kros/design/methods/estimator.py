@@ -29,10 +29,10 @@ def design_estimator(task: DesignTask) -> DesignResult:
         nominal,
         task.estimator,
     )
-    limits = sides(task.limits, found.observer.lifting.states) if task.limits else (None, None)
+    lower, upper = sides(task.limits, found.observer.lifting.states) if task.limits else (None, None)
     observer = replace(
         found.observer,
-        runtime=Runtime(0, *limits, relift=False),
+        runtime=Runtime(0, lower, upper, relift=False),
         seen=training.seen,
         sensor=task.sensor,
     )

@@ -164,7 +164,7 @@ def c_files(
         else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
     )
     bank = context["bank"]
-    begins = 0 if bank is None else sum(map(len, bank["start"])) + 2 * observer.bank.shares.size
+    begins = 0 if bank is None else sum(map(len, bank["start"])) + 2 * sum(map(len, bank["shares"]))
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = (
         None

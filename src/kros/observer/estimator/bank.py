@@ -2,7 +2,7 @@ r"""The bank: delays and first-order lags of channels, and the decaying values o
 
 For a channel v the bank holds
 
-.. math:: v_k, \quad m_i - m_{i+1}, \quad m_i = \operatorname{mean}(v_{k-t_i}, \dots, v_{k-t_{i+1}+1}), \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
+.. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
 with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first sample everything is taken to equal it.
 As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
@@ -11,6 +11,7 @@ As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -62,7 +63,7 @@ class Bank:
         before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
         sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
         ends = at + self.taps[-1] + 1
-        means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in zip(self.taps, self.taps[1:], strict=False)]
+        means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in pairwise(self.taps)]
         parts = [moving[at], *(one - other for one, other in zip(means, means[1:], strict=False))]
         for tau in self.lags:
             a = np.exp(-1 / tau)
@@ -98,7 +99,7 @@ class Bank:
         """Return coefficients (p, n) of this bank as those of `fine`."""
         moving, blocks, last = self.channels - 1, len(self.taps) - 1, self.taps[-1]
         means = np.zeros((blocks, last))
-        for i, (a, b) in enumerate(zip(self.taps, self.taps[1:], strict=False)):
+        for i, (a, b) in enumerate(pairwise(self.taps)):
             means[i, a:b] = 1 / (b - a)
         steps = (means[:-1] - means[1:]) @ -np.tril(np.ones((last, last - 1)), -1)  # v_{k-j} = v_k - sum of steps
         count = (blocks - 1) * self.delayed

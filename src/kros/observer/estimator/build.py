@@ -88,9 +88,6 @@ def identify_estimator(
     first = first_estimate(channels, recordings)
     observer = assembled(name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {})
     forget = forgetting(observer, recordings, settings)
-    observer = replace(
-        observer, bank=replace(observer.bank, forget=forget, memory=settings.memory(readout.design.bank.taps[-1]))
-    )
     observer = replace(observer, bank=shares_of(observer, recordings, settings))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
@@ -223,14 +220,23 @@ def assembled(
     places = [c if c < n else c + total - n for c in channels.columns]
     blind = [c + total - n for c in channels.without_measurements().columns]
     z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
+    x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
-    model[np.ix_(range(n), z)], model[np.ix_(range(n), places)] = filters.C, filters.D
-    model[np.ix_(z, z)], model[np.ix_(z, places)] = filters.A, filters.B
-    model[np.ix_(w, w)], model[np.ix_(w, blind)] = fallback.A, fallback.B
-    model[np.ix_(u, w)], model[np.ix_(u, blind)] = fallback.C, fallback.D
-    model[list(channels.measured), list(channels.measured)] += 1.0
-    start[np.ix_(range(n), places)], start[np.ix_(z, places)] = first[0], filters.S
-    start[np.ix_(w, blind)], start[np.ix_(u, blind)] = fallback.S, first[1]
+    for rows, states, inputs_of, system in (
+        (x, z, places, (filters.C, filters.D)),
+        (z, z, places, (filters.A, filters.B)),
+        (w, w, blind, (fallback.A, fallback.B)),
+        (u, w, blind, (fallback.C, fallback.D)),
+    ):
+        model[rows[:, None], states], model[rows[:, None], np.array(inputs_of)] = system
+    for rows, inputs_of, first_of in (
+        (x, places, first[0]),
+        (z, places, filters.S),
+        (w, blind, fallback.S),
+        (u, blind, first[1]),
+    ):
+        start[rows[:, None], np.array(inputs_of)] = first_of
+    model[at, at] += 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     bank = FilterBank(r, start, np.ones(n), 0.0, np.array([0.0, 1.0]), np.zeros((2, n)))

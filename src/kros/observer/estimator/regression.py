@@ -252,7 +252,7 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, and the penalty of a state is best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
-        weights, penalties = condition_weights(moments, whitening), 10.0**_DECADES
+        weights, penalties = condition_weights(moments, whitening), (10.0**_DECADES).tolist()
         others = moments.without(whitening, weights, penalties)
         errors = np.array(
             [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
@@ -265,7 +265,7 @@ class Readout:
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
             moments.errors(coefficients, np.arange(len(weights))),
-            penalties[best],
+            np.array(penalties)[best],
             moments.of_groups("fold"),
             {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
         )

@@ -13,17 +13,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLOTS = {
-    "Population": "recordings.signals:population_figure",
-    "IdentifiedModels": "models.bode:identified_figure",
-    "UncertainModels": "uncertainty.uncertain_model:sets_figure",
-    "Design": "observers.estimate:design_figure",
+    "Population": "recordings:population_figure",
+    "IdentifiedModels": "models:identified_figure",
+    "UncertainModels": "uncertainty:sets_figure",
+    "Design": "synthesis:design_figure",
     "RunResult": "run:run_figure",
-    "PhaseCalibration": "recordings.phase:phase_figure",
-    "ModelSet": "models.bode:bode_figure",
-    "UncertainModel": "uncertainty.uncertain_model:uncertain_figure",
-    "OutlierModel": "outliers.scores:scores_figure",
-    "Synthesis": "synthesis.correction:synthesis_figure",
-    "Observer": "synthesis.correction:observer_figure",
+    "PhaseCalibration": "recordings:phase_figure",
+    "ModelSet": "models:bode_figure",
+    "UncertainModel": "uncertainty:uncertain_figure",
+    "OutlierModel": "outliers:scores_figure",
+    "Synthesis": "synthesis:synthesis_figure",
+    "Observer": "synthesis:observer_figure",
 }
 """Name of a result's class -> file of a figure and the function in it that draws the result. Its further parameters are the options of `plot`."""
 
@@ -59,7 +59,7 @@ def plot(result: Any, **options: Any) -> Figure:
     >>> from kros.synthesis import Status, Synthesis
     >>> figure = plot(Synthesis("h2", gain([[0.5]], 0.01), Status.OPTIMAL, h2_norm=1.2))
     >>> len(figure.axes)
-    2
+    3
     """
     name = next(
         (t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None
@@ -77,5 +77,5 @@ def plot(result: Any, **options: Any) -> Figure:
             f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}."
         )
     with style():
-        figure: Figure = draw({"": result} if name == "OutlierModel" else result, **options)
+        figure: Figure = draw(result, **options)
     return figure

@@ -44,16 +44,7 @@ class Tone(Enum):
         return f"--{self.name.lower()}"
 
 
-HUES = (
-    Tone.BLUE,
-    Tone.ORANGE,
-    Tone.GREEN,
-    Tone.PURPLE,
-    Tone.GOLD,
-    Tone.SKY,
-    Tone.GREY,
-    Tone.INK,
-)  # of lines that stand side by side
+HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -70,8 +61,6 @@ _SETTINGS: dict[str, Any] = {
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-3, 4),
     "axes.facecolor": "none",
     "grid.color": Tone.GRID.light,
     "grid.linewidth": 0.6,

@@ -21,7 +21,7 @@ class Run(Protocol):
 
 
 def run_figure(run: Run, name: str = "observers_in_time") -> Figure:
-    """Draw one figure of a run's report, by default the estimates of the deployed observer."""
+    """Draw one figure of a run, by default the estimates of the deployed observer."""
     if name not in FIGURES:
         raise ConfigError(f"Plot of a run: there is no figure {name!r}; choose one of {', '.join(FIGURES)}.")
     drawn = draw(name, RunFolder(run.folder))

@@ -1,150 +1,84 @@
-"""Every unit: its errors, score, residual and phase in a table."""
+"""Every unit: errors of the deployed observer, outlier scores and phase."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
+from ..content import Column, Section, build
+from ..names import condition_label, in_condition, number, observer_label, words
+from ..verdict import measured_of
 
-from ...core.artifacts import load_artifact
-from ..content import Cell, Cells, Section, Table
-from ..names import axis_label, channel_units, condition_label, in_condition, number, observer_label
-from ..run_folder import RunFolder
-from .outliers import some_of, undecided_text
-
-Row = Mapping[str, Any]
-_ROWS = 400  # units that all get a row; more would make the page too large
-_FAR = 20  # largest of every column that get a row where not all do
-_SHARES = {"5 %": 0.05, "median": 0.5, "95 %": 0.95}
+Facts = Mapping[str, Any]
+_MOST = 400  # rows of the table; metrics.json has all units
 
 
-@dataclass
-class _Known:
-    """What the metrics and the run know of one unit, part by part."""
-
-    own: Row = field(default_factory=dict)
-    errors: list[Row] = field(default_factory=list)
-    scores: list[Row] = field(default_factory=list)
-    bound: Row = field(default_factory=dict)
-
-
-def section(run: RunFolder, metrics: Row) -> Section | None:
-    """Return the table of units; None where no unit is known."""
+def units(metrics: Facts) -> Section | None:
+    """Return the table of units, flagged ones first; None where no unit is known."""
     if not metrics.get("units"):
         return None
-    found, name = _known(run, metrics), metrics["study"].get("deployed")
-    hidden = [
-        c
-        for c in dict.fromkeys(r["channel"] for known in found.values() for r in known.errors)
-        if c not in run.measured_states
-    ]
-    flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
-    named = some_of(flagged)
-    text = f"Errors are those of “{observer_label(name)}”. " if name else ""
-    text += f"Flagged as not belonging to the batch: {named}." if flagged else "No unit is flagged."
-    shown, tables = found, list[Table]()
-    if len(found) > _ROWS:
-        columns = _columns(metrics, found, hidden)
-        shown, tables = _extremes(found, columns), [_quantiles(columns, len(found))]
-    cut = (
-        "Every unit"
-        if shown is found
-        else f"{len(shown)} of {len(found)} units, those flagged and the {_FAR} largest of every column; metrics.json has all"
+    study, home = metrics["study"], metrics["study"]["identify_on"]
+    name = study.get("deployed")
+    errors = {
+        (r["unit"], r["channel"]): r
+        for r in metrics.get("evaluation", [])
+        if r["observer"] == name and r["condition"] == home and r["channel"] not in measured_of(metrics)
+    }
+    scores = {(r["unit"], r["condition"]): r for r in metrics.get("outliers", [])}
+    flagged = {unit for (unit, _), row in scores.items() if row["outlier"]}
+    largest = dict.fromkeys((row["unit"] for row in metrics["units"]), 0.0)
+    for (unit, _), row in errors.items():
+        largest[unit] = max(largest.get(unit, 0.0), math.inf if row["error_percent"] is None else row["error_percent"])
+    many = len(largest) > _MOST
+    rows = sorted(metrics["units"], key=lambda r: (r["unit"] not in flagged, -largest[r["unit"]] * many, r["unit"]))
+    names = [row["unit"] for row in rows[:_MOST]]
+    columns = [Column("unit", names), Column("status", [_status(r, flagged, scores) for r in rows[:_MOST]])]
+    for channel in dict.fromkeys(c for _, c in errors):
+        own = [errors.get((unit, channel), {}) for unit in names]
+        group = f"error of {words(channel)}"
+        columns.append(Column("%", [r.get("error_percent") for r in own], group))
+        columns.append(Column("against the true signal (%)", [r.get("true_error_percent") for r in own], group))
+    for condition in dict.fromkeys(c for _, c in scores):
+        own = [scores.get((unit, condition), {}).get("score") for unit in names]
+        columns.append(Column(f"{condition_label(condition)} (dB)", own, "outlier score"))
+    limits = [[r["detectable"] for (u, _), r in scores.items() if u == unit and r.get("detectable")] for unit in names]
+    columns.append(Column("detectable change of gain (%)", [max(own, default=None) for own in limits], "outlier score"))
+    phases = [row.get("phase_rad") for row in rows[:_MOST]]
+    columns.append(Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]))
+    cut = "Every unit" if len(rows) <= _MOST else f"{_MOST} of {len(rows)} units, flagged ones and largest errors first"
+    table = build(f"{cut}{in_condition(home)}; errors in percent of the largest value", columns, sortable=True)
+    text = [f"Errors are those of “{observer_label(name)}”."] if name else []
+    figure = "outlier_scores" if scores else ""
+    return Section("units", "Units", [*text, *_scores(metrics)], tables=[table], figure=figure)
+
+
+def _status(row: Facts, flagged: set[str], scores: Mapping[tuple[str, str], Facts]) -> str:
+    """Return one word a unit."""
+    if row["unit"] in flagged:
+        return "flagged"
+    own = [r.get("status") for (unit, _), r in scores.items() if unit == row["unit"]]
+    silent = bool(own) and all(status in ("not enough data", "cannot tell") for status in own)
+    return "undecided" if silent and row.get("status", "ok") == "ok" else str(row.get("status", "ok"))
+
+
+def _scores(metrics: Facts) -> list[str]:
+    """Say how units are scored, and where flagged ones differ."""
+    rows = metrics.get("outliers", [])
+    if not rows:
+        return []
+    text = (
+        "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. "
+        "A unit above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
     )
-    tables.append(_table(run, metrics, shown, hidden, cut))
-    return Section("units", "Units", [text, *undecided_text(metrics.get("outliers", []))], tables)
+    return [text, *(_flagged(r) for r in rows[:_MOST] if r["outlier"])]
 
 
-def _columns(metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str]) -> dict[str, dict[str, float]]:
-    """Return numbers of units by what they are and unit, where they are known."""
-    home = metrics["study"]["identify_on"]
-    columns: dict[str, dict[str, float]] = {f"error of {c.replace('_', ' ')} (%)": {} for c in hidden}
-    for unit, known in found.items():
-        for row in known.errors:
-            if row["channel"] in hidden and row["condition"] == home:
-                columns[f"error of {row['channel'].replace('_', ' ')} (%)"][unit] = (
-                    math.inf if row["error_percent"] is None else row["error_percent"]
-                )
-        for row in known.scores:
-            if row["score"] is not None:
-                columns.setdefault(f"outlier score, {condition_label(row['condition'])} (dB)", {})[unit] = row["score"]
-        if known.bound.get("residual") is not None:
-            columns.setdefault("residual", {})[unit] = known.bound["residual"]
-    return {title: values for title, values in columns.items() if values}
-
-
-def _extremes(found: Mapping[str, _Known], columns: Mapping[str, Mapping[str, float]]) -> dict[str, _Known]:
-    """Return the units that are flagged, and those that are the largest in some column."""
-    flagged = [unit for unit, known in found.items() if any(r["outlier"] for r in known.scores)]
-    largest = [unit for values in columns.values() for unit in sorted(values, key=lambda u: -values[u])[:_FAR]]
-    return {unit: found[unit] for unit in list(dict.fromkeys(flagged + largest))[:_ROWS]}
-
-
-def _quantiles(columns: Mapping[str, Mapping[str, float]], units: int) -> Table:
-    """Return how numbers of units are spread, with the unit that is at the upper end."""
-    rows: list[Cells] = []
-    for title, values in columns.items():
-        numbers, last = np.array(list(values.values())), max(values, key=lambda u: values[u])
-        inner = [number(float(np.quantile(numbers, share, method="nearest"))) for share in _SHARES.values()]
-        rows.append(
-            [title, str(len(numbers)), number(float(numbers.min())), *inner, number(float(numbers.max())), last]
-        )
-    return Table(["", "units", "smallest", *_SHARES, "largest", "which is"], rows, f"How {units} units are spread")
-
-
-def _known(run: RunFolder, metrics: Row) -> dict[str, _Known]:
-    """Collect what is known of every unit, those that are flagged first, then by name."""
-    name = metrics["study"].get("deployed")
-    found = {row["unit"]: _Known(row) for row in metrics["units"]}
-    for row in metrics.get("evaluation", []):
-        if row["observer"] == name and row["unit"] in found:
-            found[row["unit"]].errors.append(row)
-    for row in metrics.get("outliers", []):
-        if row["unit"] in found:
-            found[row["unit"]].scores.append(row)
-    if run.has("observers/relift.json"):
-        for row in load_artifact(run.folder / "observers", "relift")[0]["rows"].get(name, []):
-            if row["unit"] in found:
-                found[row["unit"]].bound = row
-    return dict(sorted(found.items(), key=lambda item: (not any(r["outlier"] for r in item[1].scores), item[0])))
-
-
-def _table(run: RunFolder, metrics: Row, found: Mapping[str, _Known], hidden: Sequence[str], cut: str) -> Table:
-    home, units = metrics["study"]["identify_on"], channel_units(metrics)
-    conditions = list(dict.fromkeys(r["condition"] for r in metrics.get("outliers", [])))
-    rows: list[Cells] = []
-    for unit, known in found.items():
-        status = "flagged" if any(r["outlier"] for r in known.scores) else known.own.get("status", "ok")
-        row: list[Cell | str] = [unit, Cell(status, strong=status != "ok")]
-        errors = {r["channel"]: r for r in known.errors if r["condition"] == home}
-        for channel in hidden:
-            own = errors.get(channel, {})
-            row += [_cell(own.get("rms")), _cell(own.get("error_percent"))]
-        scores = {r["condition"]: r for r in known.scores}
-        row += [
-            _cell(scores.get(c, {}).get("score"), strong=bool(scores.get(c, {}).get("outlier"))) for c in conditions
-        ]
-        row += [_cell(known.bound.get("residual"))] if any(k.bound for k in found.values()) else []
-        row += [_cell(_degrees(known.own.get("phase_rad")))] if run.calibrated else []
-        rows.append(row)
-    head = ["unit", "status", *(t for c in hidden for t in (axis_label("RMS", units.get(c, "")), "%"))]
-    head += [f"{condition_label(c)} (dB)" for c in conditions]
-    groups = [
-        ("", 2),
-        *((f"error of {c.replace('_', ' ')}", 2) for c in hidden),
-        *([("outlier score", len(conditions))] if conditions else []),
-    ]
-    last = [*(["residual"] if any(k.bound for k in found.values()) else []), *(["phase (°)"] if run.calibrated else [])]
-    caption = f"{cut}{in_condition(home)}; % of the largest value, the residual relative to the population's"
-    return Table([*head, *last], rows, caption, [*groups, *([("", len(last))] if last else [])], sortable=True)
-
-
-def _cell(value: float | None, strong: bool = False) -> Cell:
-    return Cell(number(value), strong=strong, value=value)
-
-
-def _degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else math.degrees(angle_rad)
+def _flagged(row: Facts) -> str:
+    """Say where and how clearly a flagged unit differs."""
+    text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
+    if row.get("freq_hz") is not None:
+        text += f", most at {number(row['freq_hz'])} Hz"
+    if row.get("lowest_db") is not None:
+        text += f"; {number(row['lowest_db'])} to {number(row['highest_db'])} dB over the choices of the nominal unit"
+    return f"{text}."

@@ -1,0 +1,164 @@
+"""Figures of correction filters: beside plant and weights, and one filter with what is certified about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import cycle
+
+import numpy as np
+
+from ...core.lti import StateSpace
+from ...design import Design
+from ...identify import ModelSet
+from ...identify.identified import IdentifiedModels
+from ...observer import Observer
+from ...synthesis.result import Injection, Synthesis
+from ..canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, legend, note, zero_line
+from ..names import (
+    BASELINES,
+    best_models,
+    method_label,
+    method_look,
+    model_label,
+    number,
+    observer_label,
+    shorten,
+    split_observer,
+)
+from ..run_folder import NotShownError, RunFolder
+from ..theme import HUES, Tone
+from .entries import short
+from .episodes import estimate_figure
+
+_WITHOUT = (*BASELINES, "memory", "estimator")  # no correction of a model by design
+_FREQUENCIES, _DECADES = 260, 5
+_LONGEST = 32  # characters of a fact
+
+Curve = tuple[str, np.ndarray, str, str]
+
+
+def bode(run: RunFolder) -> tuple[Figure, str]:
+    """Draw plant, weights and filters, linear beside Koopman (the paper's Figure 10)."""
+    robust = {n: s for n, s in run.syntheses.items() if split_observer(n)[1] not in _WITHOUT}
+    chosen = [m for m in best_models(run.models) if any(n.startswith(f"{m}/") for n in robust)]
+    if not chosen:
+        raise NotShownError("no robust observer has been synthesized")
+    figure, axes = grid(1, len(chosen), 3.1, sharey=True)
+    ends = [
+        _panel(panel, _curves(run, m, {n: s for n, s in robust.items() if n.startswith(f"{m}/")}), run.models[m])
+        for panel, m in zip(axes[0], chosen, strict=True)
+    ]
+    for panel, labels, name in zip(axes[0], ends, chosen, strict=True):
+        end_labels(panel, labels)
+        panel.set_title(model_label(name))
+    axes[0, 0].set_ylabel("largest singular value (dB)")
+    return figure, "Every signal over its largest value. K maps the innovation to the correction."
+
+
+def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> list[Curve]:
+    """Return responses with their label, colour and style."""
+    models = run.models[name]
+    freqs = models.frequencies(_FREQUENCIES, decades=_DECADES)
+    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.INK.light, "-")]
+    if name in run.uncertain:
+        weight = run.uncertain[name].weight
+        curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD.light, "-"))
+        curves.append(("W right", weight.right.frequency_response(freqs), Tone.GREEN.light, "--"))
+    for observer, synthesis in syntheses.items():
+        response, look = scaled_filter(synthesis, models).frequency_response(freqs), method_look(observer)
+        curves.append((f"K {method_label(observer)}", response, look.colour, look.style))
+    return curves
+
+
+def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> list[tuple[float, str, str]]:
+    """Draw largest singular values; return the labels at the ends of the lines, and of filters that are zero none."""
+    freqs, ends = models.frequencies(_FREQUENCIES, decades=_DECADES), []
+    for label, response, colour, line in curves:
+        size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
+        if np.isfinite(size).any():
+            axes.plot(freqs, size, line, color=colour, lw=1.4)
+            ends.append((float(size[-1]), label, colour))
+    zero_line(axes)
+    frequency_axis(axes, freqs)
+    return ends
+
+
+def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:
+    """Return the correction filter with innovation and correction over the largest values of their signals."""
+    K = synthesis.controller
+    inside = models.output_scale[list(models.measured)]
+    outside = models.input_scale if synthesis.injection is Injection.INPUT else models.output_scale
+    return StateSpace(K.A, K.B * inside, K.C / outside[:, None], K.D * inside / outside[:, None], K.dt)
+
+
+def synthesis_figure(result: Synthesis) -> Figure:
+    """Draw the entries of the correction filter, and its certificate as a list."""
+    K = result.controller
+    labels = [f"K{i + 1}{j + 1}" for i, j in np.ndindex(K.n_outputs, K.n_inputs)]
+    return _filter_figure(K, labels, method_label(result.method), "certificate", certificate_of(result))
+
+
+def certificate_of(result: Synthesis) -> dict[str, str]:
+    """Return what is known about a correction filter, for people."""
+    return {
+        "status": result.status.value,
+        "filter states": str(result.controller.n_states),
+        "H2 norm": number(result.h2_norm, 4),
+        "H∞ norm": number(result.hinf_norm, 4),
+        "worst-case H2": number(result.worst_case_h2, 4),
+        "lower bound": number(result.lower_bound, 4),
+        "gap (%)": number(result.gap_percent),
+        "spectral radius": number(result.spectral_radius, 6),
+    }
+
+
+def observer_figure(observer: Observer, title: str = "observer", facts: Mapping[str, str] | None = None) -> Figure:
+    """Draw the entries of an observer's correction filter beside a list of facts."""
+    states, K = observer.lifting.states, observer.controller
+    facts = facts or {
+        "states": ", ".join(states),
+        "lifted functions": ", ".join(observer.lifting.functions) or "none",
+        "measured": ", ".join(states[i] for i in observer.measured),
+        "inputs": ", ".join(observer.inputs),
+        "filter states": str(K.n_states),
+        "sampling period": f"{number(observer.sample_period_s)} s",
+    }
+    to = observer.inputs if observer.injection is Injection.INPUT else observer.lifting.names
+    labels = [f"{short(states[j])} → {short(to[i])}" for i in range(K.n_outputs) for j in observer.measured]
+    return _filter_figure(K, labels, observer_label(observer.name), title, facts)
+
+
+def design_figure(design: Design, models: IdentifiedModels | None = None) -> Figure:
+    """Draw the correction filter and its certificates, or with `models` the estimates on a held-out episode."""
+    if models is not None:
+        return estimate_figure(design.observer, models)
+    proof, error = design.certificate, design.facts.get("hidden_error_percent")
+    facts = {
+        **certificate_of(design.synthesis),
+        "at run time": f"gain {number(proof.gain)}" if proof.certified else "not certified",
+        "training error": "–" if error is None else f"{number(error)} %",
+    }
+    return observer_figure(design.observer, "certificate", facts)
+
+
+def _filter_figure(K: StateSpace, labels: Sequence[str], name: str, title: str, facts: Mapping[str, str]) -> Figure:
+    """Draw magnitude and phase of a filter's entries beside a titled list of facts."""
+    figure, axes = grid(1, 3, 2.6, width_ratios=(1, 1, 1.1))
+    freqs = np.geomspace(1e-5, 1, 300) * (0.5 / K.dt if K.dt else 1e3)
+    response = K.frequency_response(freqs).reshape(len(freqs), -1).T
+    for i, (label, line, tone) in enumerate(zip(labels, response, cycle(HUES), strict=False)):
+        axes[0, 0].plot(freqs, decibel(line), color=tone.light, label=label if i < len(HUES) else None)
+        axes[0, 1].plot(freqs, np.degrees(np.unwrap(np.angle(line))), color=tone.light)
+    if not response.any():
+        note(axes[0, 0], "no correction", (0.5, 0.5), ha="center", color=Tone.SOFT.light)
+    for panel, label in zip(axes[0, :2], ("magnitude (dB)", "phase (°)"), strict=True):
+        frequency_axis(panel, freqs, most=4)
+        panel.set_ylabel(label)
+    axes[0, 0].set_title(f"correction by {name}")
+    axes[0, 2].axis("off")
+    axes[0, 2].set_title(title)
+    for row, (what, value) in enumerate(facts.items()):
+        note(axes[0, 2], what, (0, 0.95 - 0.1 * row), va="top", size=8, color=Tone.SOFT.light)
+        note(axes[0, 2], shorten(value, _LONGEST), (0.5, 0.95 - 0.1 * row), va="top", size=8)
+    legend(figure, axes[0, 0], columns=4)
+    return figure

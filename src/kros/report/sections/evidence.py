@@ -1,0 +1,201 @@
+"""Where the numbers come from: recordings, models, spread of the units, weights, disturbed measurements, the run itself."""
+
+from __future__ import annotations
+
+import json
+import math
+import platform
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from ...core.linalg import radius_text
+from ...data.population import DEFAULT_CONDITION
+from ...evaluate import Kind
+from ..content import Column, Section, build
+from ..disturbances import AXES, doublings
+from ..names import (
+    condition_label,
+    minus,
+    model_label,
+    number,
+    observer_label,
+    some_of,
+    split_observer,
+    words,
+)
+from ..verdict import measured_of
+
+Facts = Mapping[str, Any]
+_PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
+
+
+def recordings(metrics: Facts) -> Section:
+    """Return units, conditions, episodes and channels."""
+    study, measured, inputs = metrics["study"], measured_of(metrics), metrics["study"].get("inputs", ())
+    counts = [
+        f"{'' if c == DEFAULT_CONDITION else condition_label(c) + ': '}{n['train']} for training, {n['held_out']} held out"
+        for c, n in study.get("episodes", {}).items()
+    ]
+    text = f"{study['units']} units, sampled every {1e3 * study['sample_period_s']:g} ms."
+    text += f" Episodes: {'; '.join(counts)}." if counts else ""
+    aside = [row["unit"] for row in metrics.get("units", []) if row.get("group") == "outliers"]
+    text += f" Set aside as outliers: {some_of(aside)}." if aside else ""
+    text += f" Dropped for bad samples: {some_of(study['dropped'])}." if study.get("dropped") else ""
+    channels, sensor = study.get("channels", {}), study.get("sensor", {})
+    roles = ["input" if c in inputs else "measured" if c in measured else "estimated" for c in channels]
+    declared = [", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v) for c in channels]
+    columns = [
+        Column("channel", [words(c) for c in channels]),
+        Column("unit", [u or "–" for u in channels.values()]),
+        Column("role", roles),
+        Column("resolution", [study.get("resolution", {}).get(c) for c in channels]),
+        Column("declared sensor", declared),
+        Column("limits", [_limit(study.get("limits", {}).get(c)) for c in channels]),
+    ]
+    return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
+
+
+def _limit(limit: Facts | None) -> str:
+    """Return a limit and where units were seen at it."""
+    if limit is None:
+        return ""
+    ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
+    seen = (limit.get("seen") or {}).get("units")
+    return f"{ends}, {'declared' if limit['declared'] else 'estimated'}{f', reached by {some_of(seen, 3)}' if seen else ''}"
+
+
+def calibration(metrics: Facts) -> Section | None:
+    """Return the phase calibration; None for a study without one."""
+    facts = metrics.get("calibration")
+    if not facts:
+        return None
+    text = (
+        f"The gearbox disturbance is modelled as sin({facts['ratio']:g} · {facts['angle']} + {facts['parameter']}); the "
+        "phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse apart. "
+        f"Mean lag of the loop: {minus(format(math.degrees(facts['lag_rad']), '.1f'))}°."
+    )
+    missing = [row["unit"] for row in metrics.get("units", []) if row["status"] == "not calibrated"]
+    more = [f"Not calibrated, and without models: {some_of(missing)}."] if missing else []
+    return Section("calibration", "Phase calibration", [text, *more], figure="phase")
+
+
+def models(metrics: Facts) -> Section | None:
+    """Return the models and their simulation errors."""
+    entries = metrics.get("models")
+    if not entries:
+        return None
+    functions: list[str] = next((own["functions"] for own in entries.values() if own.get("functions")), [])
+    text = "Every unit has a model of each kind. Linear models have the recorded states; Koopman models have lifted functions too"
+    text += f": {', '.join(functions)}." if functions else "."
+    if any(not name.endswith("_edmd") for name in entries):
+        text += (
+            " Refined models minimise the simulation error, regularised towards the population mean; the strength is "
+        )
+        text += "chosen by cross-validation. Models named EDMD are those of the paper."
+    errors = {name: own.get("freerun_error_percent", {}) for name, own in entries.items()}
+    columns = [
+        Column("model", [model_label(name) for name in entries]),
+        Column("states", [own["order"] for own in entries.values()]),
+        Column("largest pole", [minus(radius_text(own["spectral_radius_max"])) for own in entries.values()]),
+    ]
+    for channel in dict.fromkeys(c for own in errors.values() for c in own):
+        for what in ("median", "worst"):
+            values = [own.get(channel, {}).get(what) for own in errors.values()]
+            columns.append(Column(f"{what} (%)", values, words(channel), best=True))
+    caption = (
+        "Simulation of every held-out episode from its first state, error in percent of the largest value, over units"
+    )
+    return Section("models", "Models", [text], tables=[build(caption, columns)], figure="free_run")
+
+
+def spread(metrics: Facts) -> Section | None:
+    """Return how the units differ from the nominal one."""
+    entries = metrics.get("uncertainty")
+    if not entries:
+        return None
+    first = next(iter(entries.values()))
+    text = (
+        f"Nominal unit: {first['nominal']}. The residual of a unit is its difference from the nominal unit in one of six "
+        f"forms; its peak is the largest singular value over units and frequencies. The design uses the form "
+        f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
+    )
+    noise = [
+        f"{model_label(name)} models: {100 * (1 - own['noise_share']['at_peak']):.0f} % of the spread at "
+        f"{number(own['noise_share']['peak_hz'])} Hz is variation between units, the rest is estimation noise."
+        for name, own in entries.items()
+        if "noise_share" in own
+    ]
+    forms = list(dict.fromkeys(f for own in entries.values() for f in own["peak_db"]))
+    used = ["used" if form == first["form"] else "" for form in forms]
+    columns = [Column("form", [words(form) for form in forms], notes=used)]
+    columns += [Column(f"{model_label(n)} (dB)", [e["peak_db"].get(f) for f in forms]) for n, e in entries.items()]
+    table = build("Peak residual, with the nominal unit that suits each form best", columns, words(first["form"]))
+    return Section("spread", "Spread of the units", [text, *noise], tables=[table], figure="models")
+
+
+def uncertainty(metrics: Facts) -> Section | None:
+    """Return the weights that bound the residuals of all units."""
+    entries = metrics.get("uncertainty")
+    if not entries:
+        return None
+    text = (
+        "Each residual is W_left · Δ · W_right with ‖Δ‖ ≤ 1. The weights bound every unit where no normalised residual "
+        "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
+    )
+    weights = [own["weight"] for own in entries.values()]
+    orders = [" and ".join(", ".join(map(str, side)) for side in own["orders"]) for own in weights]
+    columns = [
+        Column("model", [model_label(name) for name in entries]),
+        Column("weights", [own["structure"] for own in weights]),
+        Column("orders, left and right", orders),
+        Column("largest normalised residual", [_exact(own["cover_max"]) for own in weights]),
+        Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
+        Column("above the optimal bound (dB)", [own["overbound_db_max"] for own in weights]),
+        Column("approximation error", [own["misfit_max"] for own in entries.values()]),
+    ]
+    return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
+
+
+def _exact(value: float | None) -> str | None:
+    """Return a number near one with six digits."""
+    return None if value is None else number(value, 6)
+
+
+def robustness(metrics: Facts) -> Section | None:
+    """Return where errors double on disturbed measurements; None where the study did not try."""
+    found = doublings(metrics, measured_of(metrics))
+    if not found:
+        return None
+    text = (
+        "The measurements of held-out episodes are disturbed in one way at a time, and the observers are not informed. The "
+        "table shows where the error doubles, as the geometric mean over the hidden channels."
+    )
+    deployed = metrics["study"].get("deployed") or ""
+    names = [n for n in found if split_observer(n)[0] in (split_observer(deployed)[0], "")] or list(found)
+    kinds = [kind for kind in Kind if any(kind in own for own in found.values())]
+    columns = [Column("observer", [observer_label(n) for n in names])]
+    columns += [Column(AXES[kind].title, [found[n].get(kind, "") for n in names]) for kind in kinds]
+    table = build(
+        "Severity that doubles the error; < and >: outside of what was tried", columns, observer_label(deployed)
+    )
+    return Section("robustness", "Disturbed measurements", [text], tables=[table], figure="robustness")
+
+
+def run(metrics: Facts) -> Section:
+    """Return times, versions and settings."""
+    timing = metrics.get("timing_s", {})
+    times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
+    known = {"Python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
+    packages = [Column("package", list(known)), Column("version", list(known.values()))]
+    text = "metrics.json holds all numbers of this page. The same recordings and settings give the same results."
+    settings = json.dumps(metrics.get("settings", {}), indent=1, ensure_ascii=False)
+    tables = [build("Time; a stage that was up to date counts with its own time", times), build("Versions", packages)]
+    return Section("run", "Run", [text], tables=tables, folded=[("All settings of the study", settings)])
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None

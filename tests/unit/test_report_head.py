@@ -9,6 +9,7 @@ import pytest
 from kros.report.content import Column, build
 from kros.report.disturbances import doublings
 from kros.report.error_tables import error_tables
+from kros.report.facts import Facts
 from kros.report.sections.errors import errors
 from kros.report.verdict import Status, judge
 
@@ -90,7 +91,7 @@ BOUND = {"set_certified": True, "set_bound": {"velocity": 0.003}, "relift_certif
 def test_every_reason_sets_the_status_and_leads_to_its_section(
     parts: dict[str, Any], status: Status, section: str, text: str
 ) -> None:
-    found = judge(metrics(**parts))
+    found = judge(Facts(metrics(**parts)))
     assert found.status is status
     assert [(r.status, r.section) for r in found.reasons if text in r.text] == [(status, section)]
     assert status is Status.CHECK or text in found.sentence
@@ -98,35 +99,35 @@ def test_every_reason_sets_the_status_and_leads_to_its_section(
 
 
 def test_ready_means_that_it_can_be_deployed_and_voids_stand_beside() -> None:
-    found = judge(metrics())
+    found = judge(Facts(metrics()))
     assert found.status is Status.READY
     assert not found.reasons
     assert "can be deployed" in found.sentence
     assert "velocity from angle" in found.sentence
     assert found.certified == ["At run time: the gain from the model's one-step residual to the error is at most 2.00."]
     assert "controller uses the estimate" in found.void[0]
-    assert judge(metrics(observers={NAME: {}})).void == []
+    assert judge(Facts(metrics(observers={NAME: {}}))).void == []
 
 
 def test_errors_against_the_true_signal_stand_beside_those_against_the_recording() -> None:
     known = {"true_error_percent": 0.31, "true_rms": 0.0062, "true_lag_s": 0.0011}
     facts = metrics(evaluation=[{**row(NAME, 0.024), **known}, row("koopman/open_loop", 0.9)])
-    (number,) = judge(facts).numbers
+    (number,) = judge(Facts(facts)).numbers
     assert number.value == "0.0240"
     assert number.notes[-1] == "against the true signal: 0.310 %, 1.1 ms late"
-    first = errors(facts).tables[0]
+    first = errors(Facts(facts)).tables[0]
     assert "velocity: against the true signal (%)" in first.labels
-    assert "velocity: against the true signal (%)" not in errors(metrics()).tables[0].labels
+    assert "velocity: against the true signal (%)" not in errors(Facts(metrics())).tables[0].labels
 
 
 def test_the_best_certified_observer_is_one_that_was_designed() -> None:
     entries = {"l/open_loop": {"worst_case_h2": 1.0}, "l/mixed": {"worst_case_h2": 1.0}, "l/h2": {"worst_case_h2": 1.0}}
     rows = [row("l/open_loop", 0.1), row("l/mixed", 0.5), row("l/h2", 0.4), row(NAME, 0.2)]
-    first = errors(metrics(observers={**entries, NAME: {}}, evaluation=rows)).tables[0]
+    first = errors(Facts(metrics(observers={**entries, NAME: {}}, evaluation=rows))).tables[0]
     notes = {cells[0].text: cells[0].note for cells in first.rows}
     assert notes["l, H2"].startswith("best with a certificate")
     signals = {**metrics()["observers"], NAME: {"set_certified": True}}
-    first = errors(metrics(observers=signals, evaluation=rows)).tables[0]
+    first = errors(Facts(metrics(observers=signals, evaluation=rows))).tables[0]
     assert first.rows[first.chosen[0]][0].note.startswith("deployed and best with a certificate")
 
 
@@ -134,13 +135,13 @@ def test_an_error_doubles_where_it_was_tried() -> None:
     tried = [("none", 0.0, 1.0), ("noise", 1e-3, 2.0), ("dropped", 0.1, 1.5), ("delay", 1, 9.0)]
     shared = {"observer": NAME, "condition": "default", "channel": "velocity"}
     rows = [{**shared, "disturbance": k, "severity": s, "error_percent": {"mean": e}} for k, s, e in tried]
-    found = doublings(metrics(robustness=rows), ())
+    found = doublings(Facts(metrics(robustness=rows)))
     assert {kind.value: text for kind, text in found[NAME].items()} == {
         "noise": "0.1",
         "delay": "< 1",
         "dropped": "> 10",
     }
-    assert doublings(metrics(), ()) == {}
+    assert doublings(Facts(metrics())) == {}
 
 
 def test_tables_leave_out_what_is_not_known() -> None:

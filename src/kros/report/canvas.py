@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .names import RAISED, minus
-from .theme import WIDTH_IN, Tone
+from .theme import WIDTH_IN
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -87,14 +87,6 @@ def thin(x: Array, y: Array) -> tuple[Array, Array]:
     return x[rows], y[rows]
 
 
-def thin_log(freqs_hz: Array, values: Array) -> tuple[Array, Array]:
-    """Return a frequency line, shape (..., n), with fewer points; peaks are kept."""
-    if len(freqs_hz) <= _POINTS:
-        return freqs_hz, values
-    starts = np.unique(np.linspace(0, len(freqs_hz), _POINTS, endpoint=False).astype(int))
-    return freqs_hz[starts], np.maximum.reduceat(values, starts, axis=-1)
-
-
 def decibel(values: npt.ArrayLike) -> Array:
     """Return magnitudes in decibels; zero becomes NaN, which is not drawn."""
     magnitude = np.abs(np.asarray(values))
@@ -103,9 +95,8 @@ def decibel(values: npt.ArrayLike) -> Array:
 
 def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colour: str, style: str = "-") -> None:
     """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
-    freqs, below = thin_log(freqs_hz, shade)
-    axes.plot(freqs, decibel(below), color=colour, lw=3.2, alpha=0.3, solid_capstyle="butt")
-    axes.plot(freqs, decibel(thin_log(freqs_hz, line)[1]), style, color=colour)
+    axes.plot(freqs_hz, decibel(shade), color=colour, lw=3.2, alpha=0.3, solid_capstyle="butt")
+    axes.plot(freqs_hz, decibel(line), style, color=colour)
 
 
 def lines_of_units(axes: Axes, x: Array, lines: Array, colour: str, label: str, units: Sequence[str]) -> None:
@@ -191,8 +182,3 @@ def spread(places: Sequence[float], spacing: float) -> list[float]:
                 moved[i - 1] -= lack / 2
                 moved[i] += lack / 2
     return moved
-
-
-def zero_line(axes: Axes) -> None:
-    """Mark 0 dB."""
-    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)

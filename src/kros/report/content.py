@@ -17,26 +17,13 @@ Pairs = Sequence[tuple[str, Sequence[str]]]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table before it is formatted.
-
-    Parameters
-    ----------
-    title : str
-    values : sequence
-        A number, a text, a truth value or None a row; a column in which nothing is known is left out.
-    group : str
-        Title over columns that stand together.
-    best : bool
-        Whether the smallest number is set in bold.
-    notes : sequence of str
-        Small text below each value.
-    """
+    """A column of a table before it is formatted; one in which nothing is known is left out."""
 
     title: str
-    values: Sequence[Any]
-    group: str = ""
-    best: bool = False
-    notes: Sequence[str] = ()
+    values: Sequence[Any]  # a number, a text, a truth value or None a row
+    group: str = ""  # title over columns that stand together
+    best: bool = False  # whether the smallest number is set in bold
+    notes: Sequence[str] = ()  # small text below each value
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..evaluate import Kind
 from ..evaluate.robustness import severity_of_growth
+from .facts import Facts
 
 Array = npt.NDArray[np.float64]
 
@@ -78,9 +79,9 @@ def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str
     return f"{below}{AXES[kind].factor * max(severity, severities[1]):.2g}"
 
 
-def doublings(metrics: Mapping[str, Any], measured: Sequence[str]) -> dict[str, dict[Kind, str]]:
+def doublings(facts: Facts) -> dict[str, dict[Kind, str]]:
     """Return by observer and kind the severity at which its error doubles in the condition of the models."""
-    found = curves(metrics.get("robustness", []), metrics["study"]["identify_on"])
+    found, measured = curves(facts.get("robustness", []), facts.study["identify_on"]), facts.measured
     return {
         name: {kind: doubling(kind, own[kind], measured) for kind in AXES if kind in own} for name, own in found.items()
     }

@@ -67,12 +67,6 @@ def left_out_tables(rows: Rows, identify_on: str) -> list[ErrorTable]:
     return _tables(rows, identify_on, None)
 
 
-def home_table(metrics: Mapping[str, Any]) -> ErrorTable | None:
-    """Return the errors where the deployed observer was designed for; None where it has not been evaluated."""
-    tables = error_tables(metrics)
-    return tables[0] if tables and metrics["study"].get("deployed") in tables[0].cells else None
-
-
 def _tables(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None) -> list[ErrorTable]:
     """Group rows by condition, observer and channel."""
     tables = []

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import write_bytes
-from ..data.population import DEFAULT_CONDITION
+from .facts import Facts
 from .figures import draw
 from .files import to_svg
 from .names import condition_label
@@ -75,20 +75,19 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    content = {**metrics, "settings": run.study}
-    parts = [[s for make in makers if (s := make(content)) is not None] for makers in (FIRST, EVIDENCE)]
+    facts = Facts({**metrics, "settings": run.study})
+    parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
     figures = {}
     for drawn in mapped(partial(encoded, RunFolder(run.folder)), names):
         if drawn["reason"]:
             log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
         figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
-    study = metrics["study"]
-    conditions = [condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION]
+    conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
-        subtitle=" · ".join([f"{study['units']} units", *conditions]),
-        head=judge(metrics),
+        subtitle=" · ".join([f"{facts.study['units']} units", *conditions]),
+        head=judge(facts),
         sections=parts[0],
         evidence=parts[1],
         figures=figures,

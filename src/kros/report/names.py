@@ -164,18 +164,18 @@ def some_of(names: Sequence[str], most: int = 8) -> str:
 
 def episode_title(key: EpisodeKey) -> str:
     """Return what an episode is called above an axis."""
-    where = "" if key.condition == DEFAULT_CONDITION else f"{condition_label(key.condition)}: "
-    return shorten(f"{where}unit {key.unit}, episode {key.episode}", 46)
+    where = condition_label(key.condition)
+    return shorten(f"{where}{': ' if where else ''}unit {key.unit}, episode {key.episode}", 46)
 
 
 def condition_label(condition: str) -> str:
-    """Return what a condition is called."""
-    return {"noload": "no load", "load": "loaded"}.get(condition, condition)
+    """Return what a condition is called; nothing for the only one of recordings that name none."""
+    return {"noload": "no load", "load": "loaded", DEFAULT_CONDITION: ""}.get(condition, condition)
 
 
 def in_condition(condition: str) -> str:
-    """Return a condition as a part of a sentence, with its comma; nothing where recordings name none."""
-    return "" if condition == DEFAULT_CONDITION else f", {condition_label(condition)}"
+    """Return a condition as a part of a sentence, with its comma."""
+    return f", {condition_label(condition)}" if condition_label(condition) else ""
 
 
 def shorten(text: str, most: int) -> str:
@@ -198,8 +198,3 @@ def number(value: float | None, digits: int = 3) -> str:
 def minus(text: str) -> str:
     """Return a number's text with a proper minus sign."""
     return text.replace("-", "−")
-
-
-def channel_text(channel: str, value: str, unit: str) -> str:
-    """Return a number with its unit of measure and the channel that it belongs to."""
-    return " ".join(part for part in (value, readable_unit(unit), "in", words(channel)) if part)

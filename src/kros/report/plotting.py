@@ -17,7 +17,7 @@ PLOTS = {
     "IdentifiedModels": "models:identified_figure",
     "UncertainModels": "uncertainty:sets_figure",
     "Design": "synthesis:design_figure",
-    "RunResult": "run:run_figure",
+    "RunResult": ":run_figure",
     "PhaseCalibration": "recordings:phase_figure",
     "ModelSet": "models:bode_figure",
     "UncertainModel": "uncertainty:uncertain_figure",
@@ -69,7 +69,7 @@ def plot(result: Any, **options: Any) -> Figure:
             f"Plot: found a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
         )
     module, _, function = PLOTS[name].partition(":")
-    draw = getattr(import_module(f"{__package__}.figures.{module}"), function)
+    draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)
     known = list(signature(draw).parameters)[1:]
     unknown = sorted(set(options) - set(known))
     if unknown:

@@ -60,7 +60,6 @@ _SETTINGS: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "axes.axisbelow": True,
     "axes.facecolor": "none",
     "grid.color": Tone.GRID.light,
     "grid.linewidth": 0.6,
@@ -73,23 +72,13 @@ _SETTINGS: dict[str, Any] = {
     "ytick.labelsize": 7.5,
     "xtick.major.width": 0.7,
     "ytick.major.width": 0.7,
-    "xtick.minor.width": 0.5,
-    "ytick.minor.width": 0.5,
     "lines.linewidth": 1.2,
-    "lines.solid_capstyle": "round",
     "legend.frameon": False,
     "legend.fontsize": 8,
-    "legend.handlelength": 1.8,
-    "legend.columnspacing": 1.6,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-    "text.hinting": "none",  # widths of text do not depend on the resolution
-    "path.simplify": True,
     "path.simplify_threshold": 0.3,
     "svg.fonttype": "none",
     "svg.hashsalt": "kros",
     "pdf.fonttype": 42,
-    "mathtext.fontset": "dejavusans",
 }
 
 

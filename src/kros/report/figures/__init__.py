@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ...core.errors import ConfigError
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
 
@@ -27,71 +28,33 @@ class Row:
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
+_SMALL = "The smaller the error, the better the estimate."
 FIGURES: dict[str, Row] = {
     "signals": Row("Recorded signals", "recordings:signals", "One held-out episode as recorded."),
     "tracking_spectrum": Row(
         "Tracking error at constant speed",
         "recordings:tracking_spectrum",
-        "The peaks at the dotted lines are the disturbance that the lifting models.",
+        "Peaks are the disturbance that is modelled.",
     ),
-    "phase": Row(
-        "Phase calibration",
-        "recordings:phase",
-        "Phases may lie anywhere; lags should be nearly equal, and concentrations near one.",
-    ),
-    "models": Row(
-        "Models of all units", "models:bode", "The spread of the lines is what the uncertain model has to bound."
-    ),
-    "free_run": Row(
-        "Simulation of the models",
-        "episodes:free_run",
-        "The nearer a line is to the recorded one, the better the model predicts without measurements.",
-    ),
-    "forms": Row(
-        "Six uncertainty forms", "uncertainty:forms", "The lowest line is the form in which units differ least."
-    ),
-    "weights": Row(
-        "Weights and optimal bounds",
-        "uncertainty:weights",
-        "Lines should lie close to their shade: what is between them is uncertainty that no unit shows.",
-    ),
-    "weights_entrywise": Row(
-        "Weights, entry by entry", "uncertainty:weights_entrywise", "Black lines lie above all blue ones."
-    ),
-    "synthesis": Row(
-        "Plant, weights and correction filters",
-        "synthesis:bode",
-        "Where the weights are low the correction may be small; where they are high it has to follow the measurements.",
-    ),
-    "observers_in_time": Row("Estimates", "episodes:estimates", "The smaller the error, the better the estimate."),
-    "observers_in_time_paper": Row(
-        "Estimates of the paper's observers",
-        "episodes:estimates",
-        "The smaller the error, the better the estimate.",
-        {"paper": True},
-    ),
-    "loaded_paper": Row(
-        "Errors in another condition",
-        "episodes:other_condition",
-        "Under load the slow part of the current's error is the load torque.",
-    ),
-    "load_torque": Row(
-        "Load torque", "disturbed:load_torque", "The nearer a line is to the declared load, the better the estimate."
-    ),
-    "robustness": Row(
-        "Disturbed measurements",
-        "disturbed:robustness",
-        "Where a line rises, the disturbance is more than the observer takes.",
-    ),
+    "phase": Row("Phase calibration", "recordings:phase", "Lags should be nearly equal, concentrations near one."),
+    "models": Row("Models of all units", "models:bode", "The uncertain model has to bound the spread of the lines."),
+    "free_run": Row("Simulation of the models", "episodes:free_run", "The smaller the error, the better the model."),
+    "forms": Row("Six uncertainty forms", "uncertainty:forms", "Units differ least in the form with the lowest line."),
+    "weights": Row("Weights and optimal bounds", "uncertainty:weights", "Lines should lie close to their shade."),
+    "weights_entrywise": Row("Weights, entry by entry", "uncertainty:weights_entrywise", "Black bounds blue lines."),
+    "synthesis": Row("Plant, weights and filters", "synthesis:bode", "High weights need a large correction."),
+    "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
+    "observers_in_time_paper": Row("The paper's estimates", "episodes:estimates", _SMALL, {"paper": True}),
+    "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
+    "load_torque": Row("Load torque", "disturbed:load_torque", "The nearer to the declared load, the better."),
+    "robustness": Row("Disturbed measurements", "disturbed:robustness", "A line rises where the observer fails."),
     "outlier_scores": Row(
-        "Outlier scores",
-        "outliers:scores",
-        "The higher a unit scores, the more it differs from all others.",
+        "Outlier scores", "outliers:scores", "The higher a unit, the more it differs from the others."
     ),
     "outlier_residuals": Row(
         "The highest-scoring unit, entry by entry",
         "uncertainty:outlier_residuals",
-        "Where the red line leaves the black one, the unit differs in that response.",
+        "It differs where red leaves black.",
     ),
 }
 
@@ -117,6 +80,16 @@ def draw(name: str, run: RunFolder) -> Drawn:
             return Drawn(name, row.title, figure, f"{row.see} {text}".strip())
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))
+
+
+def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
+    """Draw one figure of the result of a run, by default the estimates of the deployed observer."""
+    if name not in FIGURES:
+        raise ConfigError(f"Plot of a run: there is no figure {name!r}; choose one of {', '.join(FIGURES)}.")
+    drawn = draw(name, RunFolder(run.folder))
+    if drawn.figure is None:
+        raise ConfigError(f"Plot of a run: the figure {name!r} is left out, {drawn.reason}.")
+    return drawn.figure
 
 
 def draw_all(run: RunFolder) -> Iterator[Drawn]:

@@ -14,14 +14,13 @@ from ...evaluate.errors import error_spectrum
 from ...evaluate.sensor import as_shown
 from ...identify.identified import IdentifiedModels
 from ...observer import Observer, run_observer
-from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, note, thin
+from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
 from ..names import (
     Look,
     best_models,
     condition_label,
     deployed_pair,
     episode_title,
-    in_condition,
     model_label,
     model_look,
     number,
@@ -39,7 +38,26 @@ from ..theme import Tone
 TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
 _MOST = 4  # states of one episode
 _SETTLED = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
+_TURNS = 300  # samples of an enlarged part at constant speed
+_DIVERGED = 1e3  # errors beyond this many ranges are not drawn
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
+
+
+@dataclass(frozen=True)
+class Signals:
+    """What the signals of a figure are: channels, sampling period, samples of the enlarged part, gearbox band."""
+
+    channels: Sequence[Channel]
+    sample_period_s: float
+    window: int
+    band_hz: tuple[float, float] | None = None
+
+    @classmethod
+    def of(cls, run: RunFolder) -> Signals:
+        """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
+        size = _TURNS if run.calibrated else len(run.shown[0].time_s) // 8
+        band = run.evaluation.get("band_hz")
+        return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 
 
 @dataclass(frozen=True)
@@ -65,7 +83,7 @@ def free_run(run: RunFolder) -> tuple[Figure, str]:
     medians = {n: [f"{words(c)} {number(v['median'])} %" for c, v in own.items()] for n, own in errors.items()}
     parts = [f"{model_label(n)} {', '.join(own)}" for n, own in medians.items()]
     text += f" Median errors over units: {'; '.join(parts)}." if parts else ""
-    return blocks_figure(run, [block], "simulated"), text + _shaded(run)
+    return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
 
 
 def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
@@ -82,7 +100,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     ]
     measured = " and ".join(words(c.name) for c in run.states if c.measured)
     text = f"{_PAPER if paper else ''}Estimated from {measured} alone; errors are recorded minus estimated values."
-    return blocks_figure(run, blocks, "estimated"), text + _shaded(run)
+    return blocks_figure(Signals.of(run), blocks), text + _shaded(run)
 
 
 def other_condition(run: RunFolder) -> tuple[Figure, str]:
@@ -95,7 +113,7 @@ def other_condition(run: RunFolder) -> tuple[Figure, str]:
     block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), _MOST)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
-    return blocks_figure(run, [block], "estimated"), text + _shaded(run)
+    return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
 
 
 def _paper(names: Sequence[str]) -> list[str]:
@@ -115,55 +133,47 @@ def _shaded(run: RunFolder) -> str:
     return " Shaded: the band around the gearbox frequency at top speed." if run.evaluation.get("band_hz") else ""
 
 
-def blocks_figure(run: RunFolder, blocks: Sequence[Block], what: str) -> Figure:
+def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
     """Draw a row a state: the episode, a part of it, the error over time, and the error's power spectral density."""
-    rows = sum(len(block.states) for block in blocks)
-    figure, axes = grid(rows, 4, 1.15, width_ratios=(1.2, 1, 1.2, 1))
+    figure, axes = grid(sum(len(block.states) for block in blocks), 4, 1.05, width_ratios=(1.2, 1, 1.2, 1))
     first = 0
     for block in blocks:
         panels = axes[first : first + len(block.states)]
         first += len(block.states)
-        window = steady_window(run, block.shown, _window(run, block.shown))
+        window = steady_window(signals, block.shown)
         for row, i in zip(panels, block.states, strict=True):
-            _draw_state(run, row, block, i, window)
-        label_rows(panels[:, 0], [run.states[i] for i in block.states])
+            _draw_state(signals, row, block, i, window)
+        label_rows(panels[:, 0], [signals.channels[i] for i in block.states])
         hide_times(panels[:-1, :3].ravel())
         label_below(panels[-1, :3], "time (s)")
-        panels[0, 0].set_title(f"{block.title}")
-        panels[0, 2].set_title("error" if len(block.lines) else "")
-        panels[0, 3].set_title("PSD of the error")
+        for column, title in ((0, block.title), (2, "error"), (3, "PSD of the error")):
+            panels[0, column].set_title(title)
     label_below(axes[-1, 3:])
     figure.align_ylabels(axes[:, 0])
     legend(figure, axes[0, 0])
     return figure
 
 
-def _window(run: RunFolder, shown: Shown) -> int:
-    """Return the samples of the enlarged part: fifteen turns of the gearbox, else an eighth of the episode."""
-    return min(300, len(shown.time_s)) if run.calibrated else max(len(shown.time_s) // 8, 2)
-
-
-def _draw_state(run: RunFolder, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
+def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
     """Draw one state of an episode in four panels."""
-    shown, recorded = block.shown, block.shown.states[:, i].astype(float)
-    near = _near(recorded)
-    lines = {label: (_inside(values[:, i], near), look) for label, (values, look) in block.lines.items()}
+    time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
+    near, start = _near(recorded), int(_SETTLED * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
-        draw_lines(panel, shown.time_s[part], {"recorded": (recorded[part], TRUTH)})
-        draw_lines(panel, shown.time_s[part], {label: (v[part], look) for label, (v, look) in lines.items()})
-    row[0].axvspan(*shown.time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
-    start, band = int(_SETTLED * len(recorded)), run.evaluation.get("band_hz")
+        draw_lines(panel, time_s[part], {"recorded": (recorded[part], TRUTH)})
+        for label, (values, look) in block.lines.items():
+            draw_lines(panel, time_s[part], {label: (_inside(values[part, i], near), look)})
+    row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
     for label, (values, look) in block.lines.items():
         error = recorded - values[:, i].astype(float)
-        if np.isfinite(error).all() and np.abs(error[start:]).max() < 1e3 * np.ptp(recorded):
-            draw_lines(row[2], shown.time_s[start:], {label: (error[start:], look)})
-            freqs, density = error_spectrum(error, run.sample_period_s)
+        if np.isfinite(error).all() and np.abs(error[start:]).max() < _DIVERGED * np.ptp(recorded):
+            draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
+            freqs, density = error_spectrum(error, signals.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour, lw=1.0)
             frequency_axis(row[3], freqs, "", 4)
     logarithmic(row[3])
-    row[3].set_ylabel(f"{squared(run.states[i].unit)}/Hz", size=7)
-    if band is not None:
-        row[3].axvspan(*band, color=Tone.GRID.light, lw=0, zorder=0.5)
+    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size=7)
+    if signals.band_hz is not None:
+        row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 
 
 def _near(recorded: Array) -> tuple[float, float]:
@@ -201,15 +211,17 @@ def hide_times(rows: Iterable[Axes]) -> None:
         axes.tick_params(labelbottom=False)
 
 
-def reference_columns(run: RunFolder) -> dict[str, int]:
+def references(channels: Sequence[Channel]) -> dict[str, int]:
     """Return for every state the input column that is its reference, by the name ``target_<state>``."""
-    inputs = [c.name for c in run.channels if c.role is Role.INPUT]
-    return {c.name: inputs.index(f"target_{c.name}") for c in run.states if f"target_{c.name}" in inputs}
+    inputs = [c.name for c in channels if c.role is Role.INPUT]
+    states = [c.name for c in channels if c.role is Role.STATE]
+    return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
 
 
-def steady_window(run: RunFolder, shown: Shown, size: int) -> slice:
-    """Return a window at constant speed: in the longest stretch of the highest steady reference, else in the middle."""
-    columns, samples = reference_columns(run), len(shown.time_s)
+def steady_window(signals: Signals, shown: Shown) -> slice:
+    """Return a window in the longest stretch of the highest steady reference, else in the middle of the episode."""
+    columns, samples = references(signals.channels), len(shown.time_s)
+    size = max(min(signals.window, samples), 2)
     speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(samples)
     start, stop = max(steady_stretches(speed), key=lambda r: r[1] - r[0], default=(0, 0))
     middle = (start + stop) // 2 if stop - start > size // 2 else samples // 2
@@ -229,24 +241,14 @@ def steady_stretches(speed: Array) -> list[tuple[int, int]]:
 
 
 def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
-    """Draw recorded states and estimates on the first held-out episode of the units behind the models."""
+    """Draw estimates on the first held-out episode of the units behind the models."""
     facts = models.facts
     key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
     y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)
     estimate = run_observer(observer, y, batch.inputs, batch.parameters or None)[:, 0]
-    channels = models.population.channels[: batch.states.shape[-1]]
-    figure, axes = grid(len(channels), 1, 1.3, sharex=True)
     time_s = np.arange(len(estimate)) * batch.sample_period_s
-    for i, (panel, channel) in enumerate(zip(axes[:, 0], channels, strict=True)):
-        recorded = batch.states[:, 0, i]
-        inside = _inside(estimate[:, i], _near(recorded))
-        lines = {"recorded": (recorded, TRUTH), observer_label(observer.name): (inside, Look(Tone.BLUE.light))}
-        draw_lines(panel, time_s, lines)
-        mark = "measured" if channel.measured else "not measured"
-        note(panel, mark, (1, 1), (-2, -2), ha="right", va="top", color=Tone.SOFT.light)
-    axes[0, 0].set_title(f"unit {key.unit}{in_condition(key.condition)}, episode {key.episode}")
-    label_rows(axes[:, 0], channels)
-    label_below(axes[-1], "time (s)")
-    legend(figure, axes[0, 0])
-    return figure
+    shown = Shown(key, time_s, batch.states[:, 0], batch.inputs[:, 0], {observer.name: estimate}, {})
+    channels = models.population.channels
+    block = _observed(episode_title(key), shown, [observer.name], range(shown.states.shape[1]))
+    return blocks_figure(Signals(channels, batch.sample_period_s, len(time_s) // 8), [block])

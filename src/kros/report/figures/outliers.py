@@ -37,7 +37,7 @@ def scores_figure(found: Mapping[str, OutlierModel] | OutlierModel) -> Figure:
     """Draw scores with their ranges, a column a condition."""
     models = {"": found} if isinstance(found, OutlierModel) else found
     units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
-    figure, axes = grid(1, len(models), 2.2, sharey=True)
+    figure, axes = grid(1, len(models), 1.9, sharey=True)
     for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
         _panel(panel, model, units)
         panel.set_title(condition_label(condition))

@@ -12,7 +12,7 @@ from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name
 from ..names import Look, episode_title, minus, some_of, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import Tone
-from .episodes import draw_lines, hide_times, label_rows, reference_columns, steady_stretches
+from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.55)
 _SEGMENT = 1024  # samples of a spectrum
@@ -39,12 +39,12 @@ def _read(run: RunFolder, key: EpisodeKey) -> Shown:
 
 def signals(run: RunFolder) -> tuple[Figure, str]:
     """Draw one episode in at most two conditions, side by side, with references."""
-    shown, channels, references = recorded_episodes(run)[:2], run.states[:5], reference_columns(run)
+    shown, channels, targets = recorded_episodes(run)[:2], run.states[:5], references(run.channels)
     figure, axes = grid(len(channels), len(shown), 1.1, sharey="row", sharex="col")
     for column, episode in zip(axes.T, shown, strict=True):
         for i, channel in enumerate(channels):
-            if channel.name in references:
-                reference = episode.inputs[:, references[channel.name]]
+            if channel.name in targets:
+                reference = episode.inputs[:, targets[channel.name]]
                 draw_lines(column[i], episode.time_s, {"reference": (reference, _REFERENCE)})
             draw_lines(column[i], episode.time_s, {"recorded": (episode.states[:, i], _RECORDED)})
         column[0].set_title(episode_title(episode.key))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
 from ...observer import Observer
 from ...synthesis.result import Injection, Synthesis
-from ..canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, legend, note, zero_line
+from ..canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, legend, note
 from ..names import (
     BASELINES,
     best_models,
@@ -22,7 +23,6 @@ from ..names import (
     model_label,
     number,
     observer_label,
-    shorten,
     split_observer,
 )
 from ..run_folder import NotShownError, RunFolder
@@ -32,7 +32,6 @@ from .episodes import estimate_figure
 
 _WITHOUT = (*BASELINES, "memory", "estimator")  # no correction of a model by design
 _FREQUENCIES, _DECADES = 260, 5
-_LONGEST = 32  # characters of a fact
 
 Curve = tuple[str, np.ndarray, str, str]
 
@@ -78,7 +77,7 @@ def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> list[tuple[
         if np.isfinite(size).any():
             axes.plot(freqs, size, line, color=colour, lw=1.4)
             ends.append((float(size[-1]), label, colour))
-    zero_line(axes)
+    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
     frequency_axis(axes, freqs)
     return ends
 
@@ -91,18 +90,12 @@ def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:
     return StateSpace(K.A, K.B * inside, K.C / outside[:, None], K.D * inside / outside[:, None], K.dt)
 
 
-def synthesis_figure(result: Synthesis) -> Figure:
-    """Draw the entries of the correction filter, and its certificate as a list."""
+def synthesis_figure(result: Synthesis, labels: Sequence[str] = (), name: str = "") -> Figure:
+    """Draw the entries of a correction filter, and its certificate as a list."""
     K = result.controller
-    labels = [f"K{i + 1}{j + 1}" for i, j in np.ndindex(K.n_outputs, K.n_inputs)]
-    return _filter_figure(K, labels, method_label(result.method), "certificate", certificate_of(result))
-
-
-def certificate_of(result: Synthesis) -> dict[str, str]:
-    """Return what is known about a correction filter, for people."""
-    return {
+    facts = {
         "status": result.status.value,
-        "filter states": str(result.controller.n_states),
+        "filter states": str(K.n_states),
         "H2 norm": number(result.h2_norm, 4),
         "H∞ norm": number(result.hinf_norm, 4),
         "worst-case H2": number(result.worst_case_h2, 4),
@@ -110,41 +103,41 @@ def certificate_of(result: Synthesis) -> dict[str, str]:
         "gap (%)": number(result.gap_percent),
         "spectral radius": number(result.spectral_radius, 6),
     }
+    figure, axes = _filter_figure(K, labels or [f"K{i + 1}{j + 1}" for i, j in np.ndindex(K.n_outputs, K.n_inputs)])
+    axes[0, 0].set_title(name or method_label(result.method))
+    axes[0, 2].axis("off")
+    for row, (what, value) in enumerate(facts.items()):
+        note(axes[0, 2], what, (0, 0.95 - 0.1 * row), va="top", size=8, color=Tone.SOFT.light)
+        note(axes[0, 2], value, (0.5, 0.95 - 0.1 * row), va="top", size=8)
+    return figure
 
 
-def observer_figure(observer: Observer, title: str = "observer", facts: Mapping[str, str] | None = None) -> Figure:
-    """Draw the entries of an observer's correction filter beside a list of facts."""
+def observer_figure(observer: Observer) -> Figure:
+    """Draw the entries of an observer's correction filter."""
+    figure, axes = _filter_figure(observer.controller, _entries(observer))
+    axes[0, 0].set_title(observer_label(observer.name))
+    axes[0, 2].remove()
+    return figure
+
+
+def _entries(observer: Observer) -> list[str]:
+    """Return from which innovation to which input or state each entry of the filter leads."""
     states, K = observer.lifting.states, observer.controller
-    facts = facts or {
-        "states": ", ".join(states),
-        "lifted functions": ", ".join(observer.lifting.functions) or "none",
-        "measured": ", ".join(states[i] for i in observer.measured),
-        "inputs": ", ".join(observer.inputs),
-        "filter states": str(K.n_states),
-        "sampling period": f"{number(observer.sample_period_s)} s",
-    }
     to = observer.inputs if observer.injection is Injection.INPUT else observer.lifting.names
-    labels = [f"{short(states[j])} → {short(to[i])}" for i in range(K.n_outputs) for j in observer.measured]
-    return _filter_figure(K, labels, observer_label(observer.name), title, facts)
+    return [f"{short(states[j])} → {short(to[i])}" for i in range(K.n_outputs) for j in observer.measured]
 
 
 def design_figure(design: Design, models: IdentifiedModels | None = None) -> Figure:
-    """Draw the correction filter and its certificates, or with `models` the estimates on a held-out episode."""
+    """Draw the correction filter and its certificate, or with `models` the estimates on a held-out episode."""
     if models is not None:
         return estimate_figure(design.observer, models)
-    proof, error = design.certificate, design.facts.get("hidden_error_percent")
-    facts = {
-        **certificate_of(design.synthesis),
-        "at run time": f"gain {number(proof.gain)}" if proof.certified else "not certified",
-        "training error": "–" if error is None else f"{number(error)} %",
-    }
-    return observer_figure(design.observer, "certificate", facts)
+    return synthesis_figure(design.synthesis, _entries(design.observer), observer_label(design.observer.name))
 
 
-def _filter_figure(K: StateSpace, labels: Sequence[str], name: str, title: str, facts: Mapping[str, str]) -> Figure:
-    """Draw magnitude and phase of a filter's entries beside a titled list of facts."""
-    figure, axes = grid(1, 3, 2.6, width_ratios=(1, 1, 1.1))
-    freqs = np.geomspace(1e-5, 1, 300) * (0.5 / K.dt if K.dt else 1e3)
+def _filter_figure(K: StateSpace, labels: Sequence[str]) -> tuple[Figure, Any]:
+    """Draw magnitude and phase of a filter's entries, with a third panel for notes."""
+    figure, axes = grid(1, 3, 2.6)
+    freqs = np.geomspace(1e-5, 1, _FREQUENCIES) * (0.5 / K.dt if K.dt else 1e3)
     response = K.frequency_response(freqs).reshape(len(freqs), -1).T
     for i, (label, line, tone) in enumerate(zip(labels, response, cycle(HUES), strict=False)):
         axes[0, 0].plot(freqs, decibel(line), color=tone.light, label=label if i < len(HUES) else None)
@@ -154,11 +147,5 @@ def _filter_figure(K: StateSpace, labels: Sequence[str], name: str, title: str, 
     for panel, label in zip(axes[0, :2], ("magnitude (dB)", "phase (°)"), strict=True):
         frequency_axis(panel, freqs, most=4)
         panel.set_ylabel(label)
-    axes[0, 0].set_title(f"correction by {name}")
-    axes[0, 2].axis("off")
-    axes[0, 2].set_title(title)
-    for row, (what, value) in enumerate(facts.items()):
-        note(axes[0, 2], what, (0, 0.95 - 0.1 * row), va="top", size=8, color=Tone.SOFT.light)
-        note(axes[0, 2], shorten(value, _LONGEST), (0.5, 0.95 - 0.1 * row), va="top", size=8)
     legend(figure, axes[0, 0], columns=4)
-    return figure
+    return figure, axes

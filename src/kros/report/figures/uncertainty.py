@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from ...core.errors import ConfigError
 from ...identify import ModelSet
-from ...uncertainty import Cover, Form, UncertainModel, bounds, sigma_max
+from ...uncertainty import Cover, Form, UncertainModel, bounds
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals
-from ...uncertainty.weights.cover import Structure
 from ..canvas import (
     Array,
     Axes,
@@ -24,13 +23,11 @@ from ..canvas import (
     line_over_shade,
     lines_of_units,
     note,
-    thin_log,
-    zero_line,
 )
 from ..names import best_models, model_label, number, words
-from ..run_folder import NotShownError, RunFolder
+from ..run_folder import RunFolder
 from ..theme import HUES, Tone
-from .entries import beside, differing, entries_figure, entry_names, short
+from .entries import beside, differing, entries_figure, entry_names
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -83,9 +80,8 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
     """Draw the bounds of all forms over frequency, the form in use thick."""
     for form, bound in model.bounds.items():
-        freqs, line = thin_log(model.freqs_hz, bound)
-        axes.plot(freqs, decibel(line), color=FORM_TONES[form].light, lw=2.4 if form is model.form else 1.2)
-    zero_line(axes)
+        axes.plot(model.freqs_hz, decibel(bound), color=FORM_TONES[form].light, lw=2.4 if form is model.form else 1.2)
+    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
     frequency_axis(axes, model.freqs_hz)
 
 
@@ -98,49 +94,29 @@ def _ends(model: UncertainModel) -> list[tuple[float, str, str]]:
 
 def weights(run: RunFolder) -> tuple[Figure, str]:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
-    chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
-    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
-    text = (
-        "Shaded: the optimal bound by diagonal weights, frequency by frequency; the scale between left and right is free "
-        f"({'; '.join(parts)}, in the mean). Product below 0 dB: no unit of the set is ill-posed."
-    )
-    try:
-        units = {n: run.unit_residuals[n] for n in chosen if n in run.unit_residuals}
-    except NotShownError:
-        units = {}
-    text += " Last column: every unit relative to the weights; at most 0 dB, so all are bounded." if units else ""
-    square = all(m.weight.left.n_outputs == m.weight.right.n_outputs for m in chosen.values())
-    titles = ["left weight", "right weight", *(["product"] if square else []), *(["units"] if units else [])]
-    figure, axes = grid(len(chosen), len(titles), 2.0, sharex=True)
+    chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
+    figure, axes = grid(len(chosen), 3, 2.0, sharex=True)
     for row, (name, model) in zip(axes, chosen.items(), strict=True):
-        models = run.models.get(name)
-        names = models.inputs if models is not None and model.form in _INPUT_SIDE else None
-        _weights_row(row, model, names, square)
-        if name in units:
-            ratio_panel(row[-1], units[name])
+        _weights_row(row, model, run.models[name])
+        ratio_panel(row[2], run.unit_residuals[name])
         row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], titles, strict=True):
+    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
         panel.set_title(title)
     label_below(axes[-1])
-    return figure, text
+    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
+    return figure, (
+        "Shaded: the optimal bound by diagonal weights, frequency by frequency; the scale between left and right is free "
+        f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
+    )
 
 
-def _weights_row(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] | None, square: bool) -> None:
-    """Draw left weights, right weights and their product."""
-    fitted, cover = model.weight.magnitudes(model.freqs_hz), model.cover
-    if model.weight.structure is Structure.ENTRYWISE:
-        names = names and [f"{short(column)} → {short(row)}" for row in names for column in names]
-    else:
-        cover = in_gauge(cover, fitted)
-    _sides(row[0], model.freqs_hz, fitted.left, cover.left, names)
-    _sides(row[1], model.freqs_hz, fitted.right, cover.right, names)
-    if square:
-        left, right = (side.frequency_response(model.freqs_hz) for side in (model.weight.left, model.weight.right))
-        line_over_shade(
-            row[2], model.freqs_hz, sigma_max(right @ left), (cover.left * cover.right).max(axis=1), Tone.INK.light
-        )
-        row[2].axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
-        frequency_axis(row[2], model.freqs_hz, "", 4)
+def _weights_row(row: Sequence[Axes], model: UncertainModel, models: ModelSet | None) -> None:
+    """Draw left weights and right weights."""
+    names = models.inputs if models is not None and model.form in _INPUT_SIDE else ()
+    fitted = model.weight.magnitudes(model.freqs_hz)
+    cover = in_gauge(model.cover, fitted)
+    _side(row[0], model.freqs_hz, fitted.left, cover.left, names)
+    _side(row[1], model.freqs_hz, fitted.right, cover.right, names)
 
 
 def in_gauge(cover: Cover, other: Cover) -> Cover:
@@ -151,19 +127,16 @@ def in_gauge(cover: Cover, other: Cover) -> Cover:
     return Cover(cover.left / scale, cover.right * scale)
 
 
-def _sides(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str] | None) -> None:
+def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str]) -> None:
     """Draw the entries of one weight, each with its name."""
-    if magnitudes.shape[1] > 1 and np.allclose(magnitudes, magnitudes[:, :1]):  # a scalar weight
-        magnitudes, cover, names = magnitudes[:, :1], cover[:, :1], ["every signal"]
     columns = range(magnitudes.shape[1])
-    labels = names if names and len(names) == len(columns) else [str(i + 1) for i in columns]
+    labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
         line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
+        note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
     frequency_axis(axes, freqs_hz, "", 4)
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
     axes.set_ylim(low, high + 0.13 * (high - low) * len(columns))
-    for i, tone in zip(columns, HUES, strict=False):
-        note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
 
 
 def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
@@ -208,18 +181,19 @@ def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entr
         if models is None:
             raise ConfigError("Plot of an uncertain model: entries need models= the ModelSet that it was made of.")
         return entries_figure({models.name: beside(model, models)}, {models.name: entry_names(model.form, models)})
-    figure, axes = grid(2 if models is None else 3, 1, 2.4, sharex=True)
+    figure, axes = grid(2, 2, 2.4, sharex=True)
     draw_forms(axes[0, 0], model)
-    axes[0, 0].set_title(f"largest residual of {len(model.unit_ids)} units, nominal {model.nominal_id}")
     end_labels(axes[0, 0], _ends(model))
-    _both_sides(axes[1, 0], model)
-    if models is not None:
-        ratio_panel(axes[2, 0], beside(model, models))
-        axes[2, 0].set_title("every unit relative to the weights")
-    for panel in axes[:, 0]:
-        panel.set_ylabel("(dB)")
-        panel.set_xlabel("")
-    label_below(axes[-1])
+    _weights_row(axes[1], model, models)
+    if models is None:
+        axes[0, 1].remove()
+    else:
+        ratio_panel(axes[0, 1], beside(model, models))
+        axes[0, 1].set_title("units relative to the weights (dB)")
+    axes[0, 0].set_title(f"largest residual (dB), nominal {model.nominal_id}")
+    axes[1, 0].set_title("left weight (dB)")
+    axes[1, 1].set_title("right weight (dB)")
+    label_below(axes[1])
     return figure
 
 
@@ -229,20 +203,3 @@ def sets_figure(found: UncertainModels, kind: str | None = None, entries: bool =
     if name not in found.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(found.sets)}.")
     return uncertain_figure(found.sets[name], found.models.models(name), entries)
-
-
-def _both_sides(axes: Axes, model: UncertainModel) -> None:
-    """Draw left and right weights in one panel."""
-    fitted, ends = model.weight.magnitudes(model.freqs_hz), []
-    cover = in_gauge(model.cover, fitted)
-    sides: Mapping[str, tuple[Array, Array]] = {
-        "left": (fitted.left, cover.left),
-        "right": (fitted.right, cover.right),
-    }
-    for side, (lines, bound) in sides.items():
-        for i, tone in zip(range(lines.shape[1]), HUES, strict=False):
-            style = "-" if side == "left" else "--"
-            line_over_shade(axes, model.freqs_hz, lines[:, i], bound[:, i], tone.light, style)
-            ends.append((float(decibel(lines[:, i])[-1]), f"{side} {i + 1}", tone.light))
-    axes.set_title("weights, and the optimal bound (shaded)")
-    end_labels(axes, ends)

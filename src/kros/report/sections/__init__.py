@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from ..content import Section
+from ..facts import Facts
 from .certificates import certificates
 from .deployment import deployment
 from .errors import errors, left_out, other_conditions
 from .evidence import calibration, models, recordings, robustness, run, spread, uncertainty
 from .units import units
 
-Maker = Callable[[Mapping[str, Any]], Section | None]
+Maker = Callable[[Facts], Section | None]
 FIRST: tuple[Maker, ...] = (deployment, errors, units)
 EVIDENCE: tuple[Maker, ...] = (
     *(recordings, calibration, models, spread, uncertainty),

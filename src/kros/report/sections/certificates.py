@@ -7,11 +7,10 @@ from typing import Any
 
 from ...core.linalg import radius_text
 from ..content import Column, Section, Table, build
-from ..error_tables import ErrorCell, ErrorTable, error_tables
+from ..error_tables import ErrorCell
+from ..facts import Facts
 from ..names import BASELINES, axis_label, minus, observer_label, split_observer
-from ..verdict import measured_of
 
-Facts = Mapping[str, Any]
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
     "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the recorded "
@@ -33,25 +32,24 @@ _RECOMPUTED = (
 )
 
 
-def certificates(metrics: Facts) -> Section | None:
+def certificates(facts: Facts) -> Section | None:
     """Return certificates, assumptions and reasons; None where no observer was designed."""
-    entries = metrics.get("observers")
-    if not entries:
+    if not facts.observers:
         return None
-    tables = error_tables(metrics)
-    deployed = metrics["study"].get("deployed")
-    designed = {name: own for name, own in entries.items() if own.get("status") != "failed" and split_observer(name)[0]}
-    assumed = entries.get(deployed, {}).get("assumptions")
-    more = [f"“{observer_label(deployed)}” at run time: {'; '.join(assumed)}."] if deployed and assumed else []
+    assumed = facts.entry.get("assumptions")
+    more = [f"“{facts.label}” at run time: {'; '.join(assumed)}."] if assumed else []
     lists = [("Assumptions", [*_ASSUMED, *more]), ("How it is verified", _RECOMPUTED)]
-    shown = [_table(designed, tables[0] if tables else None, metrics), _reasons(entries)]
-    return Section("certificates", "Certificates", [_TEXT], tables=shown, lists=lists)
+    tables = [_table(facts), _reasons(facts.observers)]
+    return Section("certificates", "Certificates", [_TEXT], tables=tables, lists=lists)
 
 
-def _table(entries: Facts, errors: ErrorTable | None, metrics: Facts) -> Table | None:
-    """Return one row an observer."""
-    own, units = list(entries.values()), metrics["study"].get("channels", {})
-    bounds = [None if n in _baselines(entries) else e.get("lower_bound") or None for n, e in entries.items()]
+def _table(facts: Facts) -> Table | None:
+    """Return one row an observer with a model."""
+    entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_observer(n)[0]}
+    own, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
+    robust = [split_observer(n)[1] not in BASELINES for n in entries]  # a baseline's optimum bounds no worst case
+    bounds = [e.get("lower_bound") or None if r else None for e, r in zip(own, robust, strict=True)]
+    gaps = [e.get("gap_percent") if b else None for e, b in zip(own, bounds, strict=True)]
     radii = [e.get("spectral_radius_max") for e in own]
     columns = [
         Column("observer", [observer_label(name) for name in entries]),
@@ -59,47 +57,26 @@ def _table(entries: Facts, errors: ErrorTable | None, metrics: Facts) -> Table |
         Column("spectral radius", [None if r is None else minus(radius_text(r)) for r in radii]),
         Column("H2 norm at most", [e.get("worst_case_h2") for e in own], "set of plants"),
         Column("lower bound", bounds, "set of plants"),
-        Column(
-            "gap (%)", [e.get("gap_percent") if b else None for e, b in zip(own, bounds, strict=True)], "set of plants"
-        ),
+        Column("gap (%)", gaps, "set of plants"),
     ]
-    channels = list(dict.fromkeys(c for e in own for c in e.get("set_bound") or {} if c not in measured_of(metrics)))
-    for channel in channels:
-        cells = [(errors.cells.get(n, {}) if errors else {}).get(channel, ErrorCell()) for n in entries]
-        group = f"recorded signals: {axis_label(channel, units.get(channel, ''))}"
+    for channel in dict.fromkeys(c for e in own for c in e.get("set_bound") or {} if c not in facts.measured):
+        worst = [errors.get(n, {}).get(channel, ErrorCell()).worst_rms for n in entries]
+        group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
         columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in own], group))
-        columns.append(Column("worst RMS error", [cell.worst_rms for cell in cells], group))
+        columns.append(Column("worst RMS error", worst, group))
     columns += [
         Column("gain at most", [e.get("relift_gain") for e in own], "at run time"),
-        Column("loss rate certified", [_lost(e) for e in own], "at run time"),
+        Column("losses certified", [e.get("dropout_certified") for e in own], "at run time"),
     ]
-    deployed = metrics["study"].get("deployed")
-    caption = "Certificates of all observers"
-    return build(caption, columns, observer_label(deployed) if deployed else None, sortable=True)
+    return build("Certificates of all observers", columns, facts.label, sortable=True)
 
 
-def _baselines(entries: Facts) -> set[str]:
-    """Return the baselines, whose own optimum bounds nothing in the worst case."""
-    return {name for name in entries if split_observer(name)[1] in BASELINES}
-
-
-def _lost(entry: Facts) -> str:
-    """Return the declared loss rate, and whether it is certified."""
-    if entry.get("dropout_rate") is None:
-        return ""
-    return f"{100 * entry['dropout_rate']:g} %: {'yes' if entry.get('dropout_certified') else 'no'}"
-
-
-def _reasons(entries: Facts) -> Table | None:
+def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
     """Return why an observer could not be designed or certified; observers with the same reason share a row."""
     reasons: dict[tuple[str, str], list[str]] = {}
     for name, own in entries.items():
-        kinds = [
-            "not designed" if own.get("status") == "failed" else "set of plants",
-            "recorded signals",
-            "at run time",
-        ]
-        for kind, key in zip(kinds, ("reason", "set_reason", "relift_reason"), strict=True):
+        first = "not designed" if own.get("status") == "failed" else "set of plants"
+        for kind, key in ((first, "reason"), ("recorded signals", "set_reason"), ("at run time", "relift_reason")):
             if own.get(key):
                 text = "; ".join(dict.fromkeys(own[key].split("; ")))
                 reasons.setdefault((kind, text), []).append(observer_label(name))

@@ -10,12 +10,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from ...core.linalg import radius_text
-from ...data.population import DEFAULT_CONDITION
 from ...evaluate import Kind
 from ..content import Column, Section, build
 from ..disturbances import AXES, doublings
+from ..facts import Facts
 from ..names import (
-    condition_label,
+    in_condition,
     minus,
     model_label,
     number,
@@ -24,26 +24,24 @@ from ..names import (
     split_observer,
     words,
 )
-from ..verdict import measured_of
 
-Facts = Mapping[str, Any]
 _PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
 
 
-def recordings(metrics: Facts) -> Section:
+def recordings(facts: Facts) -> Section:
     """Return units, conditions, episodes and channels."""
-    study, measured, inputs = metrics["study"], measured_of(metrics), metrics["study"].get("inputs", ())
+    study = facts.study
     counts = [
-        f"{'' if c == DEFAULT_CONDITION else condition_label(c) + ': '}{n['train']} for training, {n['held_out']} held out"
+        f"{n['train']} for training and {n['held_out']} held out{in_condition(c)}"
         for c, n in study.get("episodes", {}).items()
     ]
-    text = f"{study['units']} units, sampled every {1e3 * study['sample_period_s']:g} ms."
+    text = f"{study['units']} units, sampled every {study['sample_period_s']:g} s."
     text += f" Episodes: {'; '.join(counts)}." if counts else ""
-    aside = [row["unit"] for row in metrics.get("units", []) if row.get("group") == "outliers"]
+    aside = [row["unit"] for row in facts.get("units", []) if row.get("group") == "outliers"]
     text += f" Set aside as outliers: {some_of(aside)}." if aside else ""
     text += f" Dropped for bad samples: {some_of(study['dropped'])}." if study.get("dropped") else ""
     channels, sensor = study.get("channels", {}), study.get("sensor", {})
-    roles = ["input" if c in inputs else "measured" if c in measured else "estimated" for c in channels]
+    roles = [_role(c, facts) for c in channels]
     declared = [", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v) for c in channels]
     columns = [
         Column("channel", [words(c) for c in channels]),
@@ -56,7 +54,14 @@ def recordings(metrics: Facts) -> Section:
     return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
 
 
-def _limit(limit: Facts | None) -> str:
+def _role(channel: str, facts: Facts) -> str:
+    """Return whether a channel is an input, measured at run time or estimated."""
+    if channel in facts.study.get("inputs", ()):
+        return "input"
+    return "measured" if channel in facts.measured else "estimated"
+
+
+def _limit(limit: Mapping[str, Any] | None) -> str:
     """Return a limit and where units were seen at it."""
     if limit is None:
         return ""
@@ -65,24 +70,24 @@ def _limit(limit: Facts | None) -> str:
     return f"{ends}, {'declared' if limit['declared'] else 'estimated'}{f', reached by {some_of(seen, 3)}' if seen else ''}"
 
 
-def calibration(metrics: Facts) -> Section | None:
+def calibration(facts: Facts) -> Section | None:
     """Return the phase calibration; None for a study without one."""
-    facts = metrics.get("calibration")
-    if not facts:
+    own = facts.get("calibration")
+    if not own:
         return None
     text = (
-        f"The gearbox disturbance is modelled as sin({facts['ratio']:g} · {facts['angle']} + {facts['parameter']}); the "
+        f"The gearbox disturbance is modelled as sin({own['ratio']:g} · {own['angle']} + {own['parameter']}); the "
         "phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse apart. "
-        f"Mean lag of the loop: {minus(format(math.degrees(facts['lag_rad']), '.1f'))}°."
+        f"Mean lag of the loop: {minus(format(math.degrees(own['lag_rad']), '.1f'))}°."
     )
-    missing = [row["unit"] for row in metrics.get("units", []) if row["status"] == "not calibrated"]
+    missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
     more = [f"Not calibrated, and without models: {some_of(missing)}."] if missing else []
     return Section("calibration", "Phase calibration", [text, *more], figure="phase")
 
 
-def models(metrics: Facts) -> Section | None:
+def models(facts: Facts) -> Section | None:
     """Return the models and their simulation errors."""
-    entries = metrics.get("models")
+    entries = facts.get("models")
     if not entries:
         return None
     functions: list[str] = next((own["functions"] for own in entries.values() if own.get("functions")), [])
@@ -109,9 +114,9 @@ def models(metrics: Facts) -> Section | None:
     return Section("models", "Models", [text], tables=[build(caption, columns)], figure="free_run")
 
 
-def spread(metrics: Facts) -> Section | None:
+def spread(facts: Facts) -> Section | None:
     """Return how the units differ from the nominal one."""
-    entries = metrics.get("uncertainty")
+    entries = facts.get("uncertainty")
     if not entries:
         return None
     first = next(iter(entries.values()))
@@ -120,23 +125,17 @@ def spread(metrics: Facts) -> Section | None:
         f"forms; its peak is the largest singular value over units and frequencies. The design uses the form "
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
-    noise = [
-        f"{model_label(name)} models: {100 * (1 - own['noise_share']['at_peak']):.0f} % of the spread at "
-        f"{number(own['noise_share']['peak_hz'])} Hz is variation between units, the rest is estimation noise."
-        for name, own in entries.items()
-        if "noise_share" in own
-    ]
     forms = list(dict.fromkeys(f for own in entries.values() for f in own["peak_db"]))
     used = ["used" if form == first["form"] else "" for form in forms]
     columns = [Column("form", [words(form) for form in forms], notes=used)]
     columns += [Column(f"{model_label(n)} (dB)", [e["peak_db"].get(f) for f in forms]) for n, e in entries.items()]
     table = build("Peak residual, with the nominal unit that suits each form best", columns, words(first["form"]))
-    return Section("spread", "Spread of the units", [text, *noise], tables=[table], figure="models")
+    return Section("spread", "Spread of the units", [text], tables=[table], figure="models")
 
 
-def uncertainty(metrics: Facts) -> Section | None:
+def uncertainty(facts: Facts) -> Section | None:
     """Return the weights that bound the residuals of all units."""
-    entries = metrics.get("uncertainty")
+    entries = facts.get("uncertainty")
     if not entries:
         return None
     text = (
@@ -152,9 +151,15 @@ def uncertainty(metrics: Facts) -> Section | None:
         Column("largest normalised residual", [_exact(own["cover_max"]) for own in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
         Column("above the optimal bound (dB)", [own["overbound_db_max"] for own in weights]),
+        Column("estimation noise in the spread (%)", [_noise(own) for own in entries.values()]),
         Column("approximation error", [own["misfit_max"] for own in entries.values()]),
     ]
     return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
+
+
+def _noise(entry: Mapping[str, Any]) -> float | None:
+    """Return the share of estimation noise in the largest difference between units, percent."""
+    return 100 * entry["noise_share"]["at_peak"] if "noise_share" in entry else None
 
 
 def _exact(value: float | None) -> str | None:
@@ -162,34 +167,31 @@ def _exact(value: float | None) -> str | None:
     return None if value is None else number(value, 6)
 
 
-def robustness(metrics: Facts) -> Section | None:
+def robustness(facts: Facts) -> Section | None:
     """Return where errors double on disturbed measurements; None where the study did not try."""
-    found = doublings(metrics, measured_of(metrics))
+    found = doublings(facts)
     if not found:
         return None
     text = (
         "The measurements of held-out episodes are disturbed in one way at a time, and the observers are not informed. The "
         "table shows where the error doubles, as the geometric mean over the hidden channels."
     )
-    deployed = metrics["study"].get("deployed") or ""
-    names = [n for n in found if split_observer(n)[0] in (split_observer(deployed)[0], "")] or list(found)
+    names = [n for n in found if split_observer(n)[0] in (facts.model, "")] or list(found)
     kinds = [kind for kind in Kind if any(kind in own for own in found.values())]
     columns = [Column("observer", [observer_label(n) for n in names])]
     columns += [Column(AXES[kind].title, [found[n].get(kind, "") for n in names]) for kind in kinds]
-    table = build(
-        "Severity that doubles the error; < and >: outside of what was tried", columns, observer_label(deployed)
-    )
+    table = build("Severity that doubles the error; < and >: outside of what was tried", columns, facts.label)
     return Section("robustness", "Disturbed measurements", [text], tables=[table], figure="robustness")
 
 
-def run(metrics: Facts) -> Section:
+def run(facts: Facts) -> Section:
     """Return times, versions and settings."""
-    timing = metrics.get("timing_s", {})
+    timing = facts.get("timing_s", {})
     times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
     known = {"Python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
     packages = [Column("package", list(known)), Column("version", list(known.values()))]
     text = "metrics.json holds all numbers of this page. The same recordings and settings give the same results."
-    settings = json.dumps(metrics.get("settings", {}), indent=1, ensure_ascii=False)
+    settings = json.dumps(facts.get("settings", {}), indent=1, ensure_ascii=False)
     tables = [build("Time; a stage that was up to date counts with its own time", times), build("Versions", packages)]
     return Section("run", "Run", [text], tables=tables, folded=[("All settings of the study", settings)])
 

@@ -3,82 +3,98 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ..content import Column, Section, build
-from ..names import condition_label, in_condition, number, observer_label, words
-from ..verdict import measured_of
+from ..facts import Facts
+from ..names import condition_label, in_condition, number, words
 
-Facts = Mapping[str, Any]
+Row = Mapping[str, Any]
 _MOST = 400  # rows of the table; metrics.json has all units
+_SCORES = (
+    "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A unit "
+    "above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
+)
 
 
-def units(metrics: Facts) -> Section | None:
+def units(facts: Facts) -> Section | None:
     """Return the table of units, flagged ones first; None where no unit is known."""
-    if not metrics.get("units"):
+    if not facts.get("units"):
         return None
-    study, home = metrics["study"], metrics["study"]["identify_on"]
-    name = study.get("deployed")
+    rows, home = facts.get("outliers", []), facts.study["identify_on"]
     errors = {
         (r["unit"], r["channel"]): r
-        for r in metrics.get("evaluation", [])
-        if r["observer"] == name and r["condition"] == home and r["channel"] not in measured_of(metrics)
+        for r in facts.get("evaluation", [])
+        if r["observer"] == facts.deployed and r["condition"] == home and r["channel"] not in facts.measured
     }
-    scores = {(r["unit"], r["condition"]): r for r in metrics.get("outliers", [])}
-    flagged = {unit for (unit, _), row in scores.items() if row["outlier"]}
-    largest = dict.fromkeys((row["unit"] for row in metrics["units"]), 0.0)
-    for (unit, _), row in errors.items():
-        largest[unit] = max(largest.get(unit, 0.0), math.inf if row["error_percent"] is None else row["error_percent"])
-    many = len(largest) > _MOST
-    rows = sorted(metrics["units"], key=lambda r: (r["unit"] not in flagged, -largest[r["unit"]] * many, r["unit"]))
-    names = [row["unit"] for row in rows[:_MOST]]
-    columns = [Column("unit", names), Column("status", [_status(r, flagged, scores) for r in rows[:_MOST]])]
-    for channel in dict.fromkeys(c for _, c in errors):
-        own = [errors.get((unit, channel), {}) for unit in names]
-        group = f"error of {words(channel)}"
-        columns.append(Column("%", [r.get("error_percent") for r in own], group))
-        columns.append(Column("against the true signal (%)", [r.get("true_error_percent") for r in own], group))
-    for condition in dict.fromkeys(c for _, c in scores):
-        own = [scores.get((unit, condition), {}).get("score") for unit in names]
-        columns.append(Column(f"{condition_label(condition)} (dB)", own, "outlier score"))
-    limits = [[r["detectable"] for (u, _), r in scores.items() if u == unit and r.get("detectable")] for unit in names]
-    columns.append(Column("detectable change of gain (%)", [max(own, default=None) for own in limits], "outlier score"))
-    phases = [row.get("phase_rad") for row in rows[:_MOST]]
-    columns.append(Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]))
-    cut = "Every unit" if len(rows) <= _MOST else f"{_MOST} of {len(rows)} units, flagged ones and largest errors first"
+    scores = {(r["unit"], r["condition"]): r for r in rows}
+    shown = _first(facts.get("units"), errors, {r["unit"] for r in rows if r["outlier"]})
+    names = [row["unit"] for row in shown]
+    phases = [row.get("phase_rad") for row in shown]
+    columns = [
+        Column("unit", names),
+        Column("status", [_status(row, [r for r in rows if r["unit"] == row["unit"]]) for row in shown]),
+        *_errors(names, errors),
+        *_scores(names, scores),
+        Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]),
+    ]
+    cut = "Every unit" if len(shown) == len(facts.get("units")) else "Flagged units and largest errors"
     table = build(f"{cut}{in_condition(home)}; errors in percent of the largest value", columns, sortable=True)
-    text = [f"Errors are those of “{observer_label(name)}”."] if name else []
-    figure = "outlier_scores" if scores else ""
-    return Section("units", "Units", [*text, *_scores(metrics)], tables=[table], figure=figure)
+    text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
+    text += [_SCORES, *(_flagged(r) for r in rows[:_MOST] if r["outlier"])] if rows else []
+    return Section("units", "Units", text, tables=[table], figure="outlier_scores" if rows else "")
 
 
-def _status(row: Facts, flagged: set[str], scores: Mapping[tuple[str, str], Facts]) -> str:
+def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
+    """Return flagged units first, then by name; of very many units those with the largest errors."""
+    ordered = sorted(rows, key=lambda r: (r["unit"] not in flagged, r["unit"]))
+    if len(rows) <= _MOST:
+        return ordered
+    largest: dict[str, float] = {}
+    for (unit, _), row in errors.items():
+        error = math.inf if row["error_percent"] is None else row["error_percent"]
+        largest[unit] = max(largest.get(unit, 0.0), error)
+    return sorted(ordered, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0)))[:_MOST]
+
+
+def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:
+    """Return the errors of every hidden channel."""
+    keys = {"%": "error_percent", "against the true signal (%)": "true_error_percent"}
+    return [
+        Column(title, [errors.get((unit, channel), {}).get(key) for unit in names], f"error of {words(channel)}")
+        for channel in dict.fromkeys(c for _, c in errors)
+        for title, key in keys.items()
+    ]
+
+
+def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list[Column]:
+    """Return scores and detectable changes in every condition."""
+    keys = {"(dB)": "score", "detectable change of gain (%)": "detectable"}
+    return [
+        Column(
+            f"{condition_label(condition)} {title}".strip(),
+            [scores.get((unit, condition), {}).get(key) for unit in names],
+            "outlier score",
+        )
+        for condition in dict.fromkeys(c for _, c in scores)
+        for title, key in keys.items()
+    ]
+
+
+def _status(row: Row, scores: Sequence[Row]) -> str:
     """Return one word a unit."""
-    if row["unit"] in flagged:
+    if any(r["outlier"] for r in scores):
         return "flagged"
-    own = [r.get("status") for (unit, _), r in scores.items() if unit == row["unit"]]
-    silent = bool(own) and all(status in ("not enough data", "cannot tell") for status in own)
-    return "undecided" if silent and row.get("status", "ok") == "ok" else str(row.get("status", "ok"))
+    silent = bool(scores) and all(r.get("status") in ("not enough data", "cannot tell") for r in scores)
+    status = str(row.get("status", "ok"))
+    return "undecided" if silent and status == "ok" else status
 
 
-def _scores(metrics: Facts) -> list[str]:
-    """Say how units are scored, and where flagged ones differ."""
-    rows = metrics.get("outliers", [])
-    if not rows:
-        return []
-    text = (
-        "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. "
-        "A unit above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
-    )
-    return [text, *(_flagged(r) for r in rows[:_MOST] if r["outlier"])]
-
-
-def _flagged(row: Facts) -> str:
+def _flagged(row: Row) -> str:
     """Say where and how clearly a flagged unit differs."""
-    text = f"Unit {row['unit']} ({condition_label(row['condition'])}) scores {number(row['score'])} dB"
-    if row.get("freq_hz") is not None:
-        text += f", most at {number(row['freq_hz'])} Hz"
+    text = f"Unit {row['unit']}{in_condition(row['condition'])}: score {number(row['score'])} dB"
+    text += f", most at {number(row['freq_hz'])} Hz" if row.get("freq_hz") is not None else ""
     if row.get("lowest_db") is not None:
         text += f"; {number(row['lowest_db'])} to {number(row['highest_db'])} dB over the choices of the nominal unit"
     return f"{text}."

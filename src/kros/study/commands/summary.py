@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from ...core.artifacts import load_artifact, read_json
-from ...report.error_tables import home_table
-from ...report.verdict import judge, measured_of
+from ...report.facts import Facts
+from ...report.verdict import judge
 from ..config import Stage
 from ..engine.run_folder import open_finished
 from ..pipeline import RunResult
@@ -16,21 +14,22 @@ from ..pipeline import RunResult
 
 def summary_lines(result: RunResult) -> list[str]:
     """Return the verdict, three numbers, and where the report is."""
-    verdict, report, study = judge(result.metrics), result.folder / "report.html", result.metrics["study"]
-    if study.get("deployed") is None:
-        units = f"{study['units']} units, {len(study['conditions'])} condition(s): no observer has been designed yet"
-        return [units, *(f"check: {alert}" for alert in study.get("alerts", ())), f"results: {result.folder}"]
+    facts, report = Facts(result.metrics), result.folder / "report.html"
+    if not facts.deployed:
+        units = f"{facts.study['units']} units: no observer has been designed yet"
+        return [units, *(f"check: {alert}" for alert in facts.study.get("alerts", ())), f"results: {result.folder}"]
+    verdict = judge(facts)
     numbers = [f"{n.label} {n.value} {n.unit} ({n.notes[-1]})" for n in verdict.numbers]
     lines = [f"{verdict.status.value}: {verdict.sentence}", *(["; ".join(numbers)] if numbers else [])]
     return [*lines, f"report: {report}" if report.exists() else f"results: {result.folder}"]
 
 
-def ranking(metrics: Mapping[str, Any]) -> list[str]:
+def ranking(facts: Facts) -> list[str]:
     """Return one line an observer, the smallest error of the hidden channels first."""
-    table = home_table(metrics)
+    table = facts.table
     if table is None:
         return []
-    hidden = table.hidden(measured_of(metrics))
+    hidden = table.hidden(facts.measured)
     names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
     width, wide = max(map(len, names)), {c: max(12, len(c) + 2) for c in hidden}
     head = f"{'':<{width}}  " + "".join(f"{c:>{wide[c]}}" for c in hidden)
@@ -38,7 +37,7 @@ def ranking(metrics: Mapping[str, Any]) -> list[str]:
     for name in names:
         cells = [table.cells[name].get(c) for c in hidden]
         texts = ["–" if c is None else "diverged" if c.mean is None else f"{c.mean:.4g}" for c in cells]
-        mark = "  <- deployed" if name == metrics["study"]["deployed"] else ""
+        mark = "  <- deployed" if name == facts.deployed else ""
         lines.append(
             f"{name:<{width}}  " + "".join(f"{t:>{wide[c]}}" for t, c in zip(texts, hidden, strict=True)) + mark
         )
@@ -53,7 +52,7 @@ def list_run(run: Path) -> list[str]:
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.is_kept("metrics.json"):
             result = RunResult(store.folder, read_json(store.path("metrics.json")), ())
-            return lines + ranking(result.metrics) + summary_lines(result)
+            return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]

@@ -28,10 +28,8 @@ log = logging.getLogger(__name__)
 _DPI = 200
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
-# What is left out; looking around is fast, filling in what was found is not.
-_ALONG = re.compile(r"\s+(?=[A-Z])|(?<=[A-Z])\s+|(?<=\.\d)\d+")
-_BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")
-_WRITTEN = re.compile(r"(>[^<>]*[^<>\s][^<>]*<)")
+_COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
+_BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
@@ -108,11 +106,7 @@ def to_svg(figure: Figure, name: str) -> str:
     for tone in Tone:
         text = text.replace(tone.light, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
-    # coordinates stand inside tags; a hundredth of a point is enough, along lines a tenth
-    text = re.sub(r'(?<= d=")[^"]*', lambda path: _ALONG.sub("", path.group()), text)
-    parts = _WRITTEN.split(text)
-    parts[::2] = [_BEYOND.sub("", tags) for tags in parts[::2]]
-    return "".join(parts).strip()
+    return _COORDINATES.sub(lambda found: _BEYOND.sub("", found.group()), text).strip()
 
 
 def _named_units(text: str) -> str:

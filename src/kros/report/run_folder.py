@@ -90,15 +90,15 @@ class RunFolder:
         return read_parquet(folder)
 
     @cached_property
+    def channels(self) -> tuple[Channel, ...]:
+        """Channels with their units of measure."""
+        return self._signals.channels
+
+    @cached_property
     def _signals(self) -> ModelSet | Population:
         """What knows channels and sampling period."""
         identified = any(name.startswith("models/") for name in self.files)
         return next(iter(self.models.values())) if identified else self.population
-
-    @property
-    def channels(self) -> tuple[Channel, ...]:
-        """Channels with their units of measure."""
-        return self._signals.channels
 
     @property
     def states(self) -> list[Channel]:

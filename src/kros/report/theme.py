@@ -76,6 +76,7 @@ _SETTINGS: dict[str, Any] = {
     "legend.frameon": False,
     "legend.fontsize": 8,
     "path.simplify_threshold": 0.3,
+    "text.hinting": "none",
     "svg.fonttype": "none",
     "svg.hashsalt": "kros",
     "pdf.fonttype": 42,

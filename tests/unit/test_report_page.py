@@ -1,4 +1,4 @@
-"""The page, the figures as files and the plots, on a small run folder written by the dataclasses that the stages use."""
+"""The page, figures as files and plots, on a small run folder written by the classes that the stages use."""
 
 from __future__ import annotations
 
@@ -434,9 +434,12 @@ def test_words_of_the_verdict(page: str) -> None:
 _LOOK = """
 const folded = page.documentElement.scrollHeight, details = [...page.querySelectorAll("details")];
 details.forEach(one => { one.removeAttribute("name"); one.open = true; });
-const cut = [...page.querySelectorAll(".wide")].filter(one => one.querySelector("table") && one.scrollWidth > one.clientWidth + 1);
-const table = page.querySelector("#errors table.sortable"), column = () => [...table.tBodies[0].rows].map(row => row.cells[2].dataset.value ?? "");
-const [first, second] = [0, 1].map(() => { table.querySelector("thead tr:last-child th:nth-child(3) button").click(); return column(); });
+const cut = [...page.querySelectorAll(".wide")].filter(
+  one => one.querySelector("table") && one.scrollWidth > one.clientWidth + 1);
+const table = page.querySelector("#errors table.sortable");
+const column = () => [...table.tBodies[0].rows].map(row => row.cells[2].dataset.value ?? "");
+const button = table.querySelector("thead tr:last-child th:nth-child(3) button");
+const [first, second] = [0, 1].map(() => { button.click(); return column(); });
 const field = page.querySelector("#errors input");
 field.value = "kalman no"; field.dispatchEvent(new Event("input"));
 const shown = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
@@ -585,14 +588,15 @@ def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
         assert figure.axes
         figure.canvas.draw()
     assert dict(matplotlib.rcParams) == before
-    with pytest.raises(ConfigError, match="found a int"):
+    with pytest.raises(ConfigError, match="got a int"):
         plot(3)
 
 
 def test_drawing_leaves_pyplot_alone() -> None:
     code = (
-        "import sys, numpy as np; from kros.core.lti import gain; import kros.report; assert 'matplotlib' not in sys.modules;"
-        "from kros.synthesis.result import Status, Synthesis; kros.report.plot(Synthesis('h2', gain([[1.0]], 0.1), Status.OPTIMAL));"
+        "import sys; from kros.core.lti import gain; import kros.report; assert 'matplotlib' not in sys.modules;"
+        "from kros.synthesis.result import Status, Synthesis;"
+        "kros.report.plot(Synthesis('h2', gain([[1.0]], 0.1), Status.OPTIMAL));"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .names import RAISED, minus
-from .theme import WIDTH_IN
+from .theme import DRAWING
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -22,8 +22,7 @@ else:  # for annotations alone: matplotlib is imported when something is drawn
     Artist = Axes = Figure = Any
 
 Array: TypeAlias = npt.NDArray[Any]
-_POINTS = 250  # pairs of points of a line
-_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+_PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 
 def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
@@ -32,7 +31,7 @@ def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     layout = ConstrainedLayoutEngine(w_pad=0.05, h_pad=0.05, wspace=0.02, hspace=0.02)
-    figure = Figure(figsize=(WIDTH_IN, rows * row_height_in), layout=layout)
+    figure = Figure(figsize=(DRAWING.width_in, rows * row_height_in), layout=layout)
     panels = figure.subplots(rows, columns, squeeze=False, **options)
     for panel in panels.ravel():
         engineering(panel.yaxis)
@@ -54,9 +53,10 @@ def engineering(axis: Axis) -> None:
     def text(value: float, _: Any) -> str:
         largest = max(map(abs, axis.get_view_interval()))
         exponent = 3 * floor(log10(largest) / 3) if largest > 0 else 0
-        if 0.01 <= largest < 1e4 or exponent not in _PREFIXES or value == 0:
+        place = exponent // 3 + 4
+        if 0.01 <= largest < 1e4 or not 0 <= place < len(_PREFIXES) or value == 0:
             return minus(f"{value:.6g}")
-        return minus(f"{value / 10.0**exponent:.4g} {_PREFIXES[exponent]}")
+        return minus(f"{value / 10.0**exponent:.4g} {_PREFIXES[place]}")
 
     axis.set_major_formatter(FuncFormatter(text))
 
@@ -78,11 +78,12 @@ def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, fl
 
 def thin(x: Array, y: Array) -> tuple[Array, Array]:
     """Return a line with fewer points that looks the same: smallest and largest value of every bucket, in order."""
-    size = len(y) // _POINTS
+    count = DRAWING.points
+    size = len(y) // count
     if size < 3:
         return x, y
-    blocks = np.where(np.isfinite(y), y, 0.0)[: size * _POINTS].reshape(_POINTS, size)
-    starts = np.arange(_POINTS) * size
+    blocks = np.where(np.isfinite(y), y, 0.0)[: size * count].reshape(count, size)
+    starts = np.arange(count) * size
     rows = np.unique(np.concatenate([starts + blocks.argmin(axis=1), starts + blocks.argmax(axis=1), [len(y) - 1]]))
     return x[rows], y[rows]
 

@@ -1,6 +1,6 @@
 """What a page is made of, and the one builder of its tables. The template turns it into HTML and escapes every text.
 
-To add a column to a table, add one `Column` where the section builds it: title, one value a row, and the builder does the rest.
+To add a column to a table, add one `Column` where the section builds it: a title and one value a row.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Errors against the severity of disturbed measurements: curves from the rows of the metrics, and where an error doubles."""
+"""Errors against the severity of disturbed measurements: curves from the metrics, and where an error doubles."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Curves = dict[str, dict[Kind, dict[str, Curve]]]
 
 
 def curves(rows: Sequence[Mapping[str, Any]], condition: str, what: str = "mean") -> Curves:
-    """Return curves by observer, kind and channel, from ``robustness`` of the metrics; `what` is ``mean`` or ``worst``."""
+    """Return curves by observer, kind and channel from ``robustness``; `what` is ``mean`` or ``worst``."""
     plain: dict[tuple[str, str], float] = {}
     points: dict[tuple[str, Kind, str], list[tuple[float, float]]] = {}
     for row in (r for r in rows if r["condition"] == condition):
@@ -58,14 +58,14 @@ def curves(rows: Sequence[Mapping[str, Any]], condition: str, what: str = "mean"
         else:
             start = [(0.0, plain[observer, channel])]
             points.setdefault((observer, Kind(row["disturbance"]), channel), start).append((row["severity"], error))
-    found: Curves = {}
+    lines: Curves = {}
     for (observer, kind, channel), line in points.items():
-        found.setdefault(observer, {}).setdefault(kind, {})[channel] = Curve(*np.array(line).T)
-    return found
+        lines.setdefault(observer, {}).setdefault(kind, {})[channel] = Curve(*np.array(line).T)
+    return lines
 
 
 def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> str:
-    """Return the severity at which the error of hidden states doubles, in words; nothing where no severity doubles it."""
+    """Return the severity at which the error of hidden states doubles, as text."""
     hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
     if not hidden:
         return ""
@@ -81,7 +81,8 @@ def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str
 
 def doublings(facts: Facts) -> dict[str, dict[Kind, str]]:
     """Return by observer and kind the severity at which its error doubles in the condition of the models."""
-    found, measured = curves(facts.get("robustness", []), facts.study["identify_on"]), facts.measured
+    tried, measured = curves(facts.get("robustness", []), facts.study["identify_on"]), facts.measured
     return {
-        name: {kind: doubling(kind, own[kind], measured) for kind in AXES if kind in own} for name, own in found.items()
+        name: {kind: doubling(kind, lines[kind], measured) for kind in AXES if kind in lines}
+        for name, lines in tried.items()
     }

@@ -77,8 +77,8 @@ def _tables(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None) -
         published = grouped.get(PAPER, {})
         cells = {
             observer: {
-                c: _cell(own, published.get(c, []), _interval(own, intervals, (observer, condition, c)))
-                for c, own in channels.items()
+                c: _cell(units, published.get(c, []), _interval(units, intervals, (observer, condition, c)))
+                for c, units in channels.items()
             }
             for observer, channels in grouped.items()
         }
@@ -132,9 +132,9 @@ def _mean(values: Sequence[float]) -> float | None:
 
 def _band_db(rows: Rows, published: Rows) -> float | None:
     """Return the ratio of mean powers around the gearbox frequency over the units that both have, dB."""
-    own, theirs = ({r["unit"]: r.get("gearbox_band_power") for r in found} for found in (rows, published))
-    pairs = np.array([[own[unit], theirs[unit]] for unit in own if unit in theirs], float)
+    powers, others = ({r["unit"]: r.get("gearbox_band_power") for r in part} for part in (rows, published))
+    pairs = np.array([[powers[unit], others[unit]] for unit in powers if unit in others], float)
     if not pairs.size or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
         return None
-    powers = pairs.mean(axis=0)
-    return float(10 * np.log10(powers[0] / powers[1]))
+    mean = pairs.mean(axis=0)
+    return float(10 * np.log10(mean[0] / mean[1]))

@@ -35,7 +35,7 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Pat
     run : Path
         Run folder, which figures are drawn from.
     metrics : mapping
-        As in ``metrics.json``, which all texts and tables are made from; any part but ``study`` may be absent.
+        As in ``metrics.json``, the source of all texts and tables; any part but ``study`` may be absent.
     mapped : callable
         Maps the drawing of a figure over their names, in order, for example in several processes.
     out : Path, optional

@@ -25,7 +25,7 @@ PLOTS = {
     "Synthesis": "synthesis:synthesis_figure",
     "Observer": "synthesis:observer_figure",
 }
-"""Name of a result's class -> file of a figure and the function in it that draws the result. Its further parameters are the options of `plot`."""
+"""Name of a result's class -> module and function that draws it; further parameters are the options of `plot`."""
 
 
 def plot(result: Any, **options: Any) -> Figure:
@@ -34,13 +34,12 @@ def plot(result: Any, **options: Any) -> Figure:
     Parameters
     ----------
     result : one of the classes in `PLOTS`
-        A population is shown by the first episode of its first unit, models by their Bode magnitudes, uncertain models by forms, weights and every unit
-        over the weights, a design, a synthesis or an observer by the correction filter and its certificate, and a run by the
-        estimates of its deployed observer.
+        A population: its first episode. Models: Bode plots. Uncertain models: forms, weights, every unit relative to
+        the weights. A design, a synthesis, an observer: the correction filter. A run: the estimates.
     **options
-        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for the paper's figure of an uncertain model, entry by entry.
-        ``models`` of a design, the identified models behind it: its estimates on a held-out episode. ``name`` of a run: any figure of its report.
-        ``nominal`` of a `ModelSet`, a unit that is drawn on top; ``models`` of an `UncertainModel`, the `ModelSet` that it was made of.
+        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for an uncertain model entry
+        by entry; ``models`` of a design or an `UncertainModel`, the models behind it; ``name`` of a run, any of its
+        figures; ``nominal`` of a `ModelSet`, a unit that stands out.
 
     Returns
     -------
@@ -66,7 +65,7 @@ def plot(result: Any, **options: Any) -> Figure:
     )
     if name is None:
         raise ConfigError(
-            f"Plot: found a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
+            f"Plot: got a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
         )
     module, _, function = PLOTS[name].partition(":")
     draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)

@@ -1,6 +1,6 @@
 """A run folder as figures see it: every artifact by name, read when first asked for.
 
-Only files that the records of the run list are there. What a run does not have raises `NotShownError`, whose message says why.
+Only files in the records of the run count. What a run does not have raises `NotShownError`, whose message says why.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
@@ -67,7 +67,8 @@ class RunFolder:
     @cached_property
     def facts(self) -> dict[str, Any]:
         """Groups of units, episodes for training and testing, condition of the models."""
-        return self._record("population", "facts", "the recordings have not been read yet")
+        self._require("population/facts.json", "the recordings have not been read yet")
+        return self._record("population/facts.json")
 
     @property
     def identify_on(self) -> str:
@@ -116,16 +117,15 @@ class RunFolder:
         """Sampling period, s."""
         return self._signals.sample_period_s
 
-    @cached_property
-    def calibration(self) -> PhaseCalibration:
-        """The phase calibration."""
-        self._require("calibration/calibration.json", "the study has no phase calibration")
-        return PhaseCalibration.load(self.folder / "calibration")
-
     @property
     def calibrated(self) -> bool:
         """Whether the study has a phase calibration, hence a disturbance that is fixed to an angle."""
         return self.has("calibration/calibration.json")
+
+    @cached_property
+    def calibration(self) -> PhaseCalibration:
+        """The phase calibration."""
+        return PhaseCalibration.load(self._require("calibration/calibration.json", "there is no phase calibration"))
 
     @cached_property
     def models(self) -> dict[str, ModelSet]:
@@ -133,51 +133,29 @@ class RunFolder:
         models = self._load("models/*/model.json", ModelSet.load, "no models have been identified yet")
         return dict(sorted(_at_home(models).items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
 
-    def condition_models(self, name: str, condition: str) -> ModelSet:
-        """Return the models of one kind in a condition."""
-        if condition == self.identify_on:
-            return self.models[name]
-        place = f"models/{name}@{quote(condition, safe='')}"
-        self._require(f"{place}/model.json", f"no models have been identified in condition {condition!r}")
-        return ModelSet.load(self.folder / place)
-
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
         """Uncertain models of the condition that feeds synthesis."""
-        models = self._load("uncertainty/*/*.json", UncertainModel.load, "the uncertainty has not been quantified yet")
-        return _at_home(models)
+        reason = "the uncertainty has not been quantified yet"
+        return _at_home(self._load("uncertainty/*/*.json", UncertainModel.load, reason))
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
         """Residuals of all units relative to the weights, by kind of model."""
-        reason = "the run has no residuals of single units"
-        return self._load("uncertainty/*/units/*.json", UnitResiduals.load, reason)
+        return self._load("uncertainty/*/units/*.json", UnitResiduals.load, "there are no residuals of single units")
 
     @cached_property
-    def others(self) -> tuple[str, dict[str, UnitResiduals]]:
-        """Condition of the highest outlier score, and there the residuals of all units, by kind of model."""
+    def others(self) -> dict[str, UnitResiduals]:
+        """Residuals of the highest-scoring unit and of all others, by kind of model and condition."""
         reason = "no unit was compared with the others; at least three units in a condition are needed"
-        residuals = self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
-        condition = self._condition(next(iter(residuals)))
-        return condition, {name.partition("@")[0]: one for name, one in residuals.items()}
+        return self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
         """Outlier scores by condition."""
         reason = "outlier scores need at least three units in a condition"
         models = self._load("outliers/*/outlier_model.json", OutlierModel.load, reason)
-        return {self._condition(name): one for name, one in models.items()}
-
-    def _condition(self, name: str) -> str:
-        """Return the condition of a folder of models."""
-        return unquote(name.partition("@")[2]) or self.identify_on
-
-    @cached_property
-    def nominal(self) -> str | None:
-        """The nominal unit, where one has been chosen."""
-        if not self.has("uncertainty/choice.json"):
-            return None
-        return str(self._record("uncertainty", "choice", "")["nominal"])
+        return {unquote(name.partition("@")[2]) or self.identify_on: one for name, one in models.items()}
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
@@ -185,31 +163,32 @@ class RunFolder:
         return self._load("synthesis/*/*/synthesis.json", Synthesis.load, "no observer has been synthesized yet")
 
     @property
+    def nominal(self) -> str | None:
+        """The nominal unit, where one has been chosen."""
+        return self._record("uncertainty/choice.json").get("nominal")
+
+    @property
     def deployed(self) -> str | None:
         """Name of the deployed observer, where there is one."""
-        if not self.has("observers/observers.json"):
-            return None
-        name = self._record("observers", "observers", "").get("deployed")
-        return None if name is None else str(name)
+        return self._record("observers/observers.json").get("deployed")
+
+    @property
+    def disturbed(self) -> dict[str, Any]:
+        """Errors on disturbed measurements; empty where the study does not ask for them."""
+        return self._record("disturbed/disturbed.json")
 
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Errors of all observers and models."""
-        self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
-        content: dict[str, Any] = read_json(self.folder / "evaluation" / "evaluation.json")
+        folder = self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
+        content: dict[str, Any] = read_json(folder / "evaluation.json")
         return content
-
-    @cached_property
-    def disturbed(self) -> dict[str, Any]:
-        """Errors on disturbed measurements; empty where the study does not ask for them."""
-        return load_artifact(self.folder / "disturbed", "disturbed")[0] if self.has("disturbed/disturbed.json") else {}
 
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
-        keys = self.evaluation["shown"]
-        self._require("evaluation/arrays.npz", "the observers have not been evaluated yet")
-        arrays = dict(read_arrays(self.folder / "evaluation" / "arrays.npz"))
+        keys, reason = self.evaluation["shown"], "the observers have not been evaluated yet"
+        arrays = dict(read_arrays(self._require("evaluation/arrays.npz", reason) / "arrays.npz"))
         return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(keys)]
 
     def _shown(self, arrays: Mapping[str, Array], start: str, key: EpisodeKey) -> Shown:
@@ -222,25 +201,27 @@ class RunFolder:
         time_s = np.arange(len(part["states"])) * self.sample_period_s
         return Shown(key, time_s, part["states"], part["inputs"], observers, models)
 
-    def _record(self, place: str, name: str, reason: str) -> dict[str, Any]:
-        self._require(f"{place}/{name}.json", reason)
-        return load_artifact(self.folder / place, name)[0]
+    def _record(self, name: str) -> dict[str, Any]:
+        """Return the content of an artifact; nothing where the run does not have it."""
+        path = self.folder / name
+        return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
 
     def _load(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
-        """Load the folders of all files that match a pattern, by what its first stars stand for."""
-        parts = pattern.split("/")
-        stars = [k for k, part in enumerate(parts[:-1]) if part == "*"]
+        """Load the folders of all files that match a pattern, by what its stars before the file stand for."""
+        stars = [k for k, part in enumerate(pattern.split("/")[:-1]) if part == "*"]
         paths = [PurePosixPath(name) for name in sorted(self.files) if name.count("/") == pattern.count("/")]
         folders = {"/".join(p.parts[k] for k in stars): p.parent for p in paths if p.match(pattern)}
         if not folders:
             raise NotShownError(reason)
         return {name: load(self.folder / folder) for name, folder in folders.items()}
 
-    def _require(self, name: str, reason: str) -> None:
+    def _require(self, name: str, reason: str) -> Path:
+        """Return the folder of a file, or raise with the reason why it is not there."""
         if not self.has(name):
             raise NotShownError(reason)
+        return (self.folder / name).parent
 
 
-def _at_home(found: Mapping[str, T]) -> dict[str, T]:
+def _at_home(artifacts: Mapping[str, T]) -> dict[str, T]:
     """Return what belongs to the condition that feeds synthesis."""
-    return {name: one for name, one in found.items() if "@" not in name}
+    return {name: one for name, one in artifacts.items() if "@" not in name}

@@ -1,6 +1,6 @@
 """The verdict on a run: READY, CHECK or NOT READY with its reasons, three numbers, and what voids the certificate.
 
-The head of the report and the lines behind ``kros run`` are both made here, from ``metrics.json`` alone.
+The head of the report and the lines behind ``kros run`` both come from here.
 """
 
 from __future__ import annotations
@@ -16,9 +16,19 @@ from .names import BASELINES, condition_label, joined, minus, model_label, numbe
 from .names import split_observer as split
 
 Row = Mapping[str, Any]
-BETTER = 0.05  # share by which all mean errors of an observer lie below another's where it is called more accurate
-NO_GAIN = 0.01  # share below which a correction is said to bring nothing
-SMALL_SET = 5.0  # ratio of a model's error to the size of its uncertain set from which on the set is called small
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """From where on a difference is a reason to check."""
+
+    better: float = 0.05  # share by which all mean errors of another observer are smaller
+    improved: float = 0.01  # share by which a correction must reduce the error of the model alone
+    small_set: float = 5.0  # ratio of a model's simulation error to the size of its uncertain set
+    noise: float = 0.5  # share of estimation noise in the largest difference between units
+
+
+THRESHOLDS = Thresholds()
 
 
 class Status(Enum):
@@ -155,7 +165,7 @@ def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
         text += f"“{condition_label(facts.study['identify_on'])}”."
         yield text, "Record all units in the same conditions.", "recordings"
     noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
-    if noise and noise["at_peak"] >= 0.5:
+    if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
 
@@ -231,7 +241,7 @@ def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if peak is None or not known:
         return
     channel, size = max(known, key=lambda c: known[c]), 100 * 10 ** (peak / 20)
-    if known[channel] > SMALL_SET * size:
+    if known[channel] > THRESHOLDS.small_set * size:
         yield (
             f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
             f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
@@ -282,8 +292,8 @@ def voids(facts: Facts) -> list[str]:
 
 
 def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> str | None:
-    """Return the most accurate of the observers that are better by `BETTER` in every channel; None where none is."""
-    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 1 - BETTER)]
+    """Return the most accurate of the observers that are clearly better in every channel; None where none is."""
+    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 1 - THRESHOLDS.better)]
     return min(better, key=lambda o: table.mean(o, channels), default=None)
 
 
@@ -292,7 +302,7 @@ def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[
     other = f"{split(name)[0]}/open_loop"
     if name == other or other not in table.cells:
         return []
-    return [c for c in channels if not _smaller(table, name, other, [c], 1 - NO_GAIN)]
+    return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]
 
 
 def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:

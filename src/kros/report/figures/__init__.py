@@ -1,6 +1,6 @@
 """Figures: one row of one table each, in the order of the paper's argument.
 
-The function behind a row takes a `RunFolder` and the options of the row; it returns the figure and the rest of its caption.
+The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
 """
 
 from __future__ import annotations

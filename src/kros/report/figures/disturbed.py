@@ -13,12 +13,9 @@ from ..canvas import Axes, Figure, frequency_axis, grid, legend, logarithmic, po
 from ..disturbances import AXES, Curve, curves
 from ..names import Look, in_condition, method_label, method_look, model_label, model_look, split_observer, words
 from ..run_folder import NotShownError, RunFolder
+from ..theme import DRAWING
 from .episodes import TRUTH, draw_lines, hide_times
 
-_COLUMNS = 4
-_ZERO = 0.1  # place of "none" on a logarithmic axis, as a share of the smallest severity
-_DIVERGED = 400.0  # percent; errors above are not drawn
-_SEGMENT = 4096  # samples of a spectrum
 _WAYS = (("load", "load state"), ("current", "error of the\nrecorded current"))
 
 
@@ -27,14 +24,14 @@ def robustness(run: RunFolder) -> tuple[Figure, str]:
     rows, channel, condition = run.disturbed.get("robustness", []), run.states[run.hidden[0]].name, run.identify_on
     if not rows:
         raise NotShownError("the study did not run observers on disturbed measurements")
-    found, model = curves(rows, condition), split_observer(run.deployed or "")[0]
-    names = [n for n in found if n == run.deployed or split_observer(n)[0] in (model, "")]
-    names = sorted((n for n in names if any(channel in c for c in found[n].values())), key=lambda n: n == run.deployed)
-    kinds = [kind for kind in AXES if any(kind in found[n] for n in names)]
-    figure, axes = grid(-(-len(kinds) // _COLUMNS), min(_COLUMNS, len(kinds)), 1.75, sharey=True)
+    tried, model = curves(rows, condition), split_observer(run.deployed or "")[0]
+    names = [n for n in tried if n == run.deployed or split_observer(n)[0] in (model, "")]
+    names = sorted((n for n in names if any(channel in c for c in tried[n].values())), key=lambda n: n == run.deployed)
+    kinds = [kind for kind in AXES if any(kind in tried[n] for n in names)]
+    figure, axes = grid(-(-len(kinds) // 4), min(4, len(kinds)), 1.75, sharey=True)
     panels = axes.ravel()
     for panel, kind in zip(panels, kinds, strict=False):
-        lines = {n: found[n][kind][channel] for n in names if channel in found[n].get(kind, {})}
+        lines = {n: tried[n][kind][channel] for n in names if channel in tried[n].get(kind, {})}
         _panel(panel, kind, lines, run.deployed)
     for panel in panels[len(kinds) :]:
         panel.remove()
@@ -44,8 +41,8 @@ def robustness(run: RunFolder) -> tuple[Figure, str]:
     legend(figure, panels[0], 4)
     seconds, units = run.disturbed["seconds"], len(run.disturbed["units"])
     return figure, (
-        f"RMS error of the {words(channel)}{in_condition(condition)}, mean over {units} units, the first {seconds:g} s of a "
-        "held-out episode, one disturbance at a time. Lines end where the estimate diverges. Gaps take a tenth of the time. "
+        f"RMS error of the {words(channel)}{in_condition(condition)}, mean over {units} units, the first {seconds:g} s "
+        "of a held-out episode. Lines end where the estimate diverges. Gaps take a tenth of the time. "
         "Filtered difference and learned estimator get the last measurement that arrived."
     )
 
@@ -58,9 +55,9 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
     severities = next(iter(lines.values())).severities * axis.factor
     for name, curve in lines.items():
         x = curve.severities * axis.factor
-        x = np.where(x > 0, x, _ZERO * x[1]) if axis.logarithmic else x
+        x = np.where(x > 0, x, 0.1 * x[1]) if axis.logarithmic else x
         look, main = method_look(name), name == deployed
-        errors = np.where(curve.errors < _DIVERGED, curve.errors, np.nan)
+        errors = np.where(curve.errors < DRAWING.diverged_percent, curve.errors, np.nan)
         label = method_label(name) + (" (deployed)" if main else "")
         panel.plot(x, errors, look.style, color=look.colour, lw=2.4 if main else 1.2, marker="o", ms=2.4, label=label)
     panel.set_title(axis.title.replace(" (", "\n("), size=8)
@@ -68,9 +65,9 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
         low, high = float(severities[1]), float(severities[-1])
         ticks = [10.0**k for k in range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)][::2]
         panel.set_xscale("log")
-        panel.set_xlim(0.7 * _ZERO * low, 1.4 * high)
+        panel.set_xlim(0.07 * low, 1.4 * high)
         panel.xaxis.set_minor_locator(NullLocator())
-        panel.set_xticks([_ZERO * low, *ticks], ["0", *map(power_of_ten, ticks)])
+        panel.set_xticks([0.1 * low, *ticks], ["0", *map(power_of_ten, ticks)])
 
 
 def load_torque(run: RunFolder) -> tuple[Figure, str]:
@@ -83,7 +80,7 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
     truth = arrays["truth"].astype(float)
     times = np.arange(len(truth)) * run.sample_period_s
     figure, axes = grid(len(ways), 2, 1.7, width_ratios=(1.6, 1), sharex="col")
-    freqs, density = error_spectrum(truth, run.sample_period_s, _SEGMENT)
+    freqs, density = error_spectrum(truth, run.sample_period_s, 4 * DRAWING.segment)
     for (label, names), (time, spectrum) in zip(ways, axes, strict=True):
         draw_lines(time, times, {"declared load": (truth, TRUTH)})
         spectrum.plot(freqs[1:], density[1:], color=TRUTH.colour, alpha=TRUTH.opacity, lw=TRUTH.weight)
@@ -91,7 +88,7 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
             model, values = name.partition("/")[0], arrays[f"estimate/{name}"].astype(float)
             look: Look = model_look(model)
             draw_lines(time, times, {model_label(model): (values, look)})
-            error = error_spectrum(values - truth, run.sample_period_s, _SEGMENT)[1]
+            error = error_spectrum(values - truth, run.sample_period_s, 4 * DRAWING.segment)[1]
             spectrum.plot(freqs[1:], error[1:], color=look.colour)
         time.set_ylabel(label)
         logarithmic(spectrum)

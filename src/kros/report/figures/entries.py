@@ -10,11 +10,9 @@ from ...uncertainty import Form, UncertainModel
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten, words
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 
 Names = tuple[Sequence[str], Sequence[str]]
-_MOST = 4  # rows and columns of entries
-_FREQUENCIES = 250
 _OUTPUT_ROWS = (Form.ADDITIVE, Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 _OUTPUT_COLUMNS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
@@ -33,12 +31,14 @@ def short(name: str) -> str:
 
 def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
     """Return the residuals of all units relative to the weights of an uncertain model."""
-    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // _FREQUENCIES)]
+    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.points)]
     scale = model.input_scale / model.output_scale[:, None]
     responses = models.systems(model.unit_ids).frequency_response(freqs) * scale
-    own = model.scaled_nominal().frequency_response(freqs)
+    nominal_response = model.scaled_nominal().frequency_response(freqs)
     dt, units, nominal = model.sample_period_s, model.unit_ids, model.nominal_id
-    return unit_residuals(model.form, own, responses, model.weight, freqs, dt, unit_ids=units, nominal_id=nominal)
+    return unit_residuals(
+        model.form, nominal_response, responses, model.weight, freqs, dt, unit_ids=units, nominal_id=nominal
+    )
 
 
 def differing(residuals: UnitResiduals) -> list[int]:
@@ -46,17 +46,22 @@ def differing(residuals: UnitResiduals) -> list[int]:
     return [k for k in residuals.rows(inside=True) if residuals.unit_ids[k] != residuals.nominal_id]
 
 
-def entries_figure(found: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None) -> Figure:
+def entries_figure(
+    residuals_of: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None
+) -> Figure:
     """Draw entries of all units with their bound and its fit, models side by side or one below the other."""
-    sizes = {name: (min(r.largest.shape[1], _MOST), min(r.largest.shape[2], _MOST)) for name, r in found.items()}
-    together = sum(columns for _, columns in sizes.values()) <= _MOST
+    sizes = {
+        name: (min(r.largest.shape[1], DRAWING.states), min(r.largest.shape[2], DRAWING.states))
+        for name, r in residuals_of.items()
+    }
+    together = sum(columns for _, columns in sizes.values()) <= DRAWING.states
     rows = (max if together else sum)(p for p, _ in sizes.values())
     columns = (sum if together else max)(m for _, m in sizes.values())
     figure, axes = grid(rows, columns, 1.45, sharex=True, sharey=True)
     for panel in axes.ravel():
         panel.axis("off")
     top, left = 0, 0
-    for name, residuals in found.items():
+    for name, residuals in residuals_of.items():
         p, m = sizes[name]
         _draw_block(axes[top : top + p, left : left + m], residuals, names[name], model_label(name), alarm)
         left, top = (left + m, top) if together else (left, top + p)

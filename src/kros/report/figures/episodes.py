@@ -1,4 +1,4 @@
-"""Signals in time: recorded and estimated values, the errors, and their spectra; simulations, observers, plots in memory."""
+"""Signals in time: recorded and estimated values, errors, and their spectra."""
 
 from __future__ import annotations
 
@@ -33,13 +33,9 @@ from ..names import (
     words,
 )
 from ..run_folder import NotShownError, RunFolder, Shown
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 
 TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
-_MOST = 4  # states of one episode
-_SETTLED = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
-_TURNS = 300  # samples of an enlarged part at constant speed
-_DIVERGED = 1e3  # errors beyond this many ranges are not drawn
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
@@ -55,7 +51,7 @@ class Signals:
     @classmethod
     def of(cls, run: RunFolder) -> Signals:
         """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
-        size = _TURNS if run.calibrated else len(run.shown[0].time_s) // 8
+        size = DRAWING.zoom if run.calibrated else len(run.shown[0].time_s) // 8
         band = run.evaluation.get("band_hz")
         return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 
@@ -77,11 +73,11 @@ def free_run(run: RunFolder) -> tuple[Figure, str]:
     if not names:
         raise NotShownError("no model was simulated on the episode that is shown")
     lines = {model_label(n): (shown.models[n], model_look(n)) for n in names}
-    block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), _MOST)))
+    block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), DRAWING.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
-    errors = {n: own for n, own in run.evaluation["free_run"].items() if n in names}
-    medians = {n: [f"{words(c)} {number(v['median'])} %" for c, v in own.items()] for n, own in errors.items()}
-    parts = [f"{model_label(n)} {', '.join(own)}" for n, own in medians.items()]
+    errors = {n: error for n, error in run.evaluation["free_run"].items() if n in names}
+    medians = {n: [f"{words(c)} {number(v['median'])} %" for c, v in error.items()] for n, error in errors.items()}
+    parts = [f"{model_label(n)} {', '.join(values)}" for n, values in medians.items()]
     text += f" Median errors over units: {'; '.join(parts)}." if parts else ""
     return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
 
@@ -93,7 +89,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
         raise NotShownError("no observer was run on the episodes that are shown")
     known = list(shown[0].observers)
     names = _paper(known) if paper else deployed_pair(known, run.deployed)
-    states = range(min(len(run.states), _MOST)) if paper else run.hidden[:2]
+    states = range(min(len(run.states), DRAWING.states)) if paper else run.hidden[:2]
     blocks = [
         _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
         for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
@@ -110,7 +106,7 @@ def other_condition(run: RunFolder) -> tuple[Figure, str]:
         raise NotShownError("the recordings have one condition only")
     pair = paper_pair(shown.observers)
     names = pair or deployed_pair(list(shown.observers), run.deployed)
-    block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), _MOST)))
+    block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
     return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
@@ -157,7 +153,7 @@ def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
 def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
     """Draw one state of an episode in four panels."""
     time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
-    near, start = _near(recorded), int(_SETTLED * len(recorded))
+    near, start = _near(recorded), int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
         draw_lines(panel, time_s[part], {"recorded": (recorded[part], TRUTH)})
         for label, (values, look) in block.lines.items():
@@ -165,7 +161,7 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
     row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
     for label, (values, look) in block.lines.items():
         error = recorded - values[:, i].astype(float)
-        if np.isfinite(error).all() and np.abs(error[start:]).max() < _DIVERGED * np.ptp(recorded):
+        if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
             draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
             freqs, density = error_spectrum(error, signals.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour, lw=1.0)

@@ -16,29 +16,29 @@ from ..theme import Tone
 
 def scores(run: RunFolder) -> tuple[Figure, str]:
     """Draw one point a unit with its range, flagged ones in the colour of alarm."""
-    found = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
-    first = next(iter(found.values()))
-    flagged = sorted({s.unit for m in found.values() for s in m.scores if s.outlier}, key=natural_key)
+    models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
+    first = next(iter(models.values()))
+    flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
     about = (
-        f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all nominal "
-        f"units, and as a bar the range over them"
+        f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all "
+        "nominal units, and as a bar the range over them"
     )
     text = (
         f"{about}. The threshold has a false-alarm rate of {number(100 * first.false_alarm_rate, 2)} % for a good unit"
     )
     text += "; with so few units the rate rests on an exponential tail. " if first.extrapolated else ". "
     text += f"Above it: {some_of(flagged)}." if flagged else "No unit is above it."
-    if not any(np.isfinite(m.threshold_db) for m in found.values()):
+    if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
-    return scores_figure(found), text
+    return scores_figure(models), text
 
 
-def scores_figure(found: Mapping[str, OutlierModel] | OutlierModel) -> Figure:
+def scores_figure(models: Mapping[str, OutlierModel] | OutlierModel) -> Figure:
     """Draw scores with their ranges, a column a condition."""
-    models = {"": found} if isinstance(found, OutlierModel) else found
-    units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
-    figure, axes = grid(1, len(models), 1.9, sharey=True)
-    for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
+    conditions = {"": models} if isinstance(models, OutlierModel) else models
+    units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
+    figure, axes = grid(1, len(conditions), 1.9, sharey=True)
+    for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):
         _panel(panel, model, units)
         panel.set_title(condition_label(condition))
         units_axis(panel, units)

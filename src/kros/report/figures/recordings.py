@@ -11,12 +11,10 @@ from ...identify import PhaseCalibration
 from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
 from ..names import Look, episode_title, minus, some_of, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
 
 _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.55)
-_SEGMENT = 1024  # samples of a spectrum
-CONCENTRATED = 0.8  # concentration below which segments of a unit disagree on its phase
 
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
@@ -104,7 +102,7 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:
     reference, measured = values[:, names.index(spec.reference)], values[:, names.index(spec.measured)]
     settle = round(spec.settle * len(reference))
     stretches = [slice(a + settle, b) for a, b in steady_stretches(reference)]
-    segment = min(_SEGMENT, max((s.stop - s.start for s in stretches), default=0))
+    segment = min(DRAWING.segment, max((s.stop - s.start for s in stretches), default=0))
     if segment < 64:
         raise NotShownError(f"{shown.key} has no stretch of constant speed that is long enough")
     used = [s for s in stretches if s.stop - s.start >= segment]
@@ -117,10 +115,10 @@ def phase(run: RunFolder) -> tuple[Figure, str]:
     """Draw the phase calibration of a run (Appendix B)."""
     calibration = run.calibration
     lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u not in run.set_aside])
-    weak = [u for u, c in calibration.units.items() if c.concentration < CONCENTRATED]
+    weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
     mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
     text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
-    text += f" Concentration below {CONCENTRATED:g}: {some_of(weak)}." if weak else ""
+    text += f" Concentration below {DRAWING.concentrated:g}: {some_of(weak)}." if weak else ""
     return phase_figure(calibration, run.set_aside), text
 
 
@@ -138,12 +136,12 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
     for (column, label), panel in zip(columns, axes[0], strict=True):
         for chosen, look in ((inside, {"ms": 4, "mec": "none"}), (~inside, {"ms": 5, "mfc": "none", "mew": 1.2})):
             (drawn,) = panel.plot(places[chosen], column[chosen], "o", color=Tone.BLUE.light, **look)
-            name_units(drawn, [u for u, own in zip(units, chosen, strict=True) if own])
+            name_units(drawn, [u for u, mark in zip(units, chosen, strict=True) if mark])
         panel.set_title(label)
         units_axis(panel, units)
     axes[0, 0].set_ylim(-12, 372)
     axes[0, 0].set_yticks([0, 90, 180, 270, 360])
     axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=0.8, ls="--")
-    axes[0, 2].axhline(CONCENTRATED, color=Tone.SOFT.light, lw=0.8, ls="--")
+    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=0.8, ls="--")
     axes[0, 2].set_ylim(min(0.7, columns[2][0].min() - 0.02), 1.03)
     return figure

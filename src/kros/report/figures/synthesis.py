@@ -26,12 +26,11 @@ from ..names import (
     split_observer,
 )
 from ..run_folder import NotShownError, RunFolder
-from ..theme import HUES, Tone
+from ..theme import DRAWING, HUES, Tone
 from .entries import short
 from .episodes import estimate_figure
 
 _WITHOUT = (*BASELINES, "memory", "estimator")  # no correction of a model by design
-_FREQUENCIES, _DECADES = 260, 5
 
 Curve = tuple[str, np.ndarray, str, str]
 
@@ -57,7 +56,7 @@ def bode(run: RunFolder) -> tuple[Figure, str]:
 def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> list[Curve]:
     """Return responses with their label, colour and style."""
     models = run.models[name]
-    freqs = models.frequencies(_FREQUENCIES, decades=_DECADES)
+    freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
     curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.INK.light, "-")]
     if name in run.uncertain:
         weight = run.uncertain[name].weight
@@ -71,7 +70,7 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> li
 
 def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> list[tuple[float, str, str]]:
     """Draw largest singular values; return the labels at the ends of the lines, and of filters that are zero none."""
-    freqs, ends = models.frequencies(_FREQUENCIES, decades=_DECADES), []
+    freqs, ends = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades), []
     for label, response, colour, line in curves:
         size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
         if np.isfinite(size).any():
@@ -137,7 +136,7 @@ def design_figure(design: Design, models: IdentifiedModels | None = None) -> Fig
 def _filter_figure(K: StateSpace, labels: Sequence[str]) -> tuple[Figure, Any]:
     """Draw magnitude and phase of a filter's entries, with a third panel for notes."""
     figure, axes = grid(1, 3, 2.6)
-    freqs = np.geomspace(1e-5, 1, _FREQUENCIES) * (0.5 / K.dt if K.dt else 1e3)
+    freqs = np.geomspace(1e-5, 1, DRAWING.frequencies) * (0.5 / K.dt if K.dt else 1e3)
     response = K.frequency_response(freqs).reshape(len(freqs), -1).T
     for i, (label, line, tone) in enumerate(zip(labels, response, cycle(HUES), strict=False)):
         axes[0, 0].plot(freqs, decibel(line), color=tone.light, label=label if i < len(HUES) else None)

@@ -26,7 +26,7 @@ from ..canvas import (
 )
 from ..names import best_models, model_label, number, words
 from ..run_folder import RunFolder
-from ..theme import HUES, Tone
+from ..theme import DRAWING, HUES, Tone
 from .entries import beside, differing, entries_figure, entry_names
 
 FORM_TONES = {
@@ -39,7 +39,6 @@ FORM_TONES = {
 }
 _PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input forms agree for tall plants
 _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
-_FREQUENCIES = 60  # of the published variants
 
 
 def forms(run: RunFolder) -> tuple[Figure, str]:
@@ -70,7 +69,7 @@ def is_tall(model: UncertainModel) -> bool:
 
 def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
     """Return frequencies and bounds of the output forms as published."""
-    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // _FREQUENCIES)]
+    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.frequencies)]
     response = models.scaled_responses(freqs, model.unit_ids)
     rows = {form: model.nominals.get(form) for form in _PUBLISHED}
     nominals = {f: model.unit_ids.index(unit) if unit in model.unit_ids else 0 for f, unit in rows.items()}
@@ -105,7 +104,7 @@ def weights(run: RunFolder) -> tuple[Figure, str]:
     label_below(axes[-1])
     parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
     return figure, (
-        "Shaded: the optimal bound by diagonal weights, frequency by frequency; the scale between left and right is free "
+        "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free "
         f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
     )
 
@@ -120,7 +119,7 @@ def _weights_row(row: Sequence[Axes], model: UncertainModel, models: ModelSet | 
 
 
 def in_gauge(cover: Cover, other: Cover) -> Cover:
-    """Return a cover with the free scale between left and right of another: equal means of their right entries in dB."""
+    """Return a cover with the scale between left and right of another: equal means of right entries in dB."""
     with np.errstate(divide="ignore", invalid="ignore"):
         scale = np.exp((np.log(other.right) - np.log(cover.right)).mean(axis=1, keepdims=True))
     scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
@@ -166,13 +165,13 @@ def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
 
 def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
-    condition, residuals = run.others
+    residuals = {name.partition("@")[0]: one for name, one in run.others.items()}
     first = next(iter(residuals.values()))
     unit = first.outside[0]
     chosen = {n: residuals[n] for n in best_models(residuals)}
-    names = {n: entry_names(r.form, run.condition_models(n, condition)) for n, r in chosen.items()}
-    text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, with weights fitted to all "
-    return entries_figure(chosen, names, alarm=unit), text + f"units but {unit}."
+    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
+    text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
+    return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
 
 
 def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
@@ -197,9 +196,9 @@ def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entr
     return figure
 
 
-def sets_figure(found: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
+def sets_figure(models: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
     """Draw the uncertain model of one kind, the first by default."""
-    name = kind or next(iter(found.sets))
-    if name not in found.sets:
-        raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(found.sets)}.")
-    return uncertain_figure(found.sets[name], found.models.models(name), entries)
+    name = kind or next(iter(models.sets))
+    if name not in models.sets:
+        raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
+    return uncertain_figure(models.sets[name], models.models.models(name), entries)

@@ -1,4 +1,4 @@
-"""Sections of the report, made from ``metrics.json`` alone: first what decides, then the evidence, which the reader opens."""
+"""Sections of the report, from ``metrics.json`` alone: first what decides, then the evidence, which is folded."""
 
 from __future__ import annotations
 

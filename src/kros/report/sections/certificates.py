@@ -13,13 +13,13 @@ from ..names import BASELINES, axis_label, minus, observer_label, split_observer
 
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
-    "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the recorded "
-    "power in every band of frequency, beside the worst RMS error on held-out episodes. At run time: a bound on the gain "
-    "from the model's one-step residual to the error, with the state re-lifted at every step."
+    "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the "
+    "recorded power in every band of frequency, beside the worst RMS error on held-out episodes. At run time: a bound "
+    "on the gain from the model's one-step residual to the error, with the state re-lifted at every step."
 )
 _ASSUMED = (
     "The recorded units represent those to come: another batch and wear are not covered.",
-    "The recorded motion did not depend on any estimate. The certificates do not hold if a controller uses the estimate.",
+    "The recorded motion depended on no estimate: the certificates do not hold if a controller uses the estimate.",
     "The set of plants: every machine is the nominal model perturbed by at most the weights, in one form.",
     "The recorded signals: residuals have at most the recorded power in every band of frequency.",
     "Errors are those relative to the recorded sensors, unless the true signal is known.",
@@ -46,27 +46,27 @@ def certificates(facts: Facts) -> Section | None:
 def _table(facts: Facts) -> Table | None:
     """Return one row an observer with a model."""
     entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_observer(n)[0]}
-    own, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
+    rows, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
     robust = [split_observer(n)[1] not in BASELINES for n in entries]  # a baseline's optimum bounds no worst case
-    bounds = [e.get("lower_bound") or None if r else None for e, r in zip(own, robust, strict=True)]
-    gaps = [e.get("gap_percent") if b else None for e, b in zip(own, bounds, strict=True)]
-    radii = [e.get("spectral_radius_max") for e in own]
+    bounds = [e.get("lower_bound") or None if r else None for e, r in zip(rows, robust, strict=True)]
+    gaps = [e.get("gap_percent") if b else None for e, b in zip(rows, bounds, strict=True)]
+    radii = [e.get("spectral_radius_max") for e in rows]
     columns = [
         Column("observer", [observer_label(name) for name in entries]),
-        Column("states of the filter", [e.get("order") for e in own]),
+        Column("states of the filter", [e.get("order") for e in rows]),
         Column("spectral radius", [None if r is None else minus(radius_text(r)) for r in radii]),
-        Column("H2 norm at most", [e.get("worst_case_h2") for e in own], "set of plants"),
+        Column("H2 norm at most", [e.get("worst_case_h2") for e in rows], "set of plants"),
         Column("lower bound", bounds, "set of plants"),
         Column("gap (%)", gaps, "set of plants"),
     ]
-    for channel in dict.fromkeys(c for e in own for c in e.get("set_bound") or {} if c not in facts.measured):
+    for channel in dict.fromkeys(c for e in rows for c in e.get("set_bound") or {} if c not in facts.measured):
         worst = [errors.get(n, {}).get(channel, ErrorCell()).worst_rms for n in entries]
         group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
-        columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in own], group))
+        columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in rows], group))
         columns.append(Column("worst RMS error", worst, group))
     columns += [
-        Column("gain at most", [e.get("relift_gain") for e in own], "at run time"),
-        Column("losses certified", [e.get("dropout_certified") for e in own], "at run time"),
+        Column("gain at most", [e.get("relift_gain") for e in rows], "at run time"),
+        Column("losses certified", [e.get("dropout_certified") for e in rows], "at run time"),
     ]
     return build("Certificates of all observers", columns, facts.label, sortable=True)
 
@@ -74,11 +74,11 @@ def _table(facts: Facts) -> Table | None:
 def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
     """Return why an observer could not be designed or certified; observers with the same reason share a row."""
     reasons: dict[tuple[str, str], list[str]] = {}
-    for name, own in entries.items():
-        first = "not designed" if own.get("status") == "failed" else "set of plants"
+    for name, entry in entries.items():
+        first = "not designed" if entry.get("status") == "failed" else "set of plants"
         for kind, key in ((first, "reason"), ("recorded signals", "set_reason"), ("at run time", "relift_reason")):
-            if own.get(key):
-                text = "; ".join(dict.fromkeys(own[key].split("; ")))
+            if entry.get(key):
+                text = "; ".join(dict.fromkeys(entry[key].split("; ")))
                 reasons.setdefault((kind, text), []).append(observer_label(name))
     columns = [
         Column("observer", ["; ".join(names) for names in reasons.values()]),

@@ -36,24 +36,24 @@ def deployment(facts: Facts) -> Section | None:
     return Section("deployment", "Deployment", card=[(term, texts) for term, texts in card if texts])
 
 
-def _interface(facts: Facts, own: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
+def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
     """Return signals, rate, delay, parameters, limits and sensor."""
-    largest, dt, late = own["largest"], facts.study["sample_period_s"], own["delay_samples"]
+    largest, dt, late = entry["largest"], facts.study["sample_period_s"], entry["delay_samples"]
 
     def named(names: Sequence[str]) -> str:
         sizes = {n: f" up to {number(largest[n])}" if n in largest else "" for n in names}
         return joined([axis_label(n, facts.unit(n)) + sizes[n] for n in names])
 
-    hidden = [axis_label(n, facts.unit(n)) for n in own["estimates"] if n not in own["measured"]]
+    hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
     limits = [f"{words(c)}: {_ends(limit)}." for c, limit in facts.study.get("limits", {}).items()]
     return [
-        ("Reads", [f"Measured: {named(own['measured'])}. Inputs: {named(own['inputs'])}."]),
+        ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
-        ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {own['states']} states."]),
-        ("Parameters", _parameters(own["parameters"], facts.get("calibration") is not None)),
+        ("Rate", [f"One step every {dt:g} s ({1 / dt:g} Hz), {entry['states']} states."]),
+        ("Parameters", _parameters(entry["parameters"], facts.get("calibration") is not None)),
         ("Limits", limits),
-        ("Sensor", _sensor(facts, own["sensor"])),
+        ("Sensor", _sensor(facts, entry["sensor"])),
     ]
 
 
@@ -76,34 +76,36 @@ def _ends(limit: Mapping[str, Any]) -> str:
 
 def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str]:
     """Say what the observer assumes of its sensors, and with which disturbances its error doubles."""
-    assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in own.items() if v) for n, own in sensor.items()}
+    assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in entry.items() if v) for n, entry in sensor.items()}
     texts = [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
     tried = doublings(facts).get(facts.deployed, {})
     parts = [_NEEDS[kind].format(value) for kind, value in tried.items() if kind in _NEEDS and ">" not in value]
     return [*texts, f"The error doubles with {joined(parts).replace(' and ', ' or ')}."] if parts else texts
 
 
-def _next_unit(own: Mapping[str, Any] | None) -> list[str]:
+def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:
     """Return the bound for the next machine from units in reserve."""
-    if not own:
+    if not entry:
         return []
-    if own["bounds"] is None:
-        return [f"No bound: {own['reason']}."]
-    bounds = {c: bound["error_percent"] for c, bound in own["bounds"].items() if bound["error_percent"] is not None}
+    if entry["bounds"] is None:
+        return [f"No bound: {entry['reason']}."]
+    bounds = {c: bound["error_percent"] for c, bound in entry["bounds"].items() if bound["error_percent"] is not None}
     text = joined([f"{number(value)} % in {words(c)}" for c, value in bounds.items()])
-    return [f"Its errors are at most {text} with {100 * own['confidence']:g} % confidence ({own['reserve']} units)."]
+    return [
+        f"Its errors are at most {text} with {100 * entry['confidence']:g} % confidence ({entry['reserve']} units)."
+    ]
 
 
-def _monitor(own: Mapping[str, Any] | None) -> list[str]:
+def _monitor(entry: Mapping[str, Any] | None) -> list[str]:
     """Say what status bit 8 means, and how often it is wrong."""
-    if not own:
+    if not entry:
         return []
     text = (
-        f"Status bit 8: the innovation is outside the envelope of {own['units']} units. A good unit leaves it with a "
+        f"Status bit 8: the innovation is outside the envelope of {entry['units']} units. A good unit leaves it with a "
     )
-    text += f"probability of {100 * own['false_alarm_rate']:g} %"
-    low, high = own["alarms_per_hour"]
+    text += f"probability of {100 * entry['false_alarm_rate']:g} %"
+    low, high = entry["alarms_per_hour"]
     if low is not None:
-        text += f", {number(own['alarms'] / own['hours'], 2)} times an hour in the recordings (95 % interval "
+        text += f", {number(entry['alarms'] / entry['hours'], 2)} times an hour in the recordings (95 % interval "
         text += f"{number(low, 2)} to {number(high, 2)})"
     return [f"{text}."]

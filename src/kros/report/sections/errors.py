@@ -1,4 +1,4 @@
-"""Errors of observers on held-out episodes: in the condition of the models, in others, and on units that were left out."""
+"""Errors of observers on held-out episodes: in the condition of the models, in others, on units left out."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from ..names import (
 
 Rows = Sequence[tuple[ErrorTable, str]]
 _TEXT = (
-    "Errors on held-out episodes, RMS over time: in percent of the largest value of the signal, mean over the units other "
-    "than the nominal one, and the worst of them; RMS in the channel's unit of measure."
+    "RMS errors on held-out episodes: in percent of the largest value of the signal, mean over the units other than "
+    "the nominal one, and the worst of them; and in the channel's unit of measure."
 )
 _TRUE = "The estimate has the same lag as the recorded signal; errors against the true signal include it."
 
@@ -34,7 +34,7 @@ def errors(facts: Facts) -> Section | None:
     if not tables:
         return None
     roles = _compared(facts)
-    notes = ["; ".join(filter(None, (joined(own), observer_about(name)))) for name, own in roles.items()]
+    notes = ["; ".join(filter(None, (joined(role), observer_about(name)))) for name, role in roles.items()]
     about = [Column("observer", [observer_label(n) for n in roles], notes=notes)]
     caption = f"Observers to compare{in_condition(tables[0].condition)}"
     first = _table(caption, about, [(tables[0], name) for name in roles], facts)
@@ -67,22 +67,22 @@ def other_conditions(facts: Facts) -> Section | None:
 
 def left_out(facts: Facts) -> Section | None:
     """Return errors on units that took no part in the design; None where no unit was left out."""
-    found = facts.get("left_out")
-    if not found or not found["rows"]:
+    folded = facts.get("left_out")
+    if not folded or not folded["rows"]:
         return None
-    folds = len(found["folds"])
+    folds = len(folded["folds"])
     text = (
-        f"The units are divided into {folds} folds. For each fold the whole study is repeated with all other units, and its "
+        f"The units are divided into {folds} folds. For each fold the study is repeated with all other units, and its "
         "observers run on the units of the fold, as on new machines. Certified: in how many folds."
     )
-    failed = [f"Fold {int(n) + 1} failed: {reason}" for n, reason in found["failed"].items()]
+    failed = [f"Fold {int(n) + 1} failed: {reason}" for n, reason in folded["failed"].items()]
     tables = []
-    for table in left_out_tables(found["rows"], facts.study["identify_on"]):
-        own = [found["observers"].get(name, {}) for name in table.cells]
+    for table in left_out_tables(folded["rows"], facts.study["identify_on"]):
+        entries = [folded["observers"].get(name, {}) for name in table.cells]
         parts = {"made": ("designed", ""), "robust": ("set of plants", "certified")}
         parts["relift_certified"] = ("at run time", "certified")
         about = [Column("observer", [observer_label(name) for name in table.cells])]
-        about += [Column(title, [_count(o.get(key), folds) for o in own], g) for key, (title, g) in parts.items()]
+        about += [Column(title, [_count(e.get(key), folds) for e in entries], g) for key, (title, g) in parts.items()]
         caption = f"Units left out{in_condition(table.condition)}; small: 95 % interval of the mean over units"
         if any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values()):
             caption += f"; band: power at the gearbox frequency relative to “{observer_label(PAPER)}”"

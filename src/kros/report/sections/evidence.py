@@ -1,4 +1,4 @@
-"""Where the numbers come from: recordings, models, spread of the units, weights, disturbed measurements, the run itself."""
+"""Where the numbers come from: recordings, models, spread of the units, weights, disturbances, the run."""
 
 from __future__ import annotations
 
@@ -14,16 +14,7 @@ from ...evaluate import Kind
 from ..content import Column, Section, build
 from ..disturbances import AXES, doublings
 from ..facts import Facts
-from ..names import (
-    in_condition,
-    minus,
-    model_label,
-    number,
-    observer_label,
-    some_of,
-    split_observer,
-    words,
-)
+from ..names import in_condition, minus, model_label, number, observer_label, some_of, split_observer, words
 
 _PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
 
@@ -67,18 +58,19 @@ def _limit(limit: Mapping[str, Any] | None) -> str:
         return ""
     ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
     seen = (limit.get("seen") or {}).get("units")
-    return f"{ends}, {'declared' if limit['declared'] else 'estimated'}{f', reached by {some_of(seen, 3)}' if seen else ''}"
+    text = f"{ends}, {'declared' if limit['declared'] else 'estimated'}"
+    return f"{text}, reached by {some_of(seen, 3)}" if seen else text
 
 
 def calibration(facts: Facts) -> Section | None:
     """Return the phase calibration; None for a study without one."""
-    own = facts.get("calibration")
-    if not own:
+    entry = facts.get("calibration")
+    if not entry:
         return None
     text = (
-        f"The gearbox disturbance is modelled as sin({own['ratio']:g} · {own['angle']} + {own['parameter']}); the "
-        "phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse apart. "
-        f"Mean lag of the loop: {minus(format(math.degrees(own['lag_rad']), '.1f'))}°."
+        f"The gearbox disturbance is modelled as sin({entry['ratio']:g} · {entry['angle']} + {entry['parameter']}); "
+        "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse apart. "
+        f"Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
     missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
     more = [f"Not calibrated, and without models: {some_of(missing)}."] if missing else []
@@ -90,23 +82,23 @@ def models(facts: Facts) -> Section | None:
     entries = facts.get("models")
     if not entries:
         return None
-    functions: list[str] = next((own["functions"] for own in entries.values() if own.get("functions")), [])
-    text = "Every unit has a model of each kind. Linear models have the recorded states; Koopman models have lifted functions too"
-    text += f": {', '.join(functions)}." if functions else "."
+    functions: list[str] = next((entry["functions"] for entry in entries.values() if entry.get("functions")), [])
+    text = "Every unit has a model of each kind. Linear models have the recorded states."
+    text += f" Koopman models have lifted functions as well: {', '.join(functions)}." if functions else ""
     if any(not name.endswith("_edmd") for name in entries):
         text += (
             " Refined models minimise the simulation error, regularised towards the population mean; the strength is "
         )
         text += "chosen by cross-validation. Models named EDMD are those of the paper."
-    errors = {name: own.get("freerun_error_percent", {}) for name, own in entries.items()}
+    errors = {name: entry.get("freerun_error_percent", {}) for name, entry in entries.items()}
     columns = [
         Column("model", [model_label(name) for name in entries]),
-        Column("states", [own["order"] for own in entries.values()]),
-        Column("largest pole", [minus(radius_text(own["spectral_radius_max"])) for own in entries.values()]),
+        Column("states", [entry["order"] for entry in entries.values()]),
+        Column("largest pole", [minus(radius_text(entry["spectral_radius_max"])) for entry in entries.values()]),
     ]
-    for channel in dict.fromkeys(c for own in errors.values() for c in own):
+    for channel in dict.fromkeys(c for entry in errors.values() for c in entry):
         for what in ("median", "worst"):
-            values = [own.get(channel, {}).get(what) for own in errors.values()]
+            values = [entry.get(channel, {}).get(what) for entry in errors.values()]
             columns.append(Column(f"{what} (%)", values, words(channel), best=True))
     caption = (
         "Simulation of every held-out episode from its first state, error in percent of the largest value, over units"
@@ -121,11 +113,11 @@ def spread(facts: Facts) -> Section | None:
         return None
     first = next(iter(entries.values()))
     text = (
-        f"Nominal unit: {first['nominal']}. The residual of a unit is its difference from the nominal unit in one of six "
-        f"forms; its peak is the largest singular value over units and frequencies. The design uses the form "
+        f"Nominal unit: {first['nominal']}. The residual of a unit is its difference from the nominal unit in one of "
+        f"six forms; its peak is the largest singular value over units and frequencies. The design uses the form "
         f"“{words(first['form'])}”. Below 0 dB a unit differs by less than the whole signal."
     )
-    forms = list(dict.fromkeys(f for own in entries.values() for f in own["peak_db"]))
+    forms = list(dict.fromkeys(f for entry in entries.values() for f in entry["peak_db"]))
     used = ["used" if form == first["form"] else "" for form in forms]
     columns = [Column("form", [words(form) for form in forms], notes=used)]
     columns += [Column(f"{model_label(n)} (dB)", [e["peak_db"].get(f) for f in forms]) for n, e in entries.items()]
@@ -142,17 +134,17 @@ def uncertainty(facts: Facts) -> Section | None:
         "Each residual is W_left · Δ · W_right with ‖Δ‖ ≤ 1. The weights bound every unit where no normalised residual "
         "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
     )
-    weights = [own["weight"] for own in entries.values()]
-    orders = [" and ".join(", ".join(map(str, side)) for side in own["orders"]) for own in weights]
+    weights = [entry["weight"] for entry in entries.values()]
+    orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
     columns = [
         Column("model", [model_label(name) for name in entries]),
-        Column("weights", [own["structure"] for own in weights]),
+        Column("weights", [entry["structure"] for entry in weights]),
         Column("orders, left and right", orders),
-        Column("largest normalised residual", [_exact(own["cover_max"]) for own in weights]),
+        Column("largest normalised residual", [_exact(entry["cover_max"]) for entry in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
-        Column("above the optimal bound (dB)", [own["overbound_db_max"] for own in weights]),
-        Column("estimation noise in the spread (%)", [_noise(own) for own in entries.values()]),
-        Column("approximation error", [own["misfit_max"] for own in entries.values()]),
+        Column("above the optimal bound (dB)", [entry["overbound_db_max"] for entry in weights]),
+        Column("estimation noise in the spread (%)", [_noise(entry) for entry in entries.values()]),
+        Column("approximation error", [entry["misfit_max"] for entry in entries.values()]),
     ]
     return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
 
@@ -169,17 +161,17 @@ def _exact(value: float | None) -> str | None:
 
 def robustness(facts: Facts) -> Section | None:
     """Return where errors double on disturbed measurements; None where the study did not try."""
-    found = doublings(facts)
-    if not found:
+    severities = doublings(facts)
+    if not severities:
         return None
     text = (
-        "The measurements of held-out episodes are disturbed in one way at a time, and the observers are not informed. The "
-        "table shows where the error doubles, as the geometric mean over the hidden channels."
+        "The measurements of held-out episodes are disturbed in one way at a time, and the observers are not informed. "
+        "The table shows where the error doubles, as the geometric mean over the hidden channels."
     )
-    names = [n for n in found if split_observer(n)[0] in (facts.model, "")] or list(found)
-    kinds = [kind for kind in Kind if any(kind in own for own in found.values())]
+    names = [n for n in severities if split_observer(n)[0] in (facts.model, "")] or list(severities)
+    kinds = [kind for kind in Kind if any(kind in severity for severity in severities.values())]
     columns = [Column("observer", [observer_label(n) for n in names])]
-    columns += [Column(AXES[kind].title, [found[n].get(kind, "") for n in names]) for kind in kinds]
+    columns += [Column(AXES[kind].title, [severities[n].get(kind, "") for n in names]) for kind in kinds]
     table = build("Severity that doubles the error; < and >: outside of what was tried", columns, facts.label)
     return Section("robustness", "Disturbed measurements", [text], tables=[table], figure="robustness")
 

@@ -9,12 +9,12 @@ from typing import Any
 from ..content import Column, Section, build
 from ..facts import Facts
 from ..names import condition_label, in_condition, number, words
+from ..theme import DRAWING
 
 Row = Mapping[str, Any]
-_MOST = 400  # rows of the table; metrics.json has all units
 _SCORES = (
-    "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A unit "
-    "above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
+    "The outlier score of a unit is the excess of its largest residual over the largest of all other units, in dB. A "
+    "unit above the threshold is flagged. A defect that changes every gain by less than the detectable change is not."
 )
 
 
@@ -42,20 +42,20 @@ def units(facts: Facts) -> Section | None:
     cut = "Every unit" if len(shown) == len(facts.get("units")) else "Flagged units and largest errors"
     table = build(f"{cut}{in_condition(home)}; errors in percent of the largest value", columns, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
-    text += [_SCORES, *(_flagged(r) for r in rows[:_MOST] if r["outlier"])] if rows else []
+    text += [_SCORES, *(_flagged(r) for r in rows[: DRAWING.units] if r["outlier"])] if rows else []
     return Section("units", "Units", text, tables=[table], figure="outlier_scores" if rows else "")
 
 
 def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
     """Return flagged units first, then by name; of very many units those with the largest errors."""
     ordered = sorted(rows, key=lambda r: (r["unit"] not in flagged, r["unit"]))
-    if len(rows) <= _MOST:
+    if len(rows) <= DRAWING.units:
         return ordered
     largest: dict[str, float] = {}
     for (unit, _), row in errors.items():
         error = math.inf if row["error_percent"] is None else row["error_percent"]
         largest[unit] = max(largest.get(unit, 0.0), error)
-    return sorted(ordered, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0)))[:_MOST]
+    return sorted(ordered, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0)))[: DRAWING.units]
 
 
 def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:

@@ -65,7 +65,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
     """Write a legend across the top of the figure, from the labelled lines of one axes."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        columns = columns or len(handles)
+        columns = columns or (len(handles) if sum(map(len, labels)) < 90 else 2)
         figure.set_figheight(figure.get_figheight() + 0.2 * ceil(len(handles) / columns))
         figure.legend(handles, labels, loc="outside upper left", ncols=columns, borderaxespad=0.3, borderpad=0.1)
 

@@ -28,7 +28,7 @@ METHODS = {
     "learned": Method("learned", "ridge regression on past samples", Tone.GREEN, True),
     "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
     "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
-    "paper": Method("mixed H2-H∞, entrywise weights", "as published", Tone.ORANGE),
+    "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
     "h2": Method("H2", "H2-optimal for the nominal model", Tone.SKY),
     "hinf": Method("H∞", "H∞-optimal for the nominal model", Tone.SKY),
     "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),

@@ -242,13 +242,14 @@ def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
         return
     channel, size = max(known, key=lambda c: known[c]), 100 * 10 ** (peak / 20)
     if known[channel] > THRESHOLDS.small_set * size:
-        yield (
+        text = (
             f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
-            f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
-            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from machines.",
-            "Do not read a bound over the set as a bound on the error.",
-            "spread",
         )
+        text += f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
+        text += (
+            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from machines."
+        )
+        yield text, "Do not read a bound over the set as a bound on the error.", "spread"
 
 
 def undecided(rows: Sequence[Row]) -> list[Row]:
@@ -274,7 +275,9 @@ def certificates(facts: Facts) -> list[str]:
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
         parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
-        texts.append(f"For recorded signals: the RMS error is at most {joined(parts)}.")
+        bank = split(facts.deployed)[1] == "estimator"
+        source = "Largest RMS error on units left out" if bank else "For recorded signals: the RMS error is at most"
+        texts.append(f"{source}{':' * bank} {joined(parts)}.")
     if entry.get("relift_certified"):
         gain = number(entry.get("relift_gain"))
         texts.append(f"At run time: the gain from the model's one-step residual to the error is at most {gain}.")

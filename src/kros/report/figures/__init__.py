@@ -31,11 +31,7 @@ class Row:
 _SMALL = "The smaller the error, the better the estimate."
 FIGURES: dict[str, Row] = {
     "signals": Row("Recorded signals", "recordings:signals", "One held-out episode as recorded."),
-    "tracking_spectrum": Row(
-        "Tracking error at constant speed",
-        "recordings:tracking_spectrum",
-        "Peaks are the disturbance that is modelled.",
-    ),
+    "tracking_spectrum": Row("Tracking error", "recordings:tracking_spectrum", "Peaks are the modelled disturbance."),
     "phase": Row("Phase calibration", "recordings:phase", "Lags should be nearly equal, concentrations near one."),
     "models": Row("Models of all units", "models:bode", "The uncertain model has to bound the spread of the lines."),
     "free_run": Row("Simulation of the models", "episodes:free_run", "The smaller the error, the better the model."),
@@ -49,12 +45,10 @@ FIGURES: dict[str, Row] = {
     "load_torque": Row("Load torque", "disturbed:load_torque", "The nearer to the declared load, the better."),
     "robustness": Row("Disturbed measurements", "disturbed:robustness", "A line rises where the observer fails."),
     "outlier_scores": Row(
-        "Outlier scores", "outliers:scores", "The higher a unit, the more it differs from the others."
+        "Outlier scores", "outliers:scores", "The higher a unit, the more it differs from all others."
     ),
     "outlier_residuals": Row(
-        "The highest-scoring unit, entry by entry",
-        "uncertainty:outlier_residuals",
-        "It differs where red leaves black.",
+        "Highest score", "uncertainty:outlier_residuals", "The unit differs where red leaves black."
     ),
 }
 

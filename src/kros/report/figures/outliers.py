@@ -23,9 +23,8 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
         f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all "
         "nominal units, and as a bar the range over them"
     )
-    text = (
-        f"{about}. The threshold has a false-alarm rate of {number(100 * first.false_alarm_rate, 2)} % for a good unit"
-    )
+    rate = number(100 * first.false_alarm_rate, 2)
+    text = f"{about}. The threshold has a false-alarm rate of {rate} % for a good unit"
     text += "; with so few units the rate rests on an exponential tail. " if first.extrapolated else ". "
     text += f"Above it: {some_of(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):

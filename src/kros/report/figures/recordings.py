@@ -89,10 +89,8 @@ def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     unit = next(c.unit for c in run.channels if c.name == spec.measured)
     panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
     legend(figure, panel)
-    text = (
-        f"Power spectral density of {words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: "
-    )
-    return figure, text + f"{frequency:.3g} Hz, which is {spec.ratio:g} times the speed, and its multiples."
+    text = f"{words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: {frequency:.3g} Hz, "
+    return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
 
 
 def _tracking(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:

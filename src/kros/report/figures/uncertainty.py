@@ -46,10 +46,7 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
     published = {n: published_bounds(m, run.models[n]) for n, m in chosen.items() if n in run.models and is_tall(m)}
     used = words(next(iter(chosen.values())).form.value)
-    text = (
-        "Largest singular value of the residuals over all units, signals over their ranges, with the nominal unit that "
-    )
-    text += f"suits each form best. Thick: the form in use, {used}."
+    text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
     text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
     figure, axes = grid(1, len(chosen), 3.3, sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):

@@ -91,19 +91,16 @@ def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:
         return [f"No bound: {entry['reason']}."]
     bounds = {c: bound["error_percent"] for c, bound in entry["bounds"].items() if bound["error_percent"] is not None}
     text = joined([f"{number(value)} % in {words(c)}" for c, value in bounds.items()])
-    return [
-        f"Its errors are at most {text} with {100 * entry['confidence']:g} % confidence ({entry['reserve']} units)."
-    ]
+    level = f"{100 * entry['confidence']:g} %"
+    return [f"Its errors are at most {text} with {level} confidence ({entry['reserve']} units in reserve)."]
 
 
 def _monitor(entry: Mapping[str, Any] | None) -> list[str]:
     """Say what status bit 8 means, and how often it is wrong."""
     if not entry:
         return []
-    text = (
-        f"Status bit 8: the innovation is outside the envelope of {entry['units']} units. A good unit leaves it with a "
-    )
-    text += f"probability of {100 * entry['false_alarm_rate']:g} %"
+    text = f"Status bit 8: the innovation is outside the envelope of {entry['units']} units. A good unit leaves it "
+    text += f"with a probability of {100 * entry['false_alarm_rate']:g} %"
     low, high = entry["alarms_per_hour"]
     if low is not None:
         text += f", {number(entry['alarms'] / entry['hours'], 2)} times an hour in the recordings (95 % interval "

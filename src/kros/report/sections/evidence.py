@@ -86,10 +86,8 @@ def models(facts: Facts) -> Section | None:
     text = "Every unit has a model of each kind. Linear models have the recorded states."
     text += f" Koopman models have lifted functions as well: {', '.join(functions)}." if functions else ""
     if any(not name.endswith("_edmd") for name in entries):
-        text += (
-            " Refined models minimise the simulation error, regularised towards the population mean; the strength is "
-        )
-        text += "chosen by cross-validation. Models named EDMD are those of the paper."
+        text += " Refined models minimise the simulation error, regularised towards the population mean; the strength "
+        text += "is chosen by cross-validation. Models named EDMD are those of the paper."
     errors = {name: entry.get("freerun_error_percent", {}) for name, entry in entries.items()}
     columns = [
         Column("model", [model_label(name) for name in entries]),

@@ -162,24 +162,3 @@ def label_below(axes: Iterable[Axes], text: str = "frequency (Hz)") -> None:
     """Label the horizontal axes of a row."""
     for panel in axes:
         panel.set_xlabel(text)
-
-
-def end_labels(axes: Axes, entries: Sequence[tuple[float, str, str]], spacing: float = 0.07) -> None:
-    """Write labels at the right ends of lines, moved apart where they would overlap."""
-    low, high = axes.get_ylim()
-    labels = sorted(((v - low) / (high - low), text, colour) for v, text, colour in entries if np.isfinite(v))
-    places = spread([place for place, _, _ in labels], spacing)
-    for place, (_, text, colour) in zip(places, labels, strict=True):
-        note(axes, text, (1, place), (4, 0), va="center", color=colour, annotation_clip=False)
-
-
-def spread(places: Sequence[float], spacing: float) -> list[float]:
-    """Move sorted places in [0, 1] apart to at least `spacing`, as little as a few passes allow."""
-    moved = [min(max(p, 0.0), 1.0) for p in places]
-    for _ in range(50):
-        for i in range(1, len(moved)):
-            lack = spacing - (moved[i] - moved[i - 1])
-            if lack > 0:
-                moved[i - 1] -= lack / 2
-                moved[i] += lack / 2
-    return moved

@@ -14,7 +14,7 @@ from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
 from ...observer import Observer
 from ...synthesis.result import Injection, Synthesis
-from ..canvas import Axes, Figure, decibel, end_labels, frequency_axis, grid, legend, note
+from ..canvas import Axes, Figure, decibel, frequency_axis, grid, legend, note
 from ..names import (
     BASELINES,
     best_models,
@@ -41,14 +41,12 @@ def bode(run: RunFolder) -> tuple[Figure, str]:
     chosen = [m for m in best_models(run.models) if any(n.startswith(f"{m}/") for n in robust)]
     if not chosen:
         raise NotShownError("no robust observer has been synthesized")
-    figure, axes = grid(1, len(chosen), 3.1, sharey=True)
-    ends = [
-        _panel(panel, _curves(run, m, {n: s for n, s in robust.items() if n.startswith(f"{m}/")}), run.models[m])
-        for panel, m in zip(axes[0], chosen, strict=True)
-    ]
-    for panel, labels, name in zip(axes[0], ends, chosen, strict=True):
-        end_labels(panel, labels)
+    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
+    for panel, name in zip(axes[0], chosen, strict=True):
+        syntheses = {n: s for n, s in robust.items() if n.startswith(f"{name}/")}
+        _panel(panel, _curves(run, name, syntheses), run.models[name])
         panel.set_title(model_label(name))
+    legend(figure, max(axes[0], key=lambda panel: len(panel.lines)), 4)
     axes[0, 0].set_ylabel("largest singular value (dB)")
     return figure, "Every signal over its largest value. K maps the innovation to the correction."
 
@@ -57,7 +55,7 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> li
     """Return responses with their label, colour and style."""
     models = run.models[name]
     freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
-    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.INK.light, "-")]
+    curves: list[Curve] = [("plant G", models.scaled_responses(freqs, [str(run.nominal)])[0], Tone.GREY.light, "-")]
     if name in run.uncertain:
         weight = run.uncertain[name].weight
         curves.append(("W left", weight.left.frequency_response(freqs), Tone.GOLD.light, "-"))
@@ -68,17 +66,15 @@ def _curves(run: RunFolder, name: str, syntheses: Mapping[str, Synthesis]) -> li
     return curves
 
 
-def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> list[tuple[float, str, str]]:
-    """Draw largest singular values; return the labels at the ends of the lines, and of filters that are zero none."""
-    freqs, ends = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades), []
+def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> None:
+    """Draw largest singular values, of filters that are zero none."""
+    freqs = models.frequencies(DRAWING.frequencies, decades=DRAWING.decades)
     for label, response, colour, line in curves:
         size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
         if np.isfinite(size).any():
-            axes.plot(freqs, size, line, color=colour, lw=1.4)
-            ends.append((float(size[-1]), label, colour))
+            axes.plot(freqs, size, line, color=colour, lw=1.4, label=label)
     axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
     frequency_axis(axes, freqs)
-    return ends
 
 
 def scaled_filter(synthesis: Synthesis, models: ModelSet) -> StateSpace:

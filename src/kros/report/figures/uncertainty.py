@@ -16,10 +16,10 @@ from ..canvas import (
     Axes,
     Figure,
     decibel,
-    end_labels,
     frequency_axis,
     grid,
     label_below,
+    legend,
     line_over_shade,
     lines_of_units,
     note,
@@ -48,14 +48,14 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
     text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
-    figure, axes = grid(1, len(chosen), 3.3, sharey=True)
+    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
         for form, (freqs, bound) in published.get(name, {}).items():
             panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
-    end_labels(axes[0, -1], _ends(list(chosen.values())[-1]), spacing=0.06)
+    legend(figure, axes[0, 0], 3)
     return figure, text
 
 
@@ -76,16 +76,11 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
     """Draw the bounds of all forms over frequency, the form in use thick."""
     for form, bound in model.bounds.items():
-        axes.plot(model.freqs_hz, decibel(bound), color=FORM_TONES[form].light, lw=2.4 if form is model.form else 1.2)
+        width, label = 2.4 if form is model.form else 1.2, words(form.value)
+        style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
+        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
     axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
     frequency_axis(axes, model.freqs_hz)
-
-
-def _ends(model: UncertainModel) -> list[tuple[float, str, str]]:
-    """Return the labels at the ends of the forms' lines."""
-    return [
-        (float(decibel(bound)[-1]), words(form.value), FORM_TONES[form].light) for form, bound in model.bounds.items()
-    ]
 
 
 def weights(run: RunFolder) -> tuple[Figure, str]:
@@ -179,7 +174,7 @@ def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entr
         return entries_figure({models.name: beside(model, models)}, {models.name: entry_names(model.form, models)})
     figure, axes = grid(2, 2, 2.4, sharex=True)
     draw_forms(axes[0, 0], model)
-    end_labels(axes[0, 0], _ends(model))
+    legend(figure, axes[0, 0], 3)
     _weights_row(axes[1], model, models)
     if models is None:
         axes[0, 1].remove()

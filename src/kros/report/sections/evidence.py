@@ -6,7 +6,7 @@ import json
 import math
 import platform
 from collections.abc import Mapping
-from importlib.metadata import PackageNotFoundError, version
+from importlib import import_module
 from typing import Any
 
 from ...core.linalg import radius_text
@@ -178,16 +178,12 @@ def run(facts: Facts) -> Section:
     """Return times, versions and settings."""
     timing = facts.get("timing_s", {})
     times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
-    known = {"Python": platform.python_version()} | {name: _version(name) for name in _PACKAGES}
-    packages = [Column("package", list(known)), Column("version", list(known.values()))]
+    versions = [import_module(name).__version__ for name in _PACKAGES]
+    packages = [
+        Column("package", ["Python", *_PACKAGES]),
+        Column("version", [platform.python_version(), *versions]),
+    ]
     text = "metrics.json holds all numbers of this page. The same recordings and settings give the same results."
     settings = json.dumps(facts.get("settings", {}), indent=1, ensure_ascii=False)
     tables = [build("Time; a stage that was up to date counts with its own time", times), build("Versions", packages)]
     return Section("run", "Run", [text], tables=tables, folded=[("All settings of the study", settings)])
-
-
-def _version(name: str) -> str | None:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return None

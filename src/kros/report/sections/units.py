@@ -39,23 +39,23 @@ def units(facts: Facts) -> Section | None:
         *_scores(names, scores),
         Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]),
     ]
-    cut = "Every unit" if len(shown) == len(facts.get("units")) else "Flagged units and largest errors"
-    table = build(f"{cut}{in_condition(home)}; errors in percent of the largest value", columns, sortable=True)
+    count = (
+        f"{len(shown)} of {len(facts.get('units'))} units{in_condition(home)}, flagged ones and largest errors first"
+    )
+    table = build(f"{count}; errors in percent of the largest value", columns, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
     text += [_SCORES, *(_flagged(r) for r in rows[: DRAWING.units] if r["outlier"])] if rows else []
     return Section("units", "Units", text, tables=[table], figure="outlier_scores" if rows else "")
 
 
 def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
-    """Return flagged units first, then by name; of very many units those with the largest errors."""
-    ordered = sorted(rows, key=lambda r: (r["unit"] not in flagged, r["unit"]))
-    if len(rows) <= DRAWING.units:
-        return ordered
+    """Return flagged units, then those with the largest errors; of very many units the first ones."""
     largest: dict[str, float] = {}
     for (unit, _), row in errors.items():
         error = math.inf if row["error_percent"] is None else row["error_percent"]
         largest[unit] = max(largest.get(unit, 0.0), error)
-    return sorted(ordered, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0)))[: DRAWING.units]
+    ordered = sorted(rows, key=lambda r: (r["unit"] not in flagged, -largest.get(r["unit"], 0.0), r["unit"]))
+    return ordered[: DRAWING.units]
 
 
 def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:

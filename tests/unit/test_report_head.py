@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,6 +13,8 @@ from kros.report.error_tables import error_tables
 from kros.report.facts import Facts
 from kros.report.sections.errors import errors
 from kros.report.verdict import Status, judge
+from kros.study.commands.summary import ranking, summary_lines
+from kros.study.pipeline import RunResult
 
 NAME = "koopman/estimator"
 
@@ -167,3 +170,26 @@ def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None
     (table,) = error_tables(metrics(evaluation=rows))
     assert table.mean(NAME, ["velocity", "current"]) == pytest.approx(2.0)
     assert table.mean("l/h2", ["velocity", "current"]) == float("inf")
+
+
+def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
+    verdict, numbers, path = summary_lines(RunResult(tmp_path, metrics(outliers=[FLAGGED]), ()))
+    assert verdict.startswith("CHECK: “Koopman, estimator” estimates velocity from angle. Check 1 point")
+    assert numbers == "error of velocity 0.200 % of the largest value (worst unit b: 0.200 %); units flagged 1 of 1 (b)"
+    assert path == f"results: {tmp_path}"
+    early, alert, _ = summary_lines(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]}), ()))
+    assert early == "3 units: no observer has been designed yet"
+    assert alert == "check: stuck"
+
+
+def test_observers_are_ranked_by_their_errors() -> None:
+    rows = [row("koopman/open_loop", 0.9), row(NAME, 0.2), row("l/h2", None), row("learned", 0.3)]
+    lines = ranking(Facts(metrics(evaluation=rows)))
+    assert [line.split()[0] for line in lines[2:]] == [NAME, "learned", "koopman/open_loop", "l/h2"]
+    assert lines[2].endswith("<- deployed")
+    assert lines[-1].split()[-1] == "diverged"
+
+
+def test_the_bound_of_a_filter_bank_is_that_of_units_left_out() -> None:
+    facts = Facts(metrics(observers={NAME: {**BOUND, "set_bound": {"velocity": 0.5}}}))
+    assert judge(facts).certified[0] == "Largest RMS error on units left out: 0.500 rad/s in velocity."

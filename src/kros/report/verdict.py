@@ -87,7 +87,7 @@ def _sentence(facts: Facts, status: Status, reasons: Sequence[Reason]) -> str:
         return reasons[0].text
     task = f"estimates {channels(facts.hidden)}" + (f" from {channels(facts.measured)}" if facts.measured else "")
     if status is Status.READY:
-        return f"“{facts.label}” can be deployed on machines like the {facts.study['units']} recorded ones: it {task}."
+        return f"“{facts.label}” can be deployed on units like the {facts.study['units']} recorded ones: it {task}."
     return f"“{facts.label}” {task}. Check {len(reasons)} point{'s' * (len(reasons) > 1)} before it is used."
 
 
@@ -149,7 +149,7 @@ def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
     cells = left[0].cells.get(facts.deployed, {}) if left else {}
     if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
-        yield text, "Do not use it on new machines.", "left-out"
+        yield text, "Do not use it on new units.", "left-out"
 
 
 def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
@@ -218,7 +218,7 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
 def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
     """Yield what is not certified or bounded, and folds that failed."""
     if facts.entry.get("relift_certified") is False:
-        action = "Run it beside the machine before anything depends on it."
+        action = "Test it in parallel before anything depends on it."
         yield "No certificate at run time covers the observer.", action, "certificates"
     if outside := facts.entry.get("set_outside"):
         text = f"Outside the set of recorded signals that the certificate covers: {some_of(outside)}."
@@ -247,7 +247,7 @@ def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
         )
         text += f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
         text += (
-            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from machines."
+            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from the units."
         )
         yield text, "Do not read a bound over the set as a bound on the error.", "spread"
 
@@ -289,7 +289,7 @@ def voids(facts: Facts) -> list[str]:
     texts = ["A controller uses the estimate: the recordings did not depend on it."]
     if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
         texts += ["Signals have more power at some frequency than the recorded ones, or leave the range of training."]
-        texts += ["The machine is worn, badly assembled, or of another batch."]
+        texts += ["The unit is worn, badly assembled, or of another batch."]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
 

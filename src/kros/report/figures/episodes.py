@@ -23,7 +23,6 @@ from ..names import (
     episode_title,
     model_label,
     model_look,
-    number,
     observer_label,
     observer_look,
     paper_pair,
@@ -75,11 +74,7 @@ def free_run(run: RunFolder) -> tuple[Figure, str]:
     lines = {model_label(n): (shown.models[n], model_look(n)) for n in names}
     block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), DRAWING.states)))
     text = "Simulation from the first recorded state with the recorded inputs, without measurements."
-    errors = {n: error for n, error in run.evaluation["free_run"].items() if n in names}
-    medians = {n: [f"{words(c)} {number(v['median'])} %" for c, v in error.items()] for n, error in errors.items()}
-    parts = [f"{model_label(n)} {', '.join(values)}" for n, values in medians.items()]
-    text += f" Median errors over units: {'; '.join(parts)}." if parts else ""
-    return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
+    return _figure(run, [block], text)
 
 
 def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
@@ -96,7 +91,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     ]
     measured = " and ".join(words(c.name) for c in run.states if c.measured)
     text = f"{_PAPER if paper else ''}Estimated from {measured} alone; errors are recorded minus estimated values."
-    return blocks_figure(Signals.of(run), blocks), text + _shaded(run)
+    return _figure(run, blocks, text)
 
 
 def other_condition(run: RunFolder) -> tuple[Figure, str]:
@@ -109,7 +104,7 @@ def other_condition(run: RunFolder) -> tuple[Figure, str]:
     block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
-    return blocks_figure(Signals.of(run), [block]), text + _shaded(run)
+    return _figure(run, [block], text)
 
 
 def _paper(names: Sequence[str]) -> list[str]:
@@ -124,9 +119,11 @@ def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[i
     return Block(title, shown, lines, states)
 
 
-def _shaded(run: RunFolder) -> str:
-    """Say what is shaded, where the study has a gearbox frequency."""
-    return " Shaded: the band around the gearbox frequency at top speed." if run.evaluation.get("band_hz") else ""
+def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure, str]:
+    """Return the figure of some episodes of a run and its caption."""
+    signals = Signals.of(run)
+    text += " Shaded: the band around the gearbox frequency at top speed." if signals.band_hz else ""
+    return blocks_figure(signals, blocks), text
 
 
 def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:

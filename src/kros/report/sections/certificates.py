@@ -15,13 +15,13 @@ _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
     "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the "
     "recorded power in every band of frequency, beside the worst RMS error on held-out episodes. At run time: a bound "
-    "on the gain from the model's one-step residual to the error, with the state re-lifted at every step. The estimator "
-    "has no model: its bound for recorded signals is the largest error on a unit left out of its regression."
+    "on the gain from the model's one-step residual to the error, with the state re-lifted at every step. The "
+    "estimator has no model: its bound for recorded signals is the largest error on a unit left out of its regression."
 )
 _ASSUMED = (
     "The recorded units represent those to come: another batch and wear are not covered.",
-    "The recorded motion depended on no estimate: the certificates do not hold if a controller uses the estimate.",
-    "The set of plants: every machine is the nominal model perturbed by at most the weights, in one form.",
+    "The recorded signals depended on no estimate: the certificates do not hold if a controller uses the estimate.",
+    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form.",
     "The recorded signals: residuals have at most the recorded power in every band of frequency.",
     "Errors are those relative to the recorded sensors, unless the true signal is known.",
 )

@@ -30,7 +30,7 @@ def deployment(facts: Facts) -> Section | None:
         ("Observer", [f"{facts.label}{about} (observers/deployed.json)."]),
         *(_interface(facts, facts.get("deployment")) if facts.get("deployment") else []),
         ("Certificate assumes", [f"{assumed[0].upper()}{assumed[1:]}."] if assumed else []),
-        ("Next machine", _next_unit(facts.get("next_unit"))),
+        ("Next unit", _next_unit(facts.get("next_unit"))),
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
     return Section("deployment", "Deployment", card=[(term, texts) for term, texts in card if texts])
@@ -58,13 +58,13 @@ def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequen
 
 
 def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> list[str]:
-    """Say which numbers every machine needs, and how they are obtained."""
+    """Say which numbers every unit needs, and how they are obtained."""
     if not parameters:
         return []
     values = joined([f"{n} ({number(value)} on the nominal unit)" for n, value in parameters.items()])
     first = next(iter(parameters))
     how = f", from recordings at constant speed in both directions, or --track {first}" if calibrated else ""
-    return [f"{values}; every machine has its own value: --parameter UNIT.{first}=VALUE{how}."]
+    return [f"{values}; every unit has its own value: --parameter UNIT.{first}=VALUE{how}."]
 
 
 def _ends(limit: Mapping[str, Any]) -> str:
@@ -79,12 +79,16 @@ def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str
     assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in entry.items() if v) for n, entry in sensor.items()}
     texts = [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
     tried = doublings(facts).get(facts.deployed, {})
-    parts = [_NEEDS[kind].format(value) for kind, value in tried.items() if kind in _NEEDS and ">" not in value]
+    parts = [
+        _NEEDS[kind].format(value).replace("of < ", "below ")
+        for kind, value in tried.items()
+        if kind in _NEEDS and ">" not in value
+    ]
     return [*texts, f"The error doubles with {joined(parts).replace(' and ', ' or ')}."] if parts else texts
 
 
 def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:
-    """Return the bound for the next machine from units in reserve."""
+    """Return the bound for the next unit from units in reserve."""
     if not entry:
         return []
     if entry["bounds"] is None:

@@ -73,7 +73,7 @@ def left_out(facts: Facts) -> Section | None:
     folds = len(folded["folds"])
     text = (
         f"The units are divided into {folds} folds. For each fold the study is repeated with all other units, and its "
-        "observers run on the units of the fold, as on new machines. Certified: in how many folds."
+        "observers run on the units of the fold, as on new units. Certified: in how many folds."
     )
     failed = [f"Fold {int(n) + 1} failed: {reason}" for n, reason in folded["failed"].items()]
     tables = []
@@ -131,7 +131,7 @@ def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:
 
     chosen = [
         *(("deployed", facts.deployed), ("best with a certificate", best(certified))),
-        ("the paper's", next(iter(paper_pair(table.cells)[::-1]), None)),
+        ("as published", next(iter(paper_pair(table.cells)[::-1]), None)),
         *(("", name) for name in (best(tuned), "learned", "filtered_difference", f"{facts.model}/open_loop")),
     ]
     roles: dict[str, list[str]] = {}

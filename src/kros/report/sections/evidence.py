@@ -69,8 +69,8 @@ def calibration(facts: Facts) -> Section | None:
         return None
     text = (
         f"The gearbox disturbance is modelled as sin({entry['ratio']:g} · {entry['angle']} + {entry['parameter']}); "
-        "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse apart. "
-        f"Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
+        "the phase differs from unit to unit. It is estimated from segments of constant speed, forward and reverse "
+        f"apart. Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
     missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
     more = [f"Not calibrated, and without models: {some_of(missing)}."] if missing else []

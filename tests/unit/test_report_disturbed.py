@@ -51,7 +51,6 @@ def test_curves_begin_without_disturbance_and_take_one_condition():
     curve = curves(rows, "noload")["a"][Kind.BIAS]["v"]
     np.testing.assert_array_equal(curve.severities, [0, 0.1, 0.2])
     np.testing.assert_array_equal(curve.errors, [1, 2, np.inf])
-    np.testing.assert_array_equal(curves(rows, "noload", "worst")["a"][Kind.BIAS]["v"].errors, [2, 4, np.inf])
 
 
 def evaluation(units=8, seed=0):

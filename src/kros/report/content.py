@@ -62,7 +62,6 @@ class Section:
     tables: Sequence[Table | None] = ()
     figure: str = ""
     lists: Pairs = ()
-    folded: Sequence[tuple[str, str]] = ()  # titles and preformatted texts that the reader opens
 
 
 def build(caption: str, columns: Sequence[Column], chosen: str | None = None, **options: bool) -> Table | None:

@@ -46,12 +46,12 @@ class Curve(NamedTuple):
 Curves = dict[str, dict[Kind, dict[str, Curve]]]
 
 
-def curves(rows: Sequence[Mapping[str, Any]], condition: str, what: str = "mean") -> Curves:
-    """Return curves by observer, kind and channel from ``robustness``; `what` is ``mean`` or ``worst``."""
+def curves(rows: Sequence[Mapping[str, Any]], condition: str) -> Curves:
+    """Return curves of mean errors by observer, kind and channel from ``robustness`` of the metrics."""
     plain: dict[tuple[str, str], float] = {}
     points: dict[tuple[str, Kind, str], list[tuple[float, float]]] = {}
     for row in (r for r in rows if r["condition"] == condition):
-        value, observer, channel = row["error_percent"][what], row["observer"], row["channel"]
+        value, observer, channel = row["error_percent"]["mean"], row["observer"], row["channel"]
         error = np.inf if value is None else float(value)
         if row["disturbance"] == "none":
             plain[observer, channel] = error

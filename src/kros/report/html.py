@@ -75,7 +75,7 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     environment = Environment(
         loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    facts = Facts({**metrics, "settings": run.study})
+    facts = Facts(metrics)
     parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
     names = [section.figure for part in parts for section in part if section.figure]
     figures = {}

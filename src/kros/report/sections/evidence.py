@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import platform
 from collections.abc import Mapping
@@ -175,15 +174,13 @@ def robustness(facts: Facts) -> Section | None:
 
 
 def run(facts: Facts) -> Section:
-    """Return times, versions and settings."""
+    """Return times, versions, and where the settings are."""
     timing = facts.get("timing_s", {})
     times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
-    versions = [import_module(name).__version__ for name in _PACKAGES]
-    packages = [
-        Column("package", ["Python", *_PACKAGES]),
-        Column("version", [platform.python_version(), *versions]),
-    ]
-    text = "metrics.json holds all numbers of this page. The same recordings and settings give the same results."
-    settings = json.dumps(facts.get("settings", {}), indent=1, ensure_ascii=False)
-    tables = [build("Time; a stage that was up to date counts with its own time", times), build("Versions", packages)]
-    return Section("run", "Run", [text], tables=tables, folded=[("All settings of the study", settings)])
+    versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
+    text = (
+        "metrics.json holds all numbers of this page, study.json all settings; both give the same results again with "
+    )
+    text += f"{', '.join(versions)} and Python {platform.python_version()}."
+    table = build("Time; a stage that was up to date counts with its own time", times)
+    return Section("run", "Run", [text], tables=[table])

@@ -73,7 +73,9 @@ class Verdict:
 
 def judge(facts: Facts) -> Verdict:
     """Return the verdict on a run."""
-    reasons = [*_stops(facts), *_checks(facts)]
+    reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
+    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates, _small_set):
+        reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
     known = [reason.status for reason in reasons]
     status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
     certified = certificates(facts)
@@ -117,19 +119,6 @@ def _numbers(facts: Facts) -> list[Number]:
 def _lag(lag_s: float | None) -> str:
     """Return how late a signal is, for a sentence."""
     return "" if lag_s is None else f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
-
-
-def _stops(facts: Facts) -> Iterator[Reason]:
-    """Yield why the observer must not be used."""
-    for text, action, section in _stopping(facts):
-        yield Reason(Status.NOT_READY, text, action, section)
-
-
-def _checks(facts: Facts) -> Iterator[Reason]:
-    """Yield what has to be checked before the observer is used."""
-    for part in (_of_recordings, _of_units, _of_errors, _of_certificates, _small_set):
-        for text, action, section in part(facts):
-            yield Reason(Status.CHECK, text, action, section)
 
 
 def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:

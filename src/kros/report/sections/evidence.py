@@ -132,28 +132,19 @@ def uncertainty(facts: Facts) -> Section | None:
         "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
     )
     weights = [entry["weight"] for entry in entries.values()]
+    noise = [entry.get("noise_share") for entry in entries.values()]
     orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
     columns = [
         Column("model", [model_label(name) for name in entries]),
         Column("weights", [entry["structure"] for entry in weights]),
         Column("orders, left and right", orders),
-        Column("largest normalised residual", [_exact(entry["cover_max"]) for entry in weights]),
+        Column("largest normalised residual", [number(w["cover_max"], 6) for w in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
         Column("above the optimal bound (dB)", [entry["overbound_db_max"] for entry in weights]),
-        Column("estimation noise in the spread (%)", [_noise(entry) for entry in entries.values()]),
+        Column("estimation noise in the spread (%)", [None if n is None else 100 * n["at_peak"] for n in noise]),
         Column("approximation error", [entry["misfit_max"] for entry in entries.values()]),
     ]
     return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
-
-
-def _noise(entry: Mapping[str, Any]) -> float | None:
-    """Return the share of estimation noise in the largest difference between units, percent."""
-    return 100 * entry["noise_share"]["at_peak"] if "noise_share" in entry else None
-
-
-def _exact(value: float | None) -> str | None:
-    """Return a number near one with six digits."""
-    return None if value is None else number(value, 6)
 
 
 def robustness(facts: Facts) -> Section | None:

@@ -190,7 +190,9 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
         return
     if (better := better_observer(table, facts.deployed, hidden)) is not None:
         text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
-        yield text, f'Compare both; observer.deployed = "{better}" selects it.', "errors"
+        designed = "relift_certified" in facts.observers.get(better, {})
+        action = f'observer.deployed = "{better}" selects it.' if designed else "It is a baseline that is not exported."
+        yield text, f"Compare both. {action}", "errors"
     same = not_improved(table, facts.deployed, hidden)
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."

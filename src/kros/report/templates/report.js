@@ -1,5 +1,5 @@
 "use strict";
-// The page is complete without this: it adds sorting, filtering, names under the pointer, and opens what a link leads to.
+// The page is complete without this: it adds sorting, filtering, names of units on hover, zoom on click, and opens what a link leads to.
 (() => {
   const all = (selector, root = document) => [...root.querySelectorAll(selector)];
   document.documentElement.className = "js";

@@ -1,17 +1,22 @@
-"""The head of the report, what stands behind observers, and the deployment card, for metrics made by hand."""
+"""The head of the report: verdict, reasons, numbers, certificates; for metrics made by hand."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from kros.report.content import Level
-from kros.report.error_tables import error_table
-from kros.report.summary import summary
-from kros.report.trust import best_certified, dropout_text, sensor_text, trust_of, trusts
+from kros.report.content import Column, build
+from kros.report.disturbances import doublings
+from kros.report.error_tables import error_tables
+from kros.report.facts import Facts
+from kros.report.sections.errors import errors
+from kros.report.verdict import Status, judge
+from kros.study.commands.summary import ranking, summary_lines
+from kros.study.pipeline import RunResult
 
-NAME = "koopman/memory"
+NAME = "koopman/estimator"
 
 
 def row(observer: str, percent: float | None, unit: str = "b", channel: str = "velocity") -> dict[str, Any]:
@@ -26,18 +31,16 @@ def metrics(**parts: Any) -> dict[str, Any]:
         "identify_on": "default",
         "sample_period_s": 0.002,
         "deployed": NAME,
+        "measured": ["angle"],
+        "channels": {"angle": "rad", "velocity": "rad/s"},
     }
-    study |= {"channels": {"velocity": "rad/s"}} | parts.pop("study", {})
     observers = {
-        NAME: {"status": "trained", "relift_certified": True, "relift_gain": 2.0},
+        NAME: {"status": "certified", "relift_certified": True, "relift_gain": 2.0},
         "linear/worst_case_h2": {"status": "certified"},
     }
-    return {
-        "study": study,
-        "observers": observers,
-        "evaluation": [row(NAME, 0.2), row("koopman/open_loop", 0.9)],
-        **parts,
-    }
+    study |= parts.pop("study", {})
+    evaluation = [row(NAME, 0.2), row("koopman/open_loop", 0.9)]
+    return {"study": study, "observers": observers, "evaluation": evaluation, **parts}
 
 
 BETTER_IN_ONE = [
@@ -47,84 +50,146 @@ BETTER_IN_ONE = [
     ("koopman/open_loop", 6.1, "current"),
 ]
 FLAGGED = {"unit": "b", "condition": "default", "score": 9.0, "outlier": True}
+OPEN = {**FLAGGED, "outlier": False, "status": "cannot tell"}
+BOUND = {"set_certified": True, "set_bound": {"velocity": 0.003}, "relift_certified": True, "relift_gain": 2.0}
 
 
 @pytest.mark.parametrize(
-    ("parts", "light", "section", "text"),
+    ("parts", "status", "section", "text"),
     [
-        ({"outliers": [FLAGGED]}, Level.LOOK, "units", "Flagged as not belonging to the batch: b"),
-        ({"study": {"alerts": ["a stuck sensor"]}}, Level.LOOK, "recordings", "a stuck sensor"),
+        ({"outliers": [FLAGGED]}, Status.CHECK, "units", "Flagged as not belonging to the batch: b"),
+        ({"outliers": [OPEN]}, Status.CHECK, "units", "No outlier score is conclusive (1 of 1)"),
+        ({"study": {"alerts": ["a stuck sensor"]}}, Status.CHECK, "recordings", "a stuck sensor"),
         (
             {"observers": {NAME: {"relift_certified": False}, "linear/mixed": {}}},
-            Level.LOOK,
-            "trust",
-            "No certificate covers",
+            Status.CHECK,
+            "certificates",
+            "No certificate at run time",
         ),
+        ({"observers": {NAME: BOUND}}, Status.CHECK, "certificates", "0.00400 rad/s RMS, the bound is 0.00300 rad/s"),
         (
             {"evaluation": [row(NAME, 0.2), row("linear/mixed", 0.1)]},
-            Level.LOOK,
-            "observers",
-            "“linear, mixed H2-H∞” is more accurate",
+            Status.CHECK,
+            "errors",
+            "“linear, mixed H2-H∞” has smaller errors",
         ),
-        ({"evaluation": [row(NAME, None)]}, Level.STOP, "models", "diverge"),
+        ({"evaluation": [row(NAME, None)]}, Status.NOT_READY, "models", "diverge"),
         (
             {"evaluation": [row(NAME, 0.9), row("koopman/open_loop", 0.9)]},
-            Level.STOP,
-            "observers",
-            "no better than its model alone",
+            Status.NOT_READY,
+            "errors",
+            "no better than its model",
         ),
         (
             {"evaluation": [row(o, e, channel=c) for o, e, c in BETTER_IN_ONE]},
-            Level.LOOK,
-            "observers",
-            "Correction brings nothing for current",
+            Status.CHECK,
+            "errors",
+            "The correction does not improve current",
         ),
-        ({"observers": {"learned": {}}}, Level.LOOK, "synthesis", "No robust observer"),
-        ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, Level.STOP, "left-out", "diverges on some units"),
-        ({"study": {"deployed": None}}, Level.STOP, "making", "stopped before an observer was made"),
+        ({"observers": {"learned": {}}}, Status.CHECK, "certificates", "No robust observer"),
+        ({"left_out": {"rows": [row(NAME, None)], "failed": {}}}, Status.NOT_READY, "left-out", "diverges on some"),
+        ({"study": {"deployed": None}}, Status.NOT_READY, "run", "stopped before an observer was designed"),
     ],
 )
-def test_every_alert_sets_the_light_and_leads_to_its_section(
-    parts: dict[str, Any], light: Level, section: str, text: str
+def test_every_reason_sets_the_status_and_leads_to_its_section(
+    parts: dict[str, Any], status: Status, section: str, text: str
 ) -> None:
-    found = summary(metrics(**parts), ("angle",))
-    assert found.light is light
-    assert [(a.level, a.section) for a in found.alerts if text in a.text] == [(light, section)]
-    assert light is Level.LOOK or text in found.sentence
+    found = judge(Facts(metrics(**parts)))
+    assert found.status is status
+    assert [(r.status, r.section) for r in found.reasons if text in r.text] == [(status, section)]
+    assert status is Status.CHECK or text in found.sentence
+    assert "can be deployed" not in found.sentence
+
+
+def test_ready_means_that_it_can_be_deployed_and_voids_stand_beside() -> None:
+    found = judge(Facts(metrics()))
+    assert found.status is Status.READY
+    assert not found.reasons
+    assert "can be deployed" in found.sentence
+    assert "velocity from angle" in found.sentence
+    assert found.certified == ["At run time: the gain from the model's one-step residual to the error is at most 2.00."]
+    assert "controller uses the estimate" in found.void[0]
+    assert judge(Facts(metrics(observers={NAME: {}}))).void == []
+
+
+def test_errors_against_the_true_signal_stand_beside_those_against_the_recording() -> None:
+    known = {"true_error_percent": 0.31, "true_rms": 0.0062, "true_lag_s": 0.0011}
+    facts = metrics(evaluation=[{**row(NAME, 0.024), **known}, row("koopman/open_loop", 0.9)])
+    (number,) = judge(Facts(facts)).numbers
+    assert number.value == "0.0240"
+    assert number.notes[-1] == "against the true signal: 0.310 %, 1.1 ms late"
+    first = errors(Facts(facts)).tables[0]
+    assert "velocity: against the true signal (%)" in first.labels
+    assert "velocity: against the true signal (%)" not in errors(Facts(metrics())).tables[0].labels
 
 
 def test_the_best_certified_observer_is_one_that_was_designed() -> None:
-    entries = {
-        "l/open_loop": {"worst_case_h2": 1.0},
-        "l/mixed": {"worst_case_h2": 1.0},
-        "l/h2": {"worst_case_h2": 1.0},
-        NAME: {},
-    }
+    entries = {"l/open_loop": {"worst_case_h2": 1.0}, "l/mixed": {"worst_case_h2": 1.0}, "l/h2": {"worst_case_h2": 1.0}}
     rows = [row("l/open_loop", 0.1), row("l/mixed", 0.5), row("l/h2", 0.4), row(NAME, 0.2)]
-    found = metrics(observers=entries, evaluation=rows)
-    (table,) = error_table(rows, "default")
-    assert best_certified(found, table, ["velocity"]) == "l/h2"
-    signals = {**metrics()["observers"], NAME: {"set_certified": True, "set_bound_percent": {"velocity": 1.0}}}
-    assert best_certified({**found, "observers": signals}, table, ["velocity"]) == NAME
-    assert best_certified(metrics(), table, ["velocity"]) is None
+    first = errors(Facts(metrics(observers={**entries, NAME: {}}, evaluation=rows))).tables[0]
+    notes = {cells[0].text: cells[0].note for cells in first.rows}
+    assert notes["l, H2"].startswith("best with a certificate")
+    signals = {**metrics()["observers"], NAME: {"set_certified": True}}
+    first = errors(Facts(metrics(observers=signals, evaluation=rows))).tables[0]
+    assert first.rows[first.chosen[0]][0].note.startswith("deployed and best with a certificate")
 
 
-def test_sensor_and_dropouts_are_those_that_double_the_error() -> None:
+def test_an_error_doubles_where_it_was_tried() -> None:
     tried = [("none", 0.0, 1.0), ("noise", 1e-3, 2.0), ("dropped", 0.1, 1.5), ("delay", 1, 9.0)]
-    rows = [
-        {
-            "observer": NAME,
-            "disturbance": kind,
-            "severity": s,
-            "condition": "default",
-            "channel": "velocity",
-            "error_percent": {"mean": e},
-        }
-        for kind, s, e in tried
+    shared = {"observer": NAME, "condition": "default", "channel": "velocity"}
+    rows = [{**shared, "disturbance": k, "severity": s, "error_percent": {"mean": e}} for k, s, e in tried]
+    found = doublings(Facts(metrics(robustness=rows)))
+    assert {kind.value: text for kind, text in found[NAME].items()} == {
+        "noise": "0.1",
+        "delay": "< 1",
+        "dropped": "> 10",
+    }
+    assert doublings(Facts(metrics())) == {}
+
+
+def test_tables_leave_out_what_is_not_known() -> None:
+    columns = [
+        Column("name", ["a", "b"]),
+        Column("error", [2.0, 1.0], "group", best=True),
+        Column("nothing", [None, float("nan")], "group"),
+        Column("certified", [True, None], "other"),
     ]
-    found = metrics(robustness=rows)
-    assert sensor_text(found, NAME, ()) == "noise 0.10 %; delay less than 1"
-    assert sensor_text(found, "learned", ()) == dropout_text(found, "learned", trust_of({}), ()) == "not tried"
-    lossy = trust_of({"dropout_rate": 0.05, "dropout_certified": True})
-    assert dropout_text(found, NAME, lossy, ()) == "certified at 5 %; none that was tried doubles the error"
-    assert set(trusts(found)) == {NAME, "linear/worst_case_h2", "koopman/open_loop"}
+    table = build("caption", columns, chosen="b")
+    assert table is not None
+    assert list(table.head) == ["name", "error", "certified"]
+    assert list(table.groups) == [("", 1), ("group", 1), ("other", 1)]
+    assert [[c.text for c in cells] for cells in table.rows] == [["a", "2.00", "yes"], ["b", "1.00", "–"]]
+    assert [cells[1].strong for cells in table.rows] == [False, True]
+    assert list(table.chosen) == [1]
+    assert build("empty", [Column("name", []), Column("x", [])]) is None
+    assert build("unknown", [Column("name", ["a"]), Column("x", [None])]) is None
+
+
+def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None:
+    rows = [row(NAME, 1.0), row(NAME, 4.0, channel="current"), row("l/h2", None), row("l/h2", 1.0, channel="current")]
+    (table,) = error_tables(metrics(evaluation=rows))
+    assert table.mean(NAME, ["velocity", "current"]) == pytest.approx(2.0)
+    assert table.mean("l/h2", ["velocity", "current"]) == float("inf")
+
+
+def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
+    verdict, numbers, path = summary_lines(RunResult(tmp_path, metrics(outliers=[FLAGGED]), ()))
+    assert verdict.startswith("CHECK: “Koopman, estimator” estimates velocity from angle. Check 1 point")
+    assert numbers == "error of velocity 0.200 % of the largest value (worst unit b: 0.200 %); units flagged 1 of 1 (b)"
+    assert path == f"results: {tmp_path}"
+    early, alert, _ = summary_lines(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]}), ()))
+    assert early == "3 units: no observer has been designed yet"
+    assert alert == "check: stuck"
+
+
+def test_observers_are_ranked_by_their_errors() -> None:
+    rows = [row("koopman/open_loop", 0.9), row(NAME, 0.2), row("l/h2", None), row("learned", 0.3)]
+    lines = ranking(Facts(metrics(evaluation=rows)))
+    assert [line.split()[0] for line in lines[2:]] == [NAME, "learned", "koopman/open_loop", "l/h2"]
+    assert lines[2].endswith("<- deployed")
+    assert lines[-1].split()[-1] == "diverged"
+
+
+def test_the_bound_of_a_filter_bank_is_that_of_units_left_out() -> None:
+    facts = Facts(metrics(observers={NAME: {**BOUND, "set_bound": {"velocity": 0.5}}}))
+    assert judge(facts).certified[0] == "Largest RMS error on units left out: 0.500 rad/s in velocity."

@@ -1,4 +1,4 @@
-"""The page, the figures as files and the plots, on a small run folder written by the dataclasses that the stages use."""
+"""The page, figures as files and plots, on a small run folder written by the classes that the stages use."""
 
 from __future__ import annotations
 
@@ -34,12 +34,10 @@ from kros.identify.identified import IdentifiedModels
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.report import plot, render, write_figures
-from kros.report.figures import FIGURES, ON_THE_PAGE, draw, draw_all
-from kros.report.figures.residuals import beside, entry_names
-from kros.report.figures.spectra import band_shares, of_episode
-from kros.report.figures.synthesis.bode import scaled_filter
-from kros.report.figures.uncertainty.forms import paper_bounds
-from kros.report.figures.uncertainty.forms_entrywise import entry_bounds
+from kros.report.figures import FIGURES, draw, draw_all
+from kros.report.figures.entries import beside, entry_names
+from kros.report.figures.synthesis import scaled_filter
+from kros.report.figures.uncertainty import published_bounds
 from kros.report.files import to_svg
 from kros.report.names import observer_label
 from kros.report.plotting import PLOTS
@@ -214,7 +212,6 @@ def write_observers(run: Path) -> list[str]:
     facts: dict[str, Any] = {
         n: {"order": 0, "spectral_radius_max": 0.99, "worst_case_h2": 1.0 + i} for i, n in enumerate(names)
     }
-    facts["linear_edmd/hinf"] = {"status": "failed", "reason": "a reason; a reason; another"}
     save_artifact(run / "observers", "observers", {"names": names, "deployed": DEPLOYED, "facts": facts})
     return names
 
@@ -337,7 +334,9 @@ def finished(
         "uncertainty": {k: entry for k in ("koopman_edmd", "linear_edmd")},
         "observers": {
             n: {"order": 0, "status": "certified", "worst_case_h2": 1.0, "spectral_radius_max": 0.99} for n in names
-        },
+        }
+        | {"linear_edmd/hinf": {"status": "failed", "reason": "a reason; a reason; another"}},
+        "calibration": {"ratio": 100.0, "angle": "position", "parameter": "phase", "lag_rad": -0.9},
         "evaluation": rows,
         "outliers": [{"unit": u, "condition": "load", "score": 1.0, "outlier": u == "000000"} for u in UNITS],
     }
@@ -347,6 +346,7 @@ def finished(
 
 def early_metrics() -> dict[str, Any]:
     study = {"units": 4, "conditions": ["load", "noload"], "identify_on": "noload", "sample_period_s": DT}
+    study |= {"channels": {c.name: c.unit for c in CHANNELS}, "measured": ["position"]}
     return {
         "schema": 1,
         "study": study,
@@ -415,30 +415,47 @@ def test_identifiers_are_unique_and_references_lead_somewhere(page: str) -> None
     assert {link[1:] for link in found.links} | set(re.findall(r"url\(#([^)]*)\)", page)) <= set(found.ids)
 
 
-def test_every_figure_is_on_the_page_with_a_caption(page: str) -> None:
-    expected = set(ON_THE_PAGE) - {"load_torque"}  # of studies that declare a load
-    assert page.count("<figure") == page.count("<figcaption>") == len(expected)
-    assert "is left out" not in page
+def test_every_section_has_at_most_one_figure_with_a_caption(page: str) -> None:
+    sections = re.findall(r'<section id="([^"]*)".*?</section>', page, flags=re.DOTALL)
+    assert len(sections) == len(set(sections)) > 10
+    for part in re.findall(r"<section .*?</section>", page, flags=re.DOTALL):
+        assert part.count("<figure") == part.count("<figcaption") <= 1
+    assert page.count("<figure") == 9
+    assert all(f">{word}<" in page for word in ("Errors", "Units", "Certificates"))
+
+
+def test_words_of_the_verdict(page: str) -> None:
+    assert '<p class="status"><span class="lamp" aria-hidden="true"></span>NOT READY</p>' in page
+    assert "can be deployed" not in page
+    assert "not tried" not in page
+    assert "The certificates do not hold if" in page
 
 
 _LOOK = """
-const details = [...page.querySelectorAll("details")];
+const folded = page.documentElement.scrollHeight, details = [...page.querySelectorAll("details")];
 details.forEach(one => { one.removeAttribute("name"); one.open = true; });
-const cut = [...page.querySelectorAll(".wide")].filter(one => one.querySelector("table") && one.scrollWidth > one.clientWidth + 1);
-const table = page.querySelector("#observers table.sortable"), column = () => [...table.tBodies[0].rows].map(row => row.cells[3].dataset.value ?? "");
-const [first, second] = [0, 1].map(() => { table.querySelector("thead tr:last-child th:nth-child(4) button").click(); return column(); });
-const field = page.querySelector("#observers input");
+const cut = [...page.querySelectorAll(".wide")].filter(
+  one => one.querySelector("table") && one.scrollWidth > one.clientWidth + 1);
+const table = page.querySelector("#errors table.sortable");
+const column = () => [...table.tBodies[0].rows].map(row => row.cells[2].dataset.value ?? "");
+const button = table.querySelector("thead tr:last-child th:nth-child(3) button");
+const [first, second] = [0, 1].map(() => { button.click(); return column(); });
+const field = page.querySelector("#errors input");
 field.value = "kalman no"; field.dispatchEvent(new Event("input"));
-const kept = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
+const shown = [...table.tBodies[0].rows].filter(row => !row.hidden).map(row => row.textContent.toLowerCase());
 const unnamed = [...page.querySelectorAll("svg[role=img], nav, input, button")].filter(
   one => !(one.getAttribute("aria-label") || one.textContent.trim() || one.closest("label")));
 const mark = page.querySelector("figure use[data-unit]");
 mark.scrollIntoView({ block: "center", inline: "center" });
 const box = mark.getBoundingClientRect(), at = { clientX: box.x + box.width / 2, clientY: box.y + box.height / 2 };
 mark.closest("svg").dispatchEvent(new frame.PointerEvent("pointermove", at));
-const tip = page.querySelector(".tip");
-return { tip: tip.hidden ? "" : tip.textContent, overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.textContent.trim().slice(0, 60)),
-  first, second, kept, unnamed: unnamed.length, units: page.querySelectorAll("svg [data-unit]").length };
+const tip = page.querySelector(".tip"), near = page.querySelectorAll(".near").length;
+const wide = mark.closest(".wide"), before = mark.closest("svg").getBoundingClientRect().width;
+wide.click();
+const zoomed = mark.closest("svg").getBoundingClientRect().width / before;
+return { tip: tip.hidden ? "" : tip.textContent, near, zoomed, folded,
+  overflow: page.documentElement.scrollWidth - width, cut: cut.map(one => one.textContent.trim().slice(0, 60)),
+  first, second, shown, unnamed: unnamed.length, units: page.querySelectorAll("svg [data-unit]").length };
 """
 
 
@@ -451,10 +468,13 @@ def test_page_in_a_browser(page: str, tmp_path: Path) -> None:
         assert known[0] == sorted(known[0])
         assert known[1] == known[0][::-1]
         assert known[0][0] < known[0][-1]
-        assert 0 < len(seen["kept"]) < len(seen["first"])
-        assert all("kalman" in text and "no" in text for text in seen["kept"])
+        assert 0 < len(seen["shown"]) < len(seen["first"])
+        assert all("kalman" in text and "no" in text for text in seen["shown"])
         assert seen["units"] > 0
         assert seen["tip"] in UNITS
+        assert seen["near"] > 1  # the same unit in other figures
+        assert seen["zoomed"] > 1.2
+    assert found["1400"]["folded"] <= 4000
     assert printed_pages(page, tmp_path) <= 12
 
 
@@ -474,28 +494,20 @@ def test_text_is_escaped(page: str) -> None:
     assert "<h1>tiny &amp; small</h1>" in page
 
 
-def test_diverged_and_failed_observers_are_told(page: str) -> None:
+def test_diverged_and_failed_observers_are_named(page: str) -> None:
     assert "diverged" in page
     assert "a reason; another" in page
     assert "a reason; a reason" not in page
 
 
-def test_half_a_run_is_told_by_halves(tmp_path: Path) -> None:
+def test_a_part_of_a_run_has_a_report(tmp_path: Path) -> None:
     write_read_stage(tmp_path)
     text = render(tmp_path, early_metrics()).read_text(encoding="utf-8")
     outline(text)
     assert "<figure" not in text
-    assert "stopped before an observer was made" in text
-    assert "is left out: the recordings are not in their place any more" in text
+    assert "stopped before an observer was designed" in text
+    assert "NOT READY" in text
     assert all(result.figure is None and result.reason for result in draw_all(RunFolder(tmp_path)))
-
-
-def test_shares_of_power_in_a_band() -> None:
-    freqs, own, other = np.arange(100.0), np.ones((100, 2)), np.ones((100, 2))
-    own[45:56], other[45:56, 1] = 0.5, 0.25
-    assert band_shares(freqs, own, other, CHANNELS[:2], (45.0, 55.0)) == pytest.approx(
-        {"position": 0.5, "velocity": 2.0}
-    )
 
 
 def test_broken_artifact_is_an_error(tmp_path: Path) -> None:
@@ -538,22 +550,32 @@ def test_observer_figures_show_nominal_above_worst_off_nominal_and_the_errors(
 ) -> None:
     run = RunFolder(finished[0])
     pair = ["linear_edmd/mixed", "koopman_edmd/mixed"]
-    figure = draw("observers_in_time_paper", run).figure
-    titles = [axes.get_title("left") for axes in figure.axes[::8]]
+    rows = np.reshape(draw("observers_in_time_paper", run).figure.axes, (6, 4))
+    titles = [axes.get_title("left") for axes in rows[::3, 0]]
     assert titles == ["nominal: unit 001, episode 1", "worst off-nominal: unit 002, episode 1"]
-    assert [line.get_label() for line in figure.axes[0].lines] == ["recorded"]
-    assert [line.get_label() for line in figure.axes[2].lines] == list(map(observer_label, pair))  # errors, below
+    assert [line.get_label() for line in rows[0, 0].lines] == ["recorded", *map(observer_label, pair)]
     shown = run.shown[1]
-    drawn = figure.axes[11].lines[1].get_ydata()  # the zoom of velocity's errors on the worst unit, of all samples
-    assert np.isin(drawn, shown.states[:, 1] - shown.observers[pair[1]][:, 1]).all()
-    spectra = of_episode(run, run.shown[1], pair)
-    for name in pair:
-        error = run.shown[1].observers[name].astype(float) - run.shown[1].states
-        _, density = welch(error, 1 / DT, "hann", 512, axis=0)
-        assert spectra[name] == pytest.approx(density, rel=1e-9)
-    drawn = draw("loaded_spectra", run).figure.axes[0].lines[1].get_ydata()
-    error = run.shown[2].observers[pair[1]].astype(float) - run.shown[2].states
-    assert drawn == pytest.approx(welch(error[:, 0], 1 / DT, "hann", 512)[1][1 : 1 + len(drawn)], rel=1e-9)
+    error = shown.states[:, 1] - shown.observers[pair[1]][:, 1]
+    line = rows[4, 2].lines[1]  # velocity of the worst unit, Koopman
+    assert np.isin(line.get_ydata(), error).all()
+    density = welch(error, 1 / DT, "hann", 512)[1][1:]
+    assert rows[4, 3].lines[1].get_ydata() == pytest.approx(density, rel=1e-9)
+    assert len(rows[1, 2].lines) == 1  # an estimate that diverges has no error in scale
+    other = np.reshape(draw("loaded_paper", run).figure.axes, (3, 4))
+    error = run.shown[2].states[:, 0] - run.shown[2].observers[pair[1]][:, 0]
+    assert other[0, 3].lines[1].get_ydata() == pytest.approx(welch(error, 1 / DT, "hann", 512)[1][1:], rel=1e-9)
+
+
+def test_magnitude_and_phase_of_all_units(finished: tuple[Path, dict[str, Any]]) -> None:
+    figure = draw("models", RunFolder(finished[0])).figure
+    found = models("koopman_edmd", "noload", 1)
+    row = figure.axes[:4]
+    assert [axes.get_title("left").split("\n")[1] for axes in row] == ["magnitude (dB)", "phase (°)"] * 2
+    freqs, unit = row[0].lines[0].get_xdata(), found.index("001")
+    response = found.scaled_responses(freqs, ["001"])[0, :, 0, 1]
+    assert row[2].lines[0].get_label() == f"nominal, unit {UNITS[unit]}"
+    assert row[2].lines[0].get_ydata() == pytest.approx(20 * np.log10(np.abs(response)))
+    assert np.exp(1j * np.radians(row[3].lines[0].get_ydata())) == pytest.approx(response / np.abs(response))
 
 
 def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
@@ -566,35 +588,30 @@ def test_plot_takes_every_result(uncertain: dict[str, UncertainModel]) -> None:
         assert figure.axes
         figure.canvas.draw()
     assert dict(matplotlib.rcParams) == before
-    with pytest.raises(ConfigError, match="found a int"):
+    with pytest.raises(ConfigError, match="got a int"):
         plot(3)
 
 
 def test_drawing_leaves_pyplot_alone() -> None:
     code = (
-        "import sys, numpy as np; from kros.core.lti import gain; import kros.report; assert 'matplotlib' not in sys.modules;"
-        "from kros.synthesis.result import Status, Synthesis; kros.report.plot(Synthesis('h2', gain([[1.0]], 0.1), Status.OPTIMAL));"
+        "import sys; from kros.core.lti import gain; import kros.report; assert 'matplotlib' not in sys.modules;"
+        "from kros.synthesis.result import Status, Synthesis;"
+        "kros.report.plot(Synthesis('h2', gain([[1.0]], 0.1), Status.OPTIMAL));"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_output_forms_of_the_paper_never_fall_below_one(uncertain: dict[str, UncertainModel]) -> None:
-    found = paper_bounds(uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1))
+    found = published_bounds(uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1))
     assert set(found) == {Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE}
     assert all(np.all(bound > 1 - 1e-9) for _, bound in found.values())
 
 
-def test_entries_are_those_of_the_form(uncertain: dict[str, UncertainModel]) -> None:
+def test_entries_have_the_names_of_their_signals(uncertain: dict[str, UncertainModel]) -> None:
     model, found = uncertain["koopman_edmd"], models("koopman_edmd", "noload", 1)
-    bounds = entry_bounds(model, found)
-    freqs, entries = bounds[Form.ADDITIVE]
-    G = found.systems(model.unit_ids).frequency_response(freqs) * 3.0 / 2.0
-    nominal = model.unit_ids.index(model.nominals[Form.ADDITIVE])
-    assert entries == pytest.approx(np.abs(G - G[nominal]).max(axis=0))
-    for form, (_, sizes) in bounds.items():
-        assert sizes.shape[1:] == tuple(len(names) for names in entry_names(form, found))
-        assert np.all(sizes.max(axis=(1, 2)) <= model.bounds[form] * (1 + 1e-9))
+    own = beside(model, found)
+    assert own.largest.shape[1:] == tuple(len(names) for names in entry_names(model.form, found))
 
 
 def test_filter_is_scaled_by_the_ranges() -> None:
@@ -608,7 +625,7 @@ def test_filter_is_scaled_by_the_ranges() -> None:
 def test_every_class_that_can_be_plotted_has_its_figure() -> None:
     for name, place in PLOTS.items():
         module, _, function = place.partition(":")
-        assert callable(getattr(import_module(f"kros.report.figures.{module}"), function)), name
+        assert callable(getattr(import_module(f"kros.report.figures.{module}".rstrip(".")), function)), name
     observer = Observer(
         "linear/h2",
         Lifting(STATES),
@@ -640,9 +657,9 @@ def test_results_of_the_short_way_are_plotted(uncertain: dict[str, UncertainMode
     facts = RecordingFacts("noload", {u: "" for u in UNITS}, tuple(keys), tuple(keys), {})
     kind = "linear_edmd"
     found = IdentifiedModels(population, facts, Lifting(STATES), None, (kind,), {kind: models(kind, "noload", 1)})
-    assert len(plot(found).axes) == len(STATES) * 2
+    assert len(plot(found).axes) == len(STATES) * 4
     sets = UncertainModels(found, "001", "002", (), {kind: uncertain[kind]})
-    assert len(plot(sets).axes) == 3
+    assert len(plot(sets).axes) == 4
     assert len(plot(sets, entries=True).axes) == 4
     with pytest.raises(ConfigError, match="no set of kind 'koopman'"):
         plot(sets, kind="koopman")
@@ -654,7 +671,7 @@ def test_results_of_the_short_way_are_plotted(uncertain: dict[str, UncertainMode
     design = Design(
         observer.name, observer, made, SimpleNamespace(certified=True, gain=2.0), {"hidden_error_percent": 1.0}
     )
-    assert any(text.get_text() == "gain 2.00" for text in plot(design).axes[1].texts)
-    drawn = plot(design, models=found).axes[1].lines
+    assert any(text.get_text() == "certified" for text in plot(design).axes[2].texts)
+    drawn = plot(design, models=found).axes[4].lines
     assert [line.get_label() for line in drawn] == ["recorded", observer_label(observer.name)]
     assert drawn[0].get_ydata().max() == pytest.approx(signals[:, 1].max())

@@ -11,7 +11,7 @@ from kros.data.survey import RecordingFacts
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.plants import HarmonicDrivePopulation
-from kros.report.figures.observers import load_torque
+from kros.report.figures.disturbed import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
 from kros.study.stages.load import load_metrics, run_load
@@ -55,7 +55,7 @@ def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
     assert made.seen is not None
     assert (
         "linear/load"
-        in load_torque.draw(
+        in load_torque(
             SimpleNamespace(folder=tmp_path, sample_period_s=1e-3, has=lambda name: (tmp_path / name).exists())
         )[1]
     )

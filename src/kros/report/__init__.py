@@ -1,10 +1,10 @@
-"""The report of a run, its figures, and plots of results in memory. Nothing is computed here that is not shown.
+"""The report of a run, its figures, and plots of results in memory. Nothing is computed here that is not displayed.
 
-    run folder + metrics ──► render ──► report.html
+    metrics.json, run folder ──► render ──► report.html
     run folder ──► write_figures ──► PNG and PDF
     a result in memory ──► plot ──► matplotlib Figure
 
-matplotlib and Jinja2 are imported by nobody else, and only when something is drawn; pyplot is never touched.
+Only this package imports matplotlib and Jinja2, when something is drawn; pyplot is never touched.
 
 Examples
 --------
@@ -17,28 +17,15 @@ Examples
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .files import write_figures
     from .html import render
     from .plotting import plot
 
-_HOME = {"plot": "plotting", "render": "html", "write_figures": "files"}
-
 __all__ = ["plot", "render", "write_figures"]
-
-
-def __getattr__(name: str) -> Any:
-    """Import the module behind a public name when it is first asked for."""
-    if name not in _HOME:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(f".{_HOME[name]}", __name__), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    """List the public names."""
-    return sorted({*globals(), *__all__})
+_HOME = {"plot": "plotting", "render": "html", "write_figures": "files"}
+__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

@@ -1,27 +1,29 @@
-"""What a page is made of: sections with paragraphs, tables and figures. The template turns it into HTML, text is escaped there."""
+"""What a page is made of, and the one builder of its tables. The template turns it into HTML and escapes every text.
+
+To add a column to a table, add one `Column` where the section builds it: a title and one value a row.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
+from math import isfinite
+from typing import Any
 
+from .names import number
 
-class Level(Enum):
-    """How urgent something is, with its word: colour alone says nothing to everybody."""
-
-    GO = "ready"
-    LOOK = "look first"
-    STOP = "do not use"
+Pairs = Sequence[tuple[str, Sequence[str]]]
 
 
 @dataclass(frozen=True)
-class Alert:
-    """What has to be looked at; `section` is the anchor of where it comes from."""
+class Column:
+    """A column of a table before it is formatted; one in which nothing is known is left out."""
 
-    level: Level
-    text: str
-    section: str
+    title: str
+    values: Sequence[Any]  # a number, a text, a truth value or None a row
+    group: str = ""  # title over columns that stand together
+    best: bool = False  # whether the smallest number is set in bold
+    notes: Sequence[str] = ()  # small text below each value
 
 
 @dataclass(frozen=True)
@@ -29,63 +31,75 @@ class Cell:
     """A cell of a table."""
 
     text: str
-    strong: bool = False  # Best of its column, or worth seeing
-    note: str = ""  # Shown smaller, behind the text
-    bar: float | None = None  # Share of the cell's width that is shaded, 0 to 1
-    value: float | None = None  # What the cell is sorted by; its text by default
-
-
-Cells = Sequence[Cell | str]
+    strong: bool = False
+    note: str = ""
+    value: float | None = None  # what the cell is sorted by; its text by default
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table; the first column names the rows."""
+    """A table as the template shows it; the first column names the rows."""
 
+    caption: str
     head: Sequence[str]
-    rows: Sequence[Cells]  # a plain text stands for a cell
-    caption: str = ""
+    rows: Sequence[Sequence[Cell]]
     groups: Sequence[tuple[str, int]] = ()  # titles over several columns each, the first column included
-    folded: bool = False  # whether the reader opens it
-    emphasised: Sequence[int] = ()  # rows that are set off
-    prose: bool = False  # whether cells hold sentences instead of numbers
+    labels: Sequence[str] = ()  # what a column is called where it stands alone
+    chosen: Sequence[int] = ()  # rows that are set off
     sortable: bool = False  # whether the reader sorts it by any column, and filters its rows by their text
-
-    @property
-    def cells(self) -> list[list[Cell]]:
-        """All rows as cells."""
-        return [[Cell(c) if isinstance(c, str) else c for c in row] for row in self.rows]
-
-    @property
-    def labels(self) -> list[str]:
-        """What every column is called where it stands alone: its group's title and its own."""
-        titles = [title for title, span in self.groups for _ in range(span)] or [""] * len(self.head)
-        return [
-            f"{title}: {own}" if title and own else title or own for title, own in zip(titles, self.head, strict=True)
-        ]
+    folded: bool = False  # whether the reader opens it
+    prose: bool = False  # whether cells hold sentences
 
 
 @dataclass(frozen=True)
 class Section:
-    """A section of the report; figures are named and come after the tables."""
+    """A section of the report: paragraphs, a list of terms, tables, and one figure."""
 
-    key: str  # Anchor
+    key: str  # anchor
     title: str
     paragraphs: Sequence[str] = ()
-    tables: Sequence[Table] = ()
-    figures: Sequence[str] = ()
-    folded: Sequence[
-        tuple[str, str]
-    ] = ()  # sequence of (str, str); Titles and preformatted texts that the reader opens
-    lists: Sequence[
-        tuple[str, Sequence[str]]
-    ] = ()  # sequence of (str, sequence of str); Titles and sentences, one below the other
-    card: Sequence[
-        tuple[str, Sequence[str]]
-    ] = ()  # sequence of (str, sequence of str); Terms and what there is to say about them
-    notes: Sequence[str] = ()  # Paragraphs behind the tables
+    card: Pairs = ()
+    tables: Sequence[Table | None] = ()
+    figure: str = ""
+    lists: Pairs = ()
 
 
-def where(names: Iterable[str], name: str | None) -> list[int]:
-    """Return the places of a name, for rows that are set off."""
-    return [i for i, one in enumerate(names) if one == name]
+def build(caption: str, columns: Sequence[Column], chosen: str | None = None, **options: bool) -> Table | None:
+    """Return a table of columns, the row whose first cell or note is `chosen` set off; None where it has no rows."""
+    first, *others = columns
+    known = [first, *(c for c in others if any(_known(v) for v in c.values))]
+    if not first.values or len(known) < 2:
+        return None
+    rows = list(zip(*(_cells(column) for column in known), strict=True))
+    groups: list[tuple[str, int]] = []
+    for column in known:
+        span = groups.pop()[1] if groups and groups[-1][0] == column.group else 0
+        groups.append((column.group, span + 1))
+    labels = [": ".join(part for part in (column.group, column.title) if part) for column in known]
+    marked = [k for k, value in enumerate(first.values) if value == chosen]
+    titled = groups if any(title for title, _ in groups) else ()
+    return Table(caption, [c.title for c in known], rows, titled, labels, marked, **options)
+
+
+def _known(value: Any) -> bool:
+    """Tell whether a value says something."""
+    return value is not None and value != "" and not (isinstance(value, float) and not isfinite(value))
+
+
+def _cells(column: Column) -> list[Cell]:
+    """Return the cells of a column."""
+    numbers = [v for v in column.values if isinstance(v, float) and isfinite(v)]
+    least = min(numbers, default=None) if column.best else None
+    notes = column.notes or [""] * len(column.values)
+    return [_cell(value, note, least) for value, note in zip(column.values, notes, strict=True)]
+
+
+def _cell(value: Any, note: str, least: float | None) -> Cell:
+    """Return one value as a cell."""
+    if isinstance(value, bool):
+        return Cell("yes" if value else "no", strong=not value, note=note)
+    if isinstance(value, str) and value:
+        return Cell(value, note=note)
+    size = None if value is None or value == "" else float(value)
+    text = str(value) if isinstance(value, int) else number(size)
+    return Cell(text, strong=size is not None and size == least, note=note, value=size)

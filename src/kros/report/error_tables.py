@@ -1,8 +1,8 @@
-"""Errors of observers by channel and condition, of units that took part in their design and of units that were left out of it."""
+"""Errors of observers by channel and condition, from the rows of ``metrics.json``."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,11 +10,10 @@ import numpy as np
 
 from ..data.population import natural_key
 from ..evaluate import unit_interval
-from ..evaluate.intervals import mean_intervals
 
 Rows = Sequence[Mapping[str, Any]]
 PAPER = "koopman_edmd/mixed"
-"""The paper's own observer, which band powers are compared with."""
+"""The paper's own observer, which powers at the gearbox frequency are compared with."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +24,11 @@ class ErrorCell:
     worst: float | None = None
     worst_unit: str | None = None
     interval: tuple[float, float] | None = None  # 95 % interval of the mean, by a bootstrap over units
-    nominal: float | None = None  # of the nominal unit
     diverged: int = 0  # units whose estimate diverged
-    rms: float | None = None
+    rms: float | None = None  # mean over units, in the channel's unit of measure
+    worst_rms: float | None = None
+    true_mean: float | None = None  # against the true signal, percent of its largest value
+    lag_s: float | None = None  # of the estimate behind the true signal
     band_db: float | None = None
 
 
@@ -41,101 +42,99 @@ class ErrorTable:
     ranked: frozenset[str]  # channels in which a smaller number is better
 
     def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
-        """Return the channels that are not measured and that an observer estimates, or any does; all of them where everything is measured."""
+        """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
         known = [c for c in self.channels if observer is None or c in self.cells[observer]]
         return [c for c in known if c not in measured] or known
 
-    def best(self, channel: str, what: str) -> float | None:
-        """Return the smallest ``nominal``, ``mean`` or ``worst`` of a channel; None where every observer diverged, or in a channel that is not ranked."""
-        if channel not in self.ranked:
-            return None
-        values = [getattr(cells[channel], what) for cells in self.cells.values() if channel in cells]
-        return min((v for v in values if v is not None), default=None)
+    def mean(self, observer: str, channels: Sequence[str]) -> float:
+        """Return the geometric mean of an observer's mean errors; infinite where one is not known."""
+        values = [self.cells[observer].get(c, ErrorCell()).mean for c in channels]
+        if not values or None in values:
+            return float("inf")
+        return float(np.exp(np.mean(np.log(np.maximum(np.array(values, float), np.finfo(float).tiny)))))
 
 
-def error_table(rows: Rows, identify_on: str) -> list[ErrorTable]:
-    """Summarise the rows of ``evaluation`` in ``metrics.json``, one table a condition, the one that was identified on first."""
-    intervals = mean_intervals(rows)
-
-    def cell(observer: str, condition: str, channel: str, found: Rows, _: Rows) -> ErrorCell:
-        return _cell(found, intervals.get((observer, condition, channel)))
-
-    return _tables(rows, identify_on, cell)
-
-
-def home_table(metrics: Mapping[str, Any]) -> ErrorTable | None:
-    """Return the errors in the condition that was identified on, where the deployed observer was evaluated there."""
-    tables = error_table(metrics.get("evaluation", []), metrics["study"]["identify_on"])
-    return tables[0] if tables and metrics["study"].get("deployed") in tables[0].cells else None
+def error_tables(metrics: Mapping[str, Any]) -> list[ErrorTable]:
+    """Return a table a condition of the units that took part, the condition that was identified on first."""
+    rows = [r for r in metrics.get("evaluation", []) if r["role"] in ("nominal", "off_nominal")]
+    others = [r for r in rows if r["role"] == "off_nominal"] or rows
+    intervals = {(r["observer"], r["condition"], r["channel"]): r["interval"] for r in metrics.get("intervals", [])}
+    return _tables(others, metrics["study"]["identify_on"], intervals)
 
 
 def left_out_tables(rows: Rows, identify_on: str) -> list[ErrorTable]:
-    """Summarise the rows of ``left_out`` in ``metrics.json``, one table a condition, the one that was identified on first."""
-
-    def cell(observer: str, condition: str, channel: str, found: Rows, papers: Rows) -> ErrorCell:
-        return _left_out_cell(found, _band_db(found, papers))
-
-    return _tables(rows, identify_on, cell)
+    """Return the same of units that took no part in the design, from the rows of ``left_out``."""
+    return _tables(rows, identify_on, None)
 
 
-def _tables(rows: Rows, identify_on: str, cell: Callable[[str, str, str, Rows, Rows], ErrorCell]) -> list[ErrorTable]:
+def _tables(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None) -> list[ErrorTable]:
+    """Group rows by condition, observer and channel."""
     tables = []
     for condition in sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c))):
         grouped: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
-        for row in rows:
-            if row["condition"] == condition:
-                grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
-        papers = grouped.get(PAPER, {})
+        for row in (r for r in rows if r["condition"] == condition):
+            grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
+        published = grouped.get(PAPER, {})
         cells = {
-            o: {c: cell(o, condition, c, found, papers.get(c, [])) for c, found in own.items()}
-            for o, own in grouped.items()
+            observer: {
+                c: _cell(units, published.get(c, []), _interval(units, intervals, (observer, condition, c)))
+                for c, units in channels.items()
+            }
+            for observer, channels in grouped.items()
         }
-        channels = tuple(dict.fromkeys(r["channel"] for r in rows if r["condition"] == condition))
-        ranked = frozenset(c for c in channels if condition == identify_on or condition != "load" or c != "current")
-        tables.append(ErrorTable(condition, channels, cells, ranked))
+        names = tuple(dict.fromkeys(c for channels in grouped.values() for c in channels))
+        ranked = frozenset(c for c in names if condition == identify_on or condition != "load" or c != "current")
+        tables.append(ErrorTable(condition, names, cells, ranked))
     return tables
 
 
-def _cell(rows: Rows, interval: tuple[float, float] | None) -> ErrorCell:
-    nominal = next((r["error_percent"] for r in rows if r["role"] == "nominal"), None)
-    others = [r for r in rows if r["role"] == "off_nominal"] or [r for r in rows if r["role"] == "nominal"]
-    finite = [r for r in others if r["error_percent"] is not None]
-    if not others or len(finite) < len(others):
-        return ErrorCell(nominal=nominal, diverged=len(others) - len(finite))
-    worst = max(finite, key=lambda r: float(r["error_percent"]))
-    rms = [r.get("rms") for r in finite]
-    known = [v for v in rms if v is not None]
+def _interval(rows: Rows, intervals: Mapping[Any, Any] | None, key: tuple[str, str, str]) -> tuple[float, float] | None:
+    """Return the interval of a mean: from the metrics, or by a bootstrap where these have none."""
+    if intervals is not None:
+        return tuple(intervals[key]) if key in intervals else None
+    values = [r["error_percent"] for r in rows]
+    if len(values) < 2 or None in values:
+        return None
+    low, high = unit_interval(values)
+    return float(low), float(high)
+
+
+def _cell(rows: Rows, published: Rows, interval: tuple[float, float] | None) -> ErrorCell:
+    """Summarise the units of one observer and channel."""
+    band_db = _band_db(rows, published)
+    lost = len({r["unit"] for r in rows if r["error_percent"] is None})
+    if lost:
+        return ErrorCell(band_db=band_db, diverged=lost)
+    worst = max(rows, key=lambda r: float(r["error_percent"]))
+    rms = _known(rows, "rms")
     return ErrorCell(
-        sum(r["error_percent"] for r in finite) / len(finite),
-        worst["error_percent"],
+        float(np.mean([r["error_percent"] for r in rows])),
+        float(worst["error_percent"]),
         worst["unit"],
         interval,
-        nominal,
-        rms=sum(known) / len(known) if len(known) == len(rms) else None,
+        rms=float(np.mean(rms)) if rms else None,
+        worst_rms=float(max(rms)) if rms else None,
+        true_mean=_mean(_known(rows, "true_error_percent")),
+        lag_s=_mean(_known(rows, "true_lag_s")),
+        band_db=band_db,
     )
 
 
-def _left_out_cell(rows: Rows, band_db: float | None) -> ErrorCell:
-    units = {r["unit"]: r["error_percent"] for r in rows}
-    known = {unit: float(error) for unit, error in units.items() if error is not None and np.isfinite(error)}
-    if len(known) < len(units):
-        return ErrorCell(band_db=band_db, diverged=len(units) - len(known))
-    worst, values = max(known, key=lambda u: known[u]), list(known.values())
-    interval = None
-    if len(values) > 1:
-        low, high = unit_interval(values)
-        interval = (float(low), float(high))
-    rms = [float(v) for r in rows if (v := r.get("rms")) is not None]
-    mean_rms = float(np.mean(rms)) if len(rms) == len(rows) else None
-    return ErrorCell(float(np.mean(values)), known[worst], worst, interval, rms=mean_rms, band_db=band_db)
+def _known(rows: Rows, key: str) -> list[float]:
+    """Return a value of every row; nothing where one is unknown."""
+    values = [r.get(key) for r in rows]
+    return [float(v) for v in values if v is not None] if None not in values else []
 
 
-def _band_db(rows: Rows, papers: Rows) -> float | None:
-    """Return the ratio of mean powers around the gearbox frequency over the units that both have; None where one is unknown or infinite."""
-    own, theirs = ({r["unit"]: r.get("gearbox_band_power") for r in found} for found in (rows, papers))
-    shared = [unit for unit in own if unit in theirs]
-    pairs = np.array([[own[unit], theirs[unit]] for unit in shared], float)
-    if not shared or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _band_db(rows: Rows, published: Rows) -> float | None:
+    """Return the ratio of mean powers around the gearbox frequency over the units that both have, dB."""
+    powers, others = ({r["unit"]: r.get("gearbox_band_power") for r in part} for part in (rows, published))
+    pairs = np.array([[powers[unit], others[unit]] for unit in powers if unit in others], float)
+    if not pairs.size or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
         return None
-    powers = pairs.mean(axis=0)
-    return float(10 * np.log10(powers[0] / powers[1]))
+    mean = pairs.mean(axis=0)
+    return float(10 * np.log10(mean[0] / mean[1]))

@@ -18,20 +18,17 @@ from ..core.work import Progress, Silent
 from .canvas import settle
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
-from .theme import Tone, style
+from .theme import DRAWING, Tone, style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
-_DPI = 200
 _FONTS = "system-ui, -apple-system, 'Segoe UI', Roboto, 'Helvetica Neue', Arial, 'DejaVu Sans', sans-serif"
 _FAMILY = re.compile(r"(?<=px )'DejaVu Sans'(?:, [^;\"]*)?|(?<=font-family: )'?DejaVu Sans'?(?:, [^;\"]*)?")
-# What is left out; looking around is fast, filling in what was found is not.
-_ALONG = re.compile(r"\s+(?=[A-Z])|(?<=[A-Z])\s+|(?<=\.\d)\d+")
-_BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")
-_WRITTEN = re.compile(r"(>[^<>]*[^<>\s][^<>]*<)")
+_COORDINATES = re.compile(r'(?<= )(?:d|x|y|transform)="[^"]*"')
+_BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
@@ -42,7 +39,7 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
     run : Path
         Run folder; figures whose artifacts it does not have are left out and logged.
     out : Path
-        Folder for the files; made where it is missing.
+        Folder for the files; created where it is missing.
     progress : Progress, optional
         Told of every figure.
 
@@ -86,16 +83,18 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
 
 def to_png(figure: Figure) -> bytes:
     """Return a figure as PNG, 200 dots an inch."""
-    return _encode(figure, "png", dpi=_DPI, metadata={"Software": None})
+    return _encode(figure, "png", dpi=DRAWING.dots_per_inch, metadata={"Software": None})
 
 
 def to_pdf(figure: Figure) -> bytes:
     """Return a figure as PDF; the same content gives the same bytes."""
-    return _encode(figure, "pdf", dpi=_DPI, metadata={"CreationDate": None, "Creator": None, "Producer": None})
+    return _encode(
+        figure, "pdf", dpi=DRAWING.dots_per_inch, metadata={"CreationDate": None, "Creator": None, "Producer": None}
+    )
 
 
 def to_svg(figure: Figure, name: str) -> str:
-    """Return a figure as an inline SVG element whose colours are the page's variables; `name` is the prefix of all identifiers."""
+    """Return a figure as an inline SVG element in the page's colours; `name` is the prefix of all identifiers."""
     metadata = {"Date": None, "Creator": None, "Format": None, "Type": None}
     text = _encode(figure, "svg", transparent=True, metadata=metadata).decode()
     text = text[text.index("<svg") :]
@@ -108,23 +107,19 @@ def to_svg(figure: Figure, name: str) -> str:
     for tone in Tone:
         text = text.replace(tone.light, f"var({tone.variable})")
     text = _FAMILY.sub(_FONTS, text)
-    # coordinates stand inside tags; a hundredth of a point is enough, along lines a tenth
-    text = re.sub(r'(?<= d=")[^"]*', lambda path: _ALONG.sub("", path.group()), text)
-    parts = _WRITTEN.split(text)
-    parts[::2] = [_BEYOND.sub("", tags) for tags in parts[::2]]
-    return "".join(parts).strip()
+    return _COORDINATES.sub(lambda match: _BEYOND.sub("", match.group()), text).strip()
 
 
 def _named_units(text: str) -> str:
-    """Write the names of units, which groups carry as their identifiers, to the lines or points inside, in their order."""
+    """Write the names of units, which are the identifiers of groups, to the lines or points inside, in order."""
     first, *rest = re.split(r'<g id="[^"]*?units-([^"]*)">', text)
     parts = [first]
     for names, group in zip(rest[::2], rest[1::2], strict=True):
         left = iter(names.split(","))
 
-        def named(found: re.Match[str], left: Iterator[str] = left) -> str:
-            name = None if found[2] is None else next(left, None)
-            return found[0] if name is None else f'{found[0]}data-unit="{escape(unquote(name))}" '
+        def named(match: re.Match[str], left: Iterator[str] = left) -> str:
+            name = None if match[2] is None else next(left, None)
+            return match[0] if name is None else f'{match[0]}data-unit="{escape(unquote(name))}" '
 
         parts.append("<g>" + re.sub(r"<defs>.*?</defs>|(<(use|path) )", named, group, flags=re.DOTALL))
     return "".join(parts)

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import write_bytes
-from ..data.population import DEFAULT_CONDITION
-from .advice import advice
-from .content import Section
-from .figures import ON_THE_PAGE, draw
+from .facts import Facts
+from .figures import draw
 from .files import to_svg
 from .names import condition_label
 from .run_folder import RunFolder
-from .sections import EVIDENCE, SECTIONS
-from .summary import summary
+from .sections import EVIDENCE, FIRST
 from .theme import Tone
+from .verdict import judge
 
 log = logging.getLogger(__name__)
-
 _TEMPLATES = Path(__file__).parent / "templates"
-LEFT_TO_FILES = "Figures of the paper's entrywise kind are not among it: “kros figures” writes all of them."
-
 
 Encoded = dict[str, str]
 """A figure as the page shows it: name, title, svg and caption, or the reason why it is left out."""
@@ -38,9 +33,9 @@ def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Pat
     Parameters
     ----------
     run : Path
-        Run folder; what it does not have is left out, with the reason.
+        Run folder, which figures are drawn from.
     metrics : mapping
-        As in ``metrics.json``; any part but ``study`` may be absent.
+        As in ``metrics.json``, the source of all texts and tables; any part but ``study`` may be absent.
     mapped : callable
         Maps the drawing of a figure over their names, in order, for example in several processes.
     out : Path, optional
@@ -76,55 +71,36 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
+    loader = FileSystemLoader(_TEMPLATES)
     environment = Environment(
-        loader=FileSystemLoader(_TEMPLATES),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    drawing = mapped(
-        partial(encoded, RunFolder(run.folder)), ON_THE_PAGE
-    )  # of its own: what is loaded here need not go to workers
-    sections, evidence = _made(SECTIONS, run, metrics), _made(EVIDENCE, run, metrics)
+    facts = Facts(metrics)
+    parts = [[s for make in makers if (s := make(facts)) is not None] for makers in (FIRST, EVIDENCE)]
+    names = [section.figure for part in parts for section in part if section.figure]
     figures = {}
-    for found in drawing:
-        if found["reason"]:
-            log.info("figure %s: left out, %s", found["name"], found["reason"])
-        figures[found["name"]] = {**found, "svg": Markup(found["svg"])}
-    study = metrics["study"]
-    conditions = [condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION]
-    measured = run.measured_states
+    for drawn in mapped(partial(encoded, RunFolder(run.folder)), names):
+        if drawn["reason"]:
+            log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
+        figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
+    conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
-        subtitle=" · ".join([f"{study['units']} units", *conditions]),
-        head=summary(metrics, measured),
-        actions=advice(metrics, measured),
-        sections=sections,
-        evidence=evidence,
-        left_to_files=LEFT_TO_FILES,
+        subtitle=" · ".join([f"{facts.study['units']} units", *conditions]),
+        head=judge(facts),
+        sections=parts[0],
+        evidence=parts[1],
         figures=figures,
         style=Markup(stylesheet()),
         script=Markup((_TEMPLATES / "report.js").read_text(encoding="utf-8")),
     )
 
 
-def _made(
-    makers: Sequence[Callable[[RunFolder, Mapping[str, Any]], Section | None]],
-    run: RunFolder,
-    metrics: Mapping[str, Any],
-) -> list[Section]:
-    return [found for make in makers if (found := make(run, metrics)) is not None]
-
-
 def encoded(run: RunFolder, name: str) -> Encoded:
     """Draw a figure and return it as the page shows it."""
     drawn = draw(name, run)
-    svg = (
-        ""
-        if drawn.figure is None
-        else to_svg(drawn.figure, name).replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
-    )
+    svg = "" if drawn.figure is None else to_svg(drawn.figure, name)
+    svg = svg.replace('role="img"', f'role="img" aria-label="{escape(drawn.title)}"', 1)
     return {"name": name, "title": drawn.title, "svg": svg, "caption": drawn.caption, "reason": drawn.reason}
 
 

@@ -1,41 +1,43 @@
-"""What models, observers, forms and channels are called and coloured: the same in every figure, table and sentence."""
+"""What models, observers and channels are called and coloured: the same in every figure, table and sentence."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from math import floor, isfinite, log10
-from typing import Any
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
 from .theme import Tone
 
-_METHODS = {
-    "open_loop": "open loop",
-    "kalman_tuned": "tuned Kalman",
-    "ekf": "extended Kalman",
-    "mixed": "mixed H2-H∞",
-    "paper": "mixed H2-H∞, entrywise weights",
-    "h2": "H2",
-    "hinf": "H∞",
-    "worst_case_h2": "worst-case H2",
-    "residual_h2": "residual-shaped H2",
-    "memory": "subspace predictor",
-    "filtered_difference": "filtered difference",
-    "learned": "learned",
-    "mean_profile": "mean profile",
+
+@dataclass(frozen=True)
+class Method:
+    """A kind of observer: its name, what it is in a few words, its colour, and whether it is a baseline."""
+
+    label: str
+    about: str
+    tone: Tone
+    baseline: bool = False
+
+
+METHODS = {
+    "open_loop": Method("open loop", "the model without correction", Tone.GREY, True),
+    "kalman_tuned": Method("tuned Kalman", "steady-state Kalman filter, noise tuned in training", Tone.PURPLE, True),
+    "ekf": Method("extended Kalman", "extended Kalman filter", Tone.PURPLE, True),
+    "filtered_difference": Method("filtered difference", "low-pass filtered derivative", Tone.GOLD, True),
+    "learned": Method("learned", "ridge regression on past samples", Tone.GREEN, True),
+    "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
+    "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
+    "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
+    "h2": Method("H2", "H2-optimal for the nominal model", Tone.SKY),
+    "hinf": Method("H∞", "H∞-optimal for the nominal model", Tone.SKY),
+    "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),
+    "residual_h2": Method("residual-shaped H2", "noise shaped like the recorded residuals", Tone.INK),
+    "memory": Method("subspace predictor", "predictor identified from recordings", Tone.SKY),
+    "estimator": Method("estimator", "stable filter bank with a linear readout", Tone.SKY),
 }
-_METHOD_TONES = {
-    "open_loop": Tone.GREY,
-    "kalman_tuned": Tone.PURPLE,
-    "ekf": Tone.PURPLE,
-    "filtered_difference": Tone.GOLD,
-    "learned": Tone.GREEN,
-    "mean_profile": Tone.GREEN,
-}
-BASELINES = tuple(_METHOD_TONES)
+BASELINES = tuple(name for name, method in METHODS.items() if method.baseline)
 RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-_UNITS = {"1": "fraction", "": ""}
 
 
 @dataclass(frozen=True)
@@ -54,16 +56,27 @@ def is_koopman(name: str) -> bool:
 
 
 def split_observer(name: str) -> tuple[str, str]:
-    """Return model and method of an observer; the model is empty for those that stand alone."""
+    """Return model and method of an observer; the model is empty for those without one."""
     model, _, method = name.rpartition("/")
     return model, method
+
+
+def words(name: str) -> str:
+    """Return an identifier, such as that of a channel or a form, as words."""
+    return name.replace("_", " ")
 
 
 def model_label(name: str) -> str:
     """Return what a model is called, for example ``Koopman (EDMD)``."""
     family, _, kind = name.partition("_")
-    label = {"koopman": "Koopman", "linear": "linear"}.get(family, family)
-    return f"{label} ({'EDMD' if kind == 'edmd' else kind.replace('_', ' ')})" if kind else label
+    label = {"koopman": "Koopman"}.get(family, family)
+    return f"{label} ({'EDMD' if kind == 'edmd' else words(kind)})" if kind else label
+
+
+def method_label(name: str) -> str:
+    """Return what an observer's method is called."""
+    method = split_observer(name)[1]
+    return METHODS[method].label if method in METHODS else words(method)
 
 
 def observer_label(name: str) -> str:
@@ -72,86 +85,64 @@ def observer_label(name: str) -> str:
     return f"{model_label(model)}, {method_label(name)}" if model else method_label(name)
 
 
-def method_label(name: str) -> str:
-    """Return what an observer's method is called."""
+def observer_about(name: str) -> str:
+    """Return what an observer is, in a few words."""
     method = split_observer(name)[1]
-    return _METHODS.get(method, method.replace("_", " "))
+    return METHODS[method].about if method in METHODS else ""
 
 
 def model_look(name: str) -> Look:
-    """Return how a model's curves look: Koopman blue, linear orange, the paper's recipe dashed where kros's own is there too."""
+    """Return how a model's curves look: Koopman blue, linear orange."""
     return Look((Tone.BLUE if is_koopman(name) else Tone.ORANGE).light)
 
 
+def method_look(name: str) -> Look:
+    """Return how an observer's curves look beside others of the same model: the hue of its method."""
+    method = split_observer(name)[1]
+    tone = METHODS[method].tone if method in METHODS else Tone.GREY
+    return Look(tone.light, {"kalman_tuned": "--", "mean_profile": ":", "estimator": "-."}.get(method, "-"))
+
+
 def observer_look(name: str) -> Look:
-    """Return how an observer's curves look: hue by kind, linear ones orange, a linear baseline dashed."""
+    """Return how an observer's curves look beside others: the hue of its model, of a baseline that of its method."""
     model, method = split_observer(name)
-    if method in _METHOD_TONES:
-        return Look(_METHOD_TONES[method].light, "-" if is_koopman(model) or not model else "--")
-    if is_koopman(model):
-        return Look(
-            {"mixed": Tone.GREEN, "paper": Tone.GREEN, "h2": Tone.SKY, "hinf": Tone.SKY}.get(method, Tone.BLUE).light
-        )
-    return Look(Tone.ORANGE.light, "--" if method in ("mixed", "paper") else "-")
-
-
-def form_label(form: str) -> str:
-    """Return what an uncertainty form is called."""
-    return form.replace("_", " ")
+    if method in BASELINES or not model:
+        return method_look(name)
+    return model_look(model)
 
 
 def best_models(names: Iterable[str]) -> list[str]:
-    """Return one linear and one Koopman model to compare: kros's own where there are any, else the paper's recipe."""
+    """Return one linear and one Koopman model to compare: refined ones where there are any, else those of EDMD."""
     known = list(names)
     chosen = [next((n for n in (family, f"{family}_edmd") if n in known), None) for family in ("linear", "koopman")]
     return [n for n in chosen if n is not None] or known[:2]
 
 
 def deployed_pair(names: Sequence[str], deployed: str | None) -> list[str]:
-    """Return the deployed observer and its linear twin, or without a robust twin what there is beside its tuned Kalman filter."""
-    robust = [n for n in names if split_observer(n)[1] not in BASELINES]
-    first = deployed if deployed is not None and deployed in names else (robust or list(names) or [""])[0]
-    model, method = split_observer(first)
+    """Return the deployed observer behind that of the same method for the other model; else behind a baseline."""
+    first = deployed if deployed in names else next(iter(names), "")
+    model, method = split_observer(str(first))
     other = model.replace("koopman", "linear") if is_koopman(model) else model.replace("linear", "koopman")
-    twin = next(
-        (n for n in (f"{other}/{m}" for m in (method, "worst_case_h2", "mixed", "kalman_tuned")) if n in names), ""
-    )
-    pair = [n for n in dict.fromkeys((twin, first)) if n in robust]
-    if len(pair) > 1:
-        return pair
-    wanted = [n for n in dict.fromkeys((twin, f"{model}/kalman_tuned", first)) if n in names]
-    return [n for n in wanted if split_observer(n)[1] != "open_loop"] or wanted
+    rivals = (f"{other}/{method}", f"{model}/kalman_tuned", "learned")
+    rival = next((n for n in rivals if n in names and n != first), None)
+    return [n for n in (rival, first) if n]
 
 
 def paper_pair(names: Iterable[str]) -> list[str]:
-    """Return the paper's linear and Koopman observer, or what there is of them: with its own entrywise weights where a study made these."""
+    """Return the paper's linear and Koopman observer, those with entrywise weights where a study has both."""
     known = list(names)
-    pairs = [
-        [n for n in (f"linear_edmd/{method}", f"koopman_edmd/{method}") if n in known] for method in ("paper", "mixed")
-    ]
+    pairs = [[n for n in (f"linear_edmd/{m}", f"koopman_edmd/{m}") if n in known] for m in ("paper", "mixed")]
     return max(pairs, key=len)
 
 
 def readable_unit(unit: str) -> str:
     """Return a unit of measure for people; nothing where there is none."""
-    return _UNITS.get(unit, unit)
-
-
-def joined(parts: Sequence[str]) -> str:
-    """Return a list for a sentence: with commas, and an "and" before the last."""
-    return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
+    return "" if unit == "1" else unit
 
 
 def axis_label(channel: str, unit: str) -> str:
-    """Return a channel's name with its unit of measure, for an axis."""
-    readable = readable_unit(unit)
-    name = channel.replace("_", " ")
-    return f"{name} ({readable})" if readable else name
-
-
-def channel_units(metrics: Mapping[str, Any]) -> dict[str, str]:
-    """Return the unit of measure of every channel; nothing where the metrics do not say."""
-    return dict(metrics["study"].get("channels", {}))
+    """Return a channel's name with its unit of measure."""
+    return f"{words(channel)} ({readable_unit(unit)})" if readable_unit(unit) else words(channel)
 
 
 def squared(unit: str) -> str:
@@ -161,20 +152,30 @@ def squared(unit: str) -> str:
     return f"({unit})²" if set(unit) & set(" /·*") else f"{unit}²"
 
 
+def joined(parts: Sequence[str]) -> str:
+    """Return a list for a sentence: with commas, and an "and" before the last."""
+    return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
+
+
+def some_of(names: Sequence[str], most: int = 8) -> str:
+    """Return the first names of a list, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
 def episode_title(key: EpisodeKey) -> str:
     """Return what an episode is called above an axis."""
-    where = "" if key.condition == DEFAULT_CONDITION else f"{condition_label(key.condition)}: "
-    return shorten(f"{where}unit {key.unit}, episode {key.episode}", 46)
+    where = condition_label(key.condition)
+    return shorten(f"{where}{': ' if where else ''}unit {key.unit}, episode {key.episode}", 46)
 
 
 def condition_label(condition: str) -> str:
-    """Return what a condition is called."""
-    return {"noload": "no load", "load": "loaded"}.get(condition, condition)
+    """Return what a condition is called; nothing for the only one of recordings that name none."""
+    return {"noload": "no load", "load": "loaded", DEFAULT_CONDITION: ""}.get(condition, condition)
 
 
 def in_condition(condition: str) -> str:
-    """Return a condition as a part of a sentence, with its comma; nothing for the only one of recordings that name none."""
-    return "" if condition == DEFAULT_CONDITION else f", {condition_label(condition)}"
+    """Return a condition as a part of a sentence, with its comma."""
+    return f", {condition_label(condition)}" if condition_label(condition) else ""
 
 
 def shorten(text: str, most: int) -> str:

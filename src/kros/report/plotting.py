@@ -13,19 +13,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PLOTS = {
-    "Population": "recordings.signals:population_figure",
-    "IdentifiedModels": "models.bode:identified_figure",
-    "UncertainModels": "uncertainty.uncertain_model:sets_figure",
-    "Design": "observers.estimate:design_figure",
-    "RunResult": "run:run_figure",
-    "PhaseCalibration": "recordings.phase:phase_figure",
-    "ModelSet": "models.bode:bode_figure",
-    "UncertainModel": "uncertainty.uncertain_model:uncertain_figure",
-    "OutlierModel": "outliers.scores:scores_figure",
-    "Synthesis": "synthesis.correction:synthesis_figure",
-    "Observer": "synthesis.correction:observer_figure",
+    "Population": "recordings:population_figure",
+    "IdentifiedModels": "models:identified_figure",
+    "UncertainModels": "uncertainty:sets_figure",
+    "Design": "synthesis:design_figure",
+    "RunResult": ":run_figure",
+    "PhaseCalibration": "recordings:phase_figure",
+    "ModelSet": "models:bode_figure",
+    "UncertainModel": "uncertainty:uncertain_figure",
+    "OutlierModel": "outliers:scores_figure",
+    "Synthesis": "synthesis:synthesis_figure",
+    "Observer": "synthesis:observer_figure",
 }
-"""Name of a result's class -> file of a figure and the function in it that draws the result. Its further parameters are the options of `plot`."""
+"""Name of a result's class -> module and function that draws it; further parameters are the options of `plot`."""
 
 
 def plot(result: Any, **options: Any) -> Figure:
@@ -34,13 +34,12 @@ def plot(result: Any, **options: Any) -> Figure:
     Parameters
     ----------
     result : one of the classes in `PLOTS`
-        A population is shown by the first episode of its first unit, models by their Bode magnitudes, uncertain models by forms, weights and every unit
-        over the weights, a design, a synthesis or an observer by the correction filter and its certificate, and a run by the
-        estimates of its deployed observer.
+        A population: its first episode. Models: Bode plots. Uncertain models: forms, weights, every unit relative to
+        the weights. A design, a synthesis, an observer: the correction filter. A run: the estimates.
     **options
-        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for the paper's figure of an uncertain model, entry by entry.
-        ``models`` of a design, the identified models behind it: its estimates on a held-out episode. ``name`` of a run: any figure of its report.
-        ``nominal`` of a `ModelSet`, a unit that is drawn on top; ``models`` of an `UncertainModel`, the `ModelSet` that it was made of.
+        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for an uncertain model entry
+        by entry; ``models`` of a design or an `UncertainModel`, the models behind it; ``name`` of a run, any of its
+        figures; ``nominal`` of a `ModelSet`, a unit that stands out.
 
     Returns
     -------
@@ -59,17 +58,17 @@ def plot(result: Any, **options: Any) -> Figure:
     >>> from kros.synthesis import Status, Synthesis
     >>> figure = plot(Synthesis("h2", gain([[0.5]], 0.01), Status.OPTIMAL, h2_norm=1.2))
     >>> len(figure.axes)
-    2
+    3
     """
     name = next(
         (t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None
     )
     if name is None:
         raise ConfigError(
-            f"Plot: found a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
+            f"Plot: got a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
         )
     module, _, function = PLOTS[name].partition(":")
-    draw = getattr(import_module(f"{__package__}.figures.{module}"), function)
+    draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)
     known = list(signature(draw).parameters)[1:]
     unknown = sorted(set(options) - set(known))
     if unknown:
@@ -77,5 +76,5 @@ def plot(result: Any, **options: Any) -> Figure:
             f"Plot: a {name} has no option {', '.join(map(repr, unknown))}; it has {', '.join(known) or 'none'}."
         )
     with style():
-        figure: Figure = draw({"": result} if name == "OutlierModel" else result, **options)
+        figure: Figure = draw(result, **options)
     return figure

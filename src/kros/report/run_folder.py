@@ -1,7 +1,6 @@
-"""A run folder as the report sees it: every artifact by name, read when first asked for.
+"""A run folder as figures see it: every artifact by name, read when first asked for.
 
-Only files that the records of the run list are there; others, such as what an interrupted run left, are not looked at. What a run does not
-have raises `NotShownError` with a sentence that the report prints in place of a figure or table.
+Only files in the records of the run count. What a run does not have raises `NotShownError`, whose message says why.
 """
 
 from __future__ import annotations
@@ -11,16 +10,15 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
-from urllib.parse import quote, unquote
+from urllib.parse import unquote
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_arrays, read_json
 from ..core.records import recorded_files
-from ..data.population import Channel, EpisodeKey, Population, Role
+from ..data.population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
-from ..observer import Observer
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
@@ -30,12 +28,12 @@ T = TypeVar("T")
 
 
 class NotShownError(Exception):
-    """Something cannot be shown because the run does not have it; the message is a sentence for the reader."""
+    """A figure cannot be drawn because the run does not have what it shows; the message is the reason."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """One held-out episode with what every observer and model made of it."""
+    """One held-out episode with the estimates of observers and the predictions of models."""
 
     key: EpisodeKey
     time_s: Array  # shape (n_samples,)
@@ -47,7 +45,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class RunFolder:
-    """A finished, or half finished, run."""
+    """A run that has ended, or a part of one."""
 
     folder: Path
 
@@ -62,43 +60,46 @@ class RunFolder:
 
     @cached_property
     def study(self) -> dict[str, Any]:
-        """The resolved study."""
+        """The study with all settings."""
         content: dict[str, Any] = read_json(self.folder / "study.json")
         return content
 
     @cached_property
     def facts(self) -> dict[str, Any]:
-        """What the read stage found."""
-        return self._record("population", "facts", "the recordings have not been read yet")
+        """Groups of units, episodes for training and testing, condition of the models."""
+        self._require("population/facts.json", "the recordings have not been read yet")
+        return self._record("population/facts.json")
 
     @property
     def identify_on(self) -> str:
         """Condition that feeds models and synthesis."""
         return str(self.facts["identify_on"])
 
+    @property
+    def set_aside(self) -> list[str]:
+        """Units in the group of outliers, which take no part in pooled results."""
+        return [unit for unit, group in self.facts["groups"].items() if group == OUTLIERS]
+
     @cached_property
     def population(self) -> Population:
-        """The recordings, where they are still in place."""
+        """The recordings, where they still exist."""
         from ..data.readers.parquet import read_parquet
 
         folder = self.folder / self.facts["recordings"]
         if not (folder / "population.json").exists():
-            raise NotShownError("the recordings are not in their place any more")
+            raise NotShownError(f"the recordings are no longer in {folder}")
         return read_parquet(folder)
 
     @cached_property
-    def _described(self) -> ModelSet | Population:
-        """What knows channels and sampling period: models, or the recordings where there are none yet."""
-        return (
-            next(iter(self.models.values()))
-            if any(name.startswith("models/") for name in self.files)
-            else self.population
-        )
-
-    @property
     def channels(self) -> tuple[Channel, ...]:
         """Channels with their units of measure."""
-        return self._described.channels
+        return self._signals.channels
+
+    @cached_property
+    def _signals(self) -> ModelSet | Population:
+        """What knows channels and sampling period."""
+        identified = any(name.startswith("models/") for name in self.files)
+        return next(iter(self.models.values())) if identified else self.population
 
     @property
     def states(self) -> list[Channel]:
@@ -106,30 +107,15 @@ class RunFolder:
         return [c for c in self.channels if c.role is Role.STATE]
 
     @property
-    def hidden_states(self) -> list[str]:
-        """Names of the states that are not measured; all states where all are."""
-        return [c.name for c in self.states if not c.measured] or [c.name for c in self.states]
-
-    @property
-    def measured_states(self) -> tuple[str, ...]:
-        """States that are measured at run time; none where the run does not know its channels yet."""
-        try:
-            return tuple(c.name for c in self.channels if c.measured)
-        except NotShownError:
-            return ()
+    def hidden(self) -> list[int]:
+        """Columns of the states that are not measured; of all states where all are."""
+        columns = [i for i, c in enumerate(self.states) if not c.measured]
+        return columns or list(range(len(self.states)))
 
     @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
-        return self._described.sample_period_s
-
-    @cached_property
-    def calibration(self) -> PhaseCalibration:
-        """The phase calibration."""
-        self._require(
-            "calibration/calibration.json", "the lifting of this study has no phase, or it has not been calibrated yet"
-        )
-        return PhaseCalibration.load(self.folder / "calibration")
+        return self._signals.sample_period_s
 
     @property
     def calibrated(self) -> bool:
@@ -137,159 +123,105 @@ class RunFolder:
         return self.has("calibration/calibration.json")
 
     @cached_property
-    def models(self) -> dict[str, ModelSet]:
-        """Models of the condition that was identified on, Koopman models first."""
-        found = self._load("models", "model.json", ModelSet.load, "no models have been identified yet", at_home=True)
-        return dict(sorted(found.items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
+    def calibration(self) -> PhaseCalibration:
+        """The phase calibration."""
+        return PhaseCalibration.load(self._require("calibration/calibration.json", "there is no phase calibration"))
 
-    def condition_models(self, name: str, condition: str) -> ModelSet:
-        """Return the models of one kind in a condition."""
-        if condition == self.identify_on:
-            return self.models[name]
-        place = f"models/{name}@{quote(condition, safe='')}"
-        self._require(f"{place}/model.json", f"no models have been identified in condition {condition!r}")
-        return ModelSet.load(self.folder / place)
+    @cached_property
+    def models(self) -> dict[str, ModelSet]:
+        """Models of the condition that feeds synthesis, Koopman models first."""
+        models = self._load("models/*/model.json", ModelSet.load, "no models have been identified yet")
+        return dict(sorted(_at_home(models).items(), key=lambda item: (not item[0].startswith("koopman"), item[0])))
 
     @cached_property
     def uncertain(self) -> dict[str, UncertainModel]:
-        """Uncertain models of the condition that was identified on."""
-        return self._load(
-            "uncertainty", "*.json", UncertainModel.load, "the uncertainty has not been quantified yet", at_home=True
-        )
+        """Uncertain models of the condition that feeds synthesis."""
+        reason = "the uncertainty has not been quantified yet"
+        return _at_home(self._load("uncertainty/*/*.json", UncertainModel.load, reason))
 
     @cached_property
     def unit_residuals(self) -> dict[str, UnitResiduals]:
-        """Residuals of all units beside the weights, by kind of model."""
-        return _in_order(
-            self._load("uncertainty", "units/*.json", UnitResiduals.load, "the residuals of the units were not kept")
-        )
+        """Residuals of all units relative to the weights, by kind of model."""
+        return self._load("uncertainty/*/units/*.json", UnitResiduals.load, "there are no residuals of single units")
 
     @cached_property
-    def others(self) -> tuple[str, dict[str, UnitResiduals]]:
-        """Condition of the highest outlier score, and there the residuals of all units beside the cover of the others, by kind of model."""
-        reason = "no unit was compared with the cover of the others; it takes two others in a condition"
-        found = self._load("outliers", "others/*.json", UnitResiduals.load, reason)
-        return self._condition(next(iter(found))), _in_order(
-            {name.partition("@")[0]: one for name, one in found.items()}
-        )
+    def others(self) -> dict[str, UnitResiduals]:
+        """Residuals of the highest-scoring unit and of all others, by kind of model and condition."""
+        reason = "no unit was compared with the others; at least three units in a condition are needed"
+        return self._load("outliers/*/others/*.json", UnitResiduals.load, reason)
 
     @cached_property
     def outlier_models(self) -> dict[str, OutlierModel]:
-        """Scores with all that is known about them, by condition."""
+        """Outlier scores by condition."""
         reason = "outlier scores need at least three units in a condition"
-        return {
-            self._condition(name): one
-            for name, one in self._load("outliers", "outlier_model.json", OutlierModel.load, reason).items()
-        }
-
-    def _condition(self, name: str) -> str:
-        """Condition of a folder of models."""
-        return unquote(name.partition("@")[2]) or self.identify_on
-
-    @cached_property
-    def choice(self) -> dict[str, Any]:
-        """Which unit is nominal and which is worst off nominal."""
-        return self._record("uncertainty", "choice", "the uncertainty has not been quantified yet")
+        models = self._load("outliers/*/outlier_model.json", OutlierModel.load, reason)
+        return {unquote(name.partition("@")[2]) or self.identify_on: one for name, one in models.items()}
 
     @cached_property
     def syntheses(self) -> dict[str, Synthesis]:
-        """Syntheses by ``model/method``."""
-        return self._load("synthesis/*", "synthesis.json", Synthesis.load, "no observer has been synthesized yet")
+        """Correction filters by ``model/method``."""
+        return self._load("synthesis/*/*/synthesis.json", Synthesis.load, "no observer has been synthesized yet")
 
-    @cached_property
-    def observers_record(self) -> dict[str, Any]:
-        """What the synthesis stage says about its observers."""
-        return self._record("observers", "observers", "no observer has been made yet")
-
-    @cached_property
-    def observer(self) -> Observer:
-        """The deployed observer itself."""
-        self._require("observers/deployed.json", "no observer is deployed")
-        return Observer.load(self.folder / "observers" / "deployed.json")
+    @property
+    def nominal(self) -> str | None:
+        """The nominal unit, where one has been chosen."""
+        return self._record("uncertainty/choice.json").get("nominal")
 
     @property
     def deployed(self) -> str | None:
         """Name of the deployed observer, where there is one."""
-        try:
-            name = self.observers_record.get("deployed")
-        except NotShownError:
-            return None
-        return None if name is None else str(name)
+        return self._record("observers/observers.json").get("deployed")
+
+    @property
+    def disturbed(self) -> dict[str, Any]:
+        """Errors on disturbed measurements; empty where the study does not ask for them."""
+        return self._record("disturbed/disturbed.json")
 
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Errors of all observers and models."""
-        self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
-        content: dict[str, Any] = read_json(self.folder / "evaluation" / "evaluation.json")
+        folder = self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
+        content: dict[str, Any] = read_json(folder / "evaluation.json")
         return content
-
-    @property
-    def band_hz(self) -> tuple[float, float] | None:
-        """Band around the gearbox frequency at top speed, Hz, where there is one."""
-        found = self.evaluation.get("band_hz")
-        return None if found is None else (found[0], found[1])
-
-    @cached_property
-    def disturbed(self) -> dict[str, Any]:
-        """What was found on disturbed measurements; empty where the study does not ask for it."""
-        return load_artifact(self.folder / "disturbed", "disturbed")[0] if self.has("disturbed/disturbed.json") else {}
-
-    @cached_property
-    def arrays(self) -> dict[str, Array]:
-        """Trajectories and spectra of the evaluation."""
-        return self._arrays("evaluation", "the observers have not been evaluated yet")
 
     @cached_property
     def shown(self) -> list[Shown]:
-        """Episodes that the evaluation kept: nominal, worst off-nominal, and the nominal unit in every other condition."""
-        return [self._shown(number, EpisodeKey(*row)) for number, row in enumerate(self.evaluation["shown"])]
+        """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
+        keys, reason = self.evaluation["shown"], "the observers have not been evaluated yet"
+        arrays = dict(read_arrays(self._require("evaluation/arrays.npz", reason) / "arrays.npz"))
+        return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(keys)]
 
-    def _shown(self, number: int, key: EpisodeKey) -> Shown:
-        start = f"shown{number}/"
-        part = {name.removeprefix(start): values for name, values in self.arrays.items() if name.startswith(start)}
+    def _shown(self, arrays: Mapping[str, Array], start: str, key: EpisodeKey) -> Shown:
+        """Return one episode from the arrays whose names begin with `start`."""
+        part = {name.removeprefix(start): values for name, values in arrays.items() if name.startswith(start)}
         observers, models = (
-            {k.removeprefix(kind): v for k, v in part.items() if k.startswith(kind)} for kind in ("observer/", "model/")
+            {name.removeprefix(kind): v for name, v in part.items() if name.startswith(kind)}
+            for kind in ("observer/", "model/")
         )
-        return Shown(
-            key,
-            np.arange(len(part["states"])) * self.sample_period_s,
-            part["states"],
-            part["inputs"],
-            observers,
-            models,
-        )
+        time_s = np.arange(len(part["states"])) * self.sample_period_s
+        return Shown(key, time_s, part["states"], part["inputs"], observers, models)
 
-    def _record(self, place: str, name: str, reason: str) -> dict[str, Any]:
-        self._require(f"{place}/{name}.json", reason)
-        return load_artifact(self.folder / place, name)[0]
+    def _record(self, name: str) -> dict[str, Any]:
+        """Return the content of an artifact; nothing where the run does not have it."""
+        path = self.folder / name
+        return load_artifact(path.parent, path.stem)[0] if self.has(name) else {}
 
-    def _arrays(self, place: str, reason: str) -> dict[str, Array]:
-        self._require(f"{place}/arrays.npz", reason)
-        return dict(read_arrays(self.folder / place / "arrays.npz"))
-
-    def _load(
-        self, place: str, file: str, load: Callable[[Path], T], reason: str, at_home: bool = False
-    ) -> dict[str, T]:
-        """Load what lies beside `file` in all folders `place`/*, by their names; both may be patterns."""
-        pattern = f"{place}/*/{file}"
-        depth, below = pattern.count("/"), file.count("/")
-        paths = [PurePosixPath(name) for name in self.files if name.count("/") == depth]
-        found = {path.parents[below]: path.parent for path in paths if path.match(pattern)}
-        if not found:
+    def _load(self, pattern: str, load: Callable[[Path], T], reason: str) -> dict[str, T]:
+        """Load the folders of all files that match a pattern, by what its stars before the file stand for."""
+        stars = [k for k, part in enumerate(pattern.split("/")[:-1]) if part == "*"]
+        paths = [PurePosixPath(name) for name in sorted(self.files) if name.count("/") == pattern.count("/")]
+        folders = {"/".join(p.parts[k] for k in stars): p.parent for p in paths if p.match(pattern)}
+        if not folders:
             raise NotShownError(reason)
-        return {
-            "/".join(folder.parts[1:]): load(self.folder / found[folder])
-            for folder in sorted(found)
-            if not (at_home and "@" in folder.name)
-        }
+        return {name: load(self.folder / folder) for name, folder in folders.items()}
 
-    def _require(self, name: str, reason: str) -> None:
+    def _require(self, name: str, reason: str) -> Path:
+        """Return the folder of a file, or raise with the reason why it is not there."""
         if not self.has(name):
             raise NotShownError(reason)
+        return (self.folder / name).parent
 
 
-def _in_order(found: dict[str, T]) -> dict[str, T]:
-    """Linear before Koopman, kros's own before the paper's recipe."""
-    return dict(
-        sorted(found.items(), key=lambda item: (item[0].endswith("_edmd"), item[0].startswith("koopman"), item[0]))
-    )
+def _at_home(artifacts: Mapping[str, T]) -> dict[str, T]:
+    """Return what belongs to the condition that feeds synthesis."""
+    return {name: one for name, one in artifacts.items() if "@" not in name}

@@ -1,16 +1,37 @@
 """How figures look: size, type, and colours that have a light and a dark tone.
 
-A figure is drawn in the light tones. In the report's inline SVG every tone becomes a CSS variable, so that the page can be light or dark.
+A figure is drawn in the light tones; in the report's inline SVG every tone is a CSS variable, light or dark.
 Hues follow Okabe and Ito and stay apart for colour-blind readers; meaning is never carried by hue alone.
 """
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-WIDTH_IN = 7.4  # page width of every figure
+
+@dataclass(frozen=True)
+class Drawing:
+    """How much is drawn; no number here changes a result."""
+
+    width_in: float = 7.4  # of every figure
+    dots_per_inch: int = 200
+    points: int = 250  # buckets of a line over time, frequencies of residuals
+    frequencies: int = 140  # of a frequency response
+    decades: int = 5  # below half of the sampling frequency
+    states: int = 4  # rows of one episode or plant
+    units: int = 400  # rows of the table of units
+    zoom: int = 300  # samples at constant speed that are enlarged
+    settled: float = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
+    diverged: float = 1e3  # ranges of the signal beyond which an error is not drawn
+    diverged_percent: float = 400.0  # error on disturbed measurements that is not drawn
+    segment: int = 1024  # samples of a spectrum
+    concentrated: float = 0.8  # concentration below which the segments of a unit disagree on its phase
+
+
+DRAWING = Drawing()
 
 
 class Tone(Enum):
@@ -44,16 +65,7 @@ class Tone(Enum):
         return f"--{self.name.lower()}"
 
 
-HUES = (
-    Tone.BLUE,
-    Tone.ORANGE,
-    Tone.GREEN,
-    Tone.PURPLE,
-    Tone.GOLD,
-    Tone.SKY,
-    Tone.GREY,
-    Tone.INK,
-)  # of lines that stand side by side
+HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, Tone.GREY, Tone.INK)
 
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
@@ -69,9 +81,6 @@ _SETTINGS: dict[str, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "axes.formatter.limits": (-3, 4),
     "axes.facecolor": "none",
     "grid.color": Tone.GRID.light,
     "grid.linewidth": 0.6,
@@ -84,23 +93,14 @@ _SETTINGS: dict[str, Any] = {
     "ytick.labelsize": 7.5,
     "xtick.major.width": 0.7,
     "ytick.major.width": 0.7,
-    "xtick.minor.width": 0.5,
-    "ytick.minor.width": 0.5,
     "lines.linewidth": 1.2,
-    "lines.solid_capstyle": "round",
     "legend.frameon": False,
     "legend.fontsize": 8,
-    "legend.handlelength": 1.8,
-    "legend.columnspacing": 1.6,
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-    "text.hinting": "none",  # widths of text do not depend on the resolution
-    "path.simplify": True,
     "path.simplify_threshold": 0.3,
+    "text.hinting": "none",
     "svg.fonttype": "none",
     "svg.hashsalt": "kros",
     "pdf.fonttype": 42,
-    "mathtext.fontset": "dejavusans",
 }
 
 

@@ -1,200 +1,306 @@
-"""The first paragraph: what was recorded, which observer is deployed, how well it works, which units are flagged; numbers from the metrics."""
+"""The verdict on a run: READY, CHECK or NOT READY with its reasons, three numbers, and what voids the certificate.
+
+The head of the report and the lines behind ``kros run`` both come from here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
-from ..data.population import DEFAULT_CONDITION
-from .caveats import conditions_apart, confounded_text
-from .disturbances import needed_sensor
-from .error_tables import ErrorTable, home_table, left_out_tables
-from .names import (
-    BASELINES,
-    channel_units,
-    condition_label,
-    form_label,
-    joined,
-    minus,
-    number,
-    observer_label,
-    split_observer,
-)
-from .trust import trust_of
+from .error_tables import ErrorTable, left_out_tables
+from .facts import Facts
+from .names import BASELINES, condition_label, joined, minus, model_label, number, observer_label, some_of, words
+from .names import split_observer as split
 
-Metrics = Mapping[str, Any]
+Row = Mapping[str, Any]
 
 
-def verdict(metrics: Metrics, measured: tuple[str, ...] = ()) -> list[str]:
-    """Return the sentences of the verdict from ``metrics.json``, any part of which may be absent; errors of `measured` channels are left to the table."""
-    return [
-        *_recorded(metrics),
-        *_deployed(metrics, measured),
-        *needed_sensor(metrics, measured),
-        *_left_out(metrics, measured),
-        *_next_unit(metrics),
-        *_covered(metrics),
-        *_certificate(metrics),
-    ]
+@dataclass(frozen=True)
+class Thresholds:
+    """From where on a difference is a reason to check."""
+
+    better: float = 0.05  # share by which all mean errors of another observer are smaller
+    improved: float = 0.01  # share by which a correction must reduce the error of the model alone
+    small_set: float = 5.0  # ratio of a model's simulation error to the size of its uncertain set
+    noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
-def _recorded(metrics: Metrics) -> list[str]:
-    study = metrics["study"]
-    conditions = " and ".join(condition_label(c) for c in study["conditions"] if c != DEFAULT_CONDITION)
-    units = f"{study['units']} unit" + ("s" if study["units"] != 1 else "")
-    batch = "" if conditions_apart(metrics) else " of one batch"
-    return [f"{units}{batch} were recorded" + (f" ({conditions})." if conditions else "."), *confounded_text(metrics)]
+THRESHOLDS = Thresholds()
 
 
-def _deployed(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
-    name = metrics["study"].get("deployed")
-    if name is None:
-        return ["The run stopped before an observer was made."]
-    sentences = [f"The deployed observer is “{observer_label(name)}”."]
-    table = home_table(metrics)
+class Status(Enum):
+    """Whether an observer can be deployed."""
+
+    READY = "READY"
+    CHECK = "CHECK"
+    NOT_READY = "NOT READY"
+
+
+@dataclass(frozen=True)
+class Reason:
+    """Why a run is not READY, what to do about it, and the section of the report with the details."""
+
+    status: Status
+    text: str
+    action: str
+    section: str
+
+
+@dataclass(frozen=True)
+class Number:
+    """A number that stands alone, with its unit of measure, what it is, and what puts it into proportion."""
+
+    value: str
+    unit: str
+    label: str
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What stands at the head of the report."""
+
+    status: Status
+    sentence: str
+    reasons: Sequence[Reason]
+    numbers: Sequence[Number]
+    certified: Sequence[str]
+    void: Sequence[str]
+
+
+def judge(facts: Facts) -> Verdict:
+    """Return the verdict on a run."""
+    reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
+    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates, _small_set):
+        reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
+    known = [reason.status for reason in reasons]
+    status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
+    certified = certificates(facts)
+    void = voids(facts) if certified else []
+    return Verdict(status, _sentence(facts, status, reasons), reasons, _numbers(facts), certified, void)
+
+
+def _sentence(facts: Facts, status: Status, reasons: Sequence[Reason]) -> str:
+    """Return the verdict in one sentence."""
+    if status is Status.NOT_READY:
+        return reasons[0].text
+    task = f"estimates {channels(facts.hidden)}" + (f" from {channels(facts.measured)}" if facts.measured else "")
+    if status is Status.READY:
+        return f"“{facts.label}” can be deployed on units like the {facts.study['units']} recorded ones: it {task}."
+    return f"“{facts.label}” {task}. Check {len(reasons)} point{'s' * (len(reasons) > 1)} before it is used."
+
+
+def channels(names: Sequence[str]) -> str:
+    """Return channels for a sentence."""
+    return joined([words(name) for name in names])
+
+
+def _numbers(facts: Facts) -> list[Number]:
+    """Return the errors of at most two hidden channels, and how many units are flagged."""
+    numbers = []
+    for channel in facts.hidden[:2]:
+        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else None
+        if cell is not None and cell.mean is not None:
+            notes = [f"RMS {number(cell.rms)} {facts.unit(channel)}".strip()] if cell.rms else []
+            notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
+            true = f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}"
+            notes += [true] if cell.true_mean else []
+            numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
+    if rows := facts.get("outliers"):
+        flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
+        notes = [some_of(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
+        numbers.append(Number(str(len(flagged)), f"of {len({r['unit'] for r in rows})}", "units flagged", notes))
+    return numbers
+
+
+def _lag(lag_s: float | None) -> str:
+    """Return how late a signal is, for a sentence."""
+    return "" if lag_s is None else f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
+
+
+def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield what stops, what to do, and where the details are."""
+    table, hidden = facts.table, facts.hidden
+    if not facts.deployed:
+        yield "The run stopped before an observer was designed.", "Run it to its end.", "run"
+    elif table is None:
+        yield f"“{facts.label}” has not been evaluated.", "Run it to its end.", "run"
+    elif any(table.cells[facts.deployed][c].mean is None for c in hidden):
+        text = f"The estimates of “{facts.label}” diverge on held-out episodes."
+        yield text, "Do not use it; look at the models first.", "models"
+    elif hidden and not_improved(table, facts.deployed, hidden) == hidden:
+        text = f"“{facts.label}” is no better than its model without correction."
+        yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
+    left = left_out_tables(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
+    cells = left[0].cells.get(facts.deployed, {}) if left else {}
+    if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
+        text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
+        yield text, "Do not use it on new units.", "left-out"
+
+
+def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield alerts of the recordings, confounded conditions, and too short recordings."""
+    for alert in facts.study.get("alerts", ()):
+        yield f"Recordings: {alert.rstrip('.')}.", "Look at the recordings.", "recordings"
+    rows = [row for row in facts.get("units", []) if row.get("conditions") and row.get("group") != "outliers"]
+    inside = [row for row in rows if facts.study["identify_on"] in row["conditions"]]
+    if len(inside) < len(rows):
+        single = all(len(row["conditions"]) == 1 for row in rows)
+        text = "Units and conditions are confounded: every unit was recorded in one condition only. " if single else ""
+        text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
+        text += f"“{condition_label(facts.study['identify_on'])}”."
+        yield text, "Record all units in the same conditions.", "recordings"
+    noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
+    if noise and noise["at_peak"] >= THRESHOLDS.noise:
+        text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
+        yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
+
+
+def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield units that are flagged, undecided or have a remark."""
+    rows = facts.get("outliers", [])
+    if flagged := [r for r in rows if r["outlier"]]:
+        text = f"Flagged as not belonging to the batch: {units_text(flagged)}."
+        yield text, "Inspect these units before they are shipped.", "units"
+    if short := [r for r in undecided(rows) if r["status"] == "not enough data"]:
+        most = max(short, key=lambda r: float(r["needed_s"]))
+        need = f"{most['unit']} needs {number(most['needed_s'])} s, has {number(most['recorded_s'])} s"
+        yield _inconclusive(short, rows), f"Record longer: {need}.", "units"
+    if few := [r for r in undecided(rows) if r["status"] == "cannot tell"]:
+        yield _inconclusive(few, rows), "Score against at least 8 units in one condition.", "units"
+    remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
+    if remarks:
+        yield f"Units with a remark: {some_of(remarks)}.", "See their rows.", "units"
+
+
+def _inconclusive(rows: Sequence[Row], every: Sequence[Row]) -> str:
+    """Say how many scores decide nothing."""
+    if len(rows) == len(every):
+        return f"No outlier score is conclusive ({len(rows)} of {len(every)})."
+    return f"{len(rows)} of {len(every)} outlier scores are not conclusive: {units_text(rows)}."
+
+
+def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield better observers, channels without improvement, and bounds that errors exceed."""
+    table, hidden = facts.table, facts.hidden
     if table is None:
-        return [*sentences, "It has not been evaluated."]
-    hidden = table.hidden(measured, name)
-    source = f"From {' and '.join(measured)} alone it" if measured else "It"
-    known = [c for c in hidden if table.cells[name][c].mean is not None]
-    if not known:
-        return [*sentences, "Its estimates diverge on held-out episodes: do not use it."]
-    units = channel_units(metrics)
-    parts = [_channel(table, name, c, units.get(c, "")) for c in known]
-    shown = ", as the declared sensor shows them," if metrics["study"].get("sensor") else ""
-    sentences.append(
-        f"{source} estimates {joined(parts)} on held-out episodes{shown} of units that are not the nominal one, in the mean."
-    )
-    return [*sentences, *_open_loop(table, name, known), *_rivals(table, name, known)]
+        return
+    if (better := better_observer(table, facts.deployed, hidden)) is not None:
+        text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
+        designed = "relift_certified" in facts.observers.get(better, {})
+        action = f'observer.deployed = "{better}" selects it.' if designed else "It is a baseline that is not exported."
+        yield text, f"Compare both. {action}", "errors"
+    same = not_improved(table, facts.deployed, hidden)
+    if 0 < len(same) < len(hidden):
+        text = f"The correction does not improve {channels(same)}: the model alone is as good."
+        yield text, "Do not rely on the estimate more than on the model.", "errors"
+    for channel, bound in (facts.entry.get("set_bound") or {}).items():
+        cell = table.cells[facts.deployed].get(channel)
+        if cell is not None and cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
+            unit = facts.unit(channel)
+            text = f"A held-out episode exceeds the bound for recorded signals: {words(channel)} of unit "
+            text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit} RMS, the bound is {number(bound)} {unit}."
+            yield text, "Do not rely on this bound; record more kinds of episodes.", "certificates"
 
 
-def _left_out(metrics: Metrics, measured: tuple[str, ...]) -> list[str]:
-    """What the same method does on units that took no part."""
-    name, rows = metrics["study"].get("deployed"), metrics.get("left_out", {}).get("rows", [])
-    tables = left_out_tables(rows, metrics["study"]["identify_on"])
-    if not tables or name not in tables[0].cells:
-        return []
-    cells = {c: cell for c, cell in tables[0].cells[name].items() if c not in measured}
-    if any(cell.mean is None for cell in cells.values()):
-        return [
-            "Designed without the unit it runs on, the same kind of observer diverges on some units: do not use it on new ones."
-        ]
-    parts = [
-        f"{c.replace('_', ' ')} to {number(v.mean)} % ({number(v.worst)} % on the worst unit, {v.worst_unit})"
-        for c, v in cells.items()
-    ]
-    if not parts:
-        return []
-    text = f"Designed without the unit it runs on, the same kind of observer estimates {joined(parts)}, in the mean (empirical)."
-    return [text, *_rivals(tables[0], name, list(cells))]
+def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield what is not certified or bounded, and folds that failed."""
+    if facts.entry.get("relift_certified") is False:
+        action = "Test it in parallel before anything depends on it."
+        yield "No certificate at run time covers the observer.", action, "certificates"
+    if outside := facts.entry.get("set_outside"):
+        text = f"Outside the set of recorded signals that the certificate covers: {some_of(outside)}."
+        yield text, "Do not rely on the bounds for these units.", "certificates"
+    if facts.observers and all(split(name)[1] in BASELINES for name in facts.observers):
+        yield "No robust observer could be designed for this population.", "See why.", "certificates"
+    bound = facts.get("uncertainty", {}).get(facts.model, {}).get("weight", {}).get("cover_max")
+    if bound is not None and bound > 1:
+        yield "The weights do not bound all units that they were fitted to.", "Raise their order.", "uncertainty"
+    for fold, why in facts.get("left_out", {}).get("failed", {}).items():
+        yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
 
 
-def _next_unit(metrics: Metrics) -> list[str]:
-    """What units that took part in nothing say about the next one."""
-    found = metrics.get("next_unit")
-    if not found:
-        return []
-    if found["bounds"] is None:
-        return [f"Nothing is known with confidence about the next unit: {found['reason']}."]
-    parts = [
-        f"{c.replace('_', ' ')} to {number(b['error_percent'])} %"
-        for c, b in found["bounds"].items()
-        if b["error_percent"] is not None
-    ]
-    home = "" if found["condition"] == DEFAULT_CONDITION else f" ({condition_label(found['condition'])})"
-    level, n = f"{100 * found['confidence']:g}", found["reserve"]
-    return [
-        f"With {level} % confidence it estimates {joined(parts)} or better on the next unit of the batch{home}: {n} units took part in nothing."
-    ]
+def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
+    """Yield an uncertain set that is far smaller than the simulation errors of its models."""
+    entry = facts.get("uncertainty", {}).get(facts.model, {})
+    peak = entry.get("peak_db", {}).get(entry.get("form"))
+    errors = facts.get("models", {}).get(facts.model, {}).get("freerun_error_percent", {})
+    known = {channel: error["median"] for channel, error in errors.items() if error.get("median") is not None}
+    if peak is None or not known:
+        return
+    channel, size = max(known, key=lambda c: known[c]), 100 * 10 ** (peak / 20)
+    if known[channel] > THRESHOLDS.small_set * size:
+        text = (
+            f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
+        )
+        text += f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
+        text += (
+            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from the units."
+        )
+        yield text, "Do not read a bound over the set as a bound on the error.", "spread"
 
 
-def _channel(table: ErrorTable, name: str, channel: str, unit: str) -> str:
-    cell = table.cells[name][channel]
-    more = [f"RMS {number(cell.rms)}{' ' + unit if unit not in ('', '1') else ''}"] if cell.rms is not None else []
-    more += [f"{number(cell.worst)} % on the worst unit, {cell.worst_unit}"] if cell.worst is not None else []
-    return f"{channel.replace('_', ' ')} to {number(cell.mean)} % of the largest value" + (
-        f" ({'; '.join(more)})" if more else ""
-    )
+def undecided(rows: Sequence[Row]) -> list[Row]:
+    """Return the outlier scores that decide nothing."""
+    return [r for r in rows if r.get("status") in ("not enough data", "cannot tell")]
 
 
-def _open_loop(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
-    same = f"{split_observer(name)[0]}/open_loop"
-    other = same if same in table.cells else next((o for o in table.cells if split_observer(o)[1] == "open_loop"), None)
-    if other is None or other == name:
-        return []
-    theirs = {c: table.cells[other][c].mean for c in channels if c in table.cells[other]}
-    if any(value is None for value in theirs.values()):
-        return ["Open loop, the nominal model alone, diverges on some units."]
-    parts = [
-        f"{c.replace('_', ' ')} {number(v)} %{_ratio(table.cells[name][c].mean, v)}"
-        for c, v in theirs.items()
-        if v is not None
-    ]
-    return [f"Open loop, the nominal model alone, gives {joined(parts)}."]
+def units_text(rows: Sequence[Row]) -> str:
+    """Return units with their conditions, for a sentence."""
+    units: dict[str, list[str]] = {}
+    for row in rows:
+        units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
+    named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
+    return some_of([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
 
 
-def _rivals(table: ErrorTable, name: str, channels: list[str]) -> list[str]:
-    """The best of all baselines in every channel, whichever it is, with its name."""
-    parts = []
-    for channel in channels:
-        means = {
-            o: cells[channel].mean
-            for o, cells in table.cells.items()
-            if channel in cells and split_observer(o)[1] in BASELINES
-        }
-        theirs = {o: mean for o, mean in means.items() if mean is not None and o != name}
-        if theirs and channel in table.ranked:
-            best = min(theirs, key=lambda o: theirs[o])
-            ratio = _ratio(table.cells[name][channel].mean, theirs[best])
-            parts.append(f"{channel.replace('_', ' ')} “{observer_label(best)}”, {number(theirs[best])} %{ratio}")
-    return [f"The best baseline is for {joined(parts)}."] if parts else []
-
-
-def _ratio(own: float | None, theirs: float) -> str:
-    if not own:
-        return ""
-    ratio = theirs / own
-    if 0.99 < ratio < 1.01:
-        return " (the same)"
-    if ratio > 1.95:
-        return f" ({number(ratio, 2)} times as much)"
-    return f" ({100 * (ratio - 1):.0f} % more)" if ratio > 1 else f" ({100 * (1 - ratio):.0f} % less)"
-
-
-def _covered(metrics: Metrics) -> list[str]:
-    """The uncertain set of the deployed observer."""
-    name = metrics["study"].get("deployed") or ""
-    entry = metrics.get("uncertainty", {}).get(split_observer(name)[0])
-    if split_observer(name)[1] == "memory":
-        return ["It was identified from the recordings of these units, not designed for a set of machines."]
-    if entry is None or entry["peak_db"].get(entry["form"]) is None:
-        return []
-    peak, cover = minus(f"{entry['peak_db'][entry['form']]:.1f}"), entry["weight"]["cover_max"]
-    covers = "cover the" if cover is not None and cover <= 1 else "do not cover all"
-    return [
-        f"The set of machines it is designed for ({form_label(entry['form'])}) has residuals of at most {peak} dB around unit {entry['nominal']}; "
-        f"its weights {covers} units that it was made from."
-    ]
-
-
-def _certificate(metrics: Metrics) -> list[str]:
-    name = metrics["study"].get("deployed") or ""
-    entry, sentences = metrics.get("observers", {}).get(name, {}), []
+def certificates(facts: Facts) -> list[str]:
+    """Return what is certified about the deployed observer."""
+    entry, texts = facts.entry, []
     if entry.get("worst_case_h2") is not None:
-        gap = entry.get("gap_percent")
-        near = f", at most {number(gap)} % above what any correction of this kind can reach" if gap is not None else ""
-        sentences.append(f"Its error is certified for all plants inside the uncertain set{near}.")
-    trust = trust_of(entry)
-    if trust.signals:
-        bounds = joined([f"{number(value)} % in {state.replace('_', ' ')}" for state, value in trust.signals.items()])
-        sentences.append(
-            f"For all signals with the power that was recorded its RMS errors are at most {bounds} (of the largest value)."
-        )
-    if entry.get("relift_certified") is not None:
-        which = "Another certificate" if sentences else "A certificate"
-        sentences.append(
-            f"{which} covers it as it runs, re-lifted at every step, on any machine."
-            if entry["relift_certified"]
-            else "No certificate could be found for it as it runs, re-lifted at every step."
-        )
-    return sentences
+        texts.append(f"For the set of plants: the H2 norm of the error is at most {number(entry['worst_case_h2'])}.")
+    bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
+    hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
+    if hidden:
+        parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
+        bank = split(facts.deployed)[1] == "estimator"
+        source = "Largest RMS error on units left out" if bank else "For recorded signals: the RMS error is at most"
+        texts.append(f"{source}{':' * bank} {joined(parts)}.")
+    if entry.get("relift_certified"):
+        gain = number(entry.get("relift_gain"))
+        texts.append(f"At run time: the gain from the model's one-step residual to the error is at most {gain}.")
+    return texts
+
+
+def voids(facts: Facts) -> list[str]:
+    """Return when the certificates of the deployed observer do not hold, the most frequent mistake first."""
+    texts = ["A controller uses the estimate: the recordings did not depend on it."]
+    if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
+        texts += ["Signals have more power at some frequency than the recorded ones, or leave the range of training."]
+        texts += ["The unit is worn, badly assembled, or of another batch."]
+    rate = 1 / facts.study["sample_period_s"]
+    return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]
+
+
+def better_observer(table: ErrorTable, name: str, channels: Sequence[str]) -> str | None:
+    """Return the most accurate of the observers that are clearly better in every channel; None where none is."""
+    better = [o for o in table.cells if o != name and _smaller(table, o, name, channels, 1 - THRESHOLDS.better)]
+    return min(better, key=lambda o: table.mean(o, channels), default=None)
+
+
+def not_improved(table: ErrorTable, name: str, channels: Sequence[str]) -> list[str]:
+    """Return the channels in which an observer is no better than its model without correction."""
+    other = f"{split(name)[0]}/open_loop"
+    if name == other or other not in table.cells:
+        return []
+    return [c for c in channels if not _smaller(table, name, other, [c], 1 - THRESHOLDS.improved)]
+
+
+def _smaller(table: ErrorTable, one: str, other: str, channels: Sequence[str], ratio: float) -> bool:
+    """Tell whether the mean errors of one observer are below a ratio of another's in all channels."""
+    known = [c for c in channels if c in table.cells[one] and c in table.cells[other]]
+    pairs = [(table.cells[one][c].mean, table.cells[other][c].mean) for c in known]
+    return len(pairs) == len(channels) and all(a is not None and (b is None or a < ratio * b) for a, b in pairs)

@@ -13,6 +13,7 @@ import numpy as np
 from ..core.artifacts import load_artifact, plain, read_json
 from ..data.flat_tops import FoundLimit
 from ..evaluate.intervals import interval_rows
+from ..observer import Observer
 from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
@@ -28,9 +29,13 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     done = list(Stage)[: list(Stage).index(until) + 1]
     metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done, total_s)}
     metrics["units"] = _units(context, done)
+    if Stage.CALIBRATE in done:
+        metrics |= _calibration(context)
     for stage, name, collect in _SECTIONS:
         if stage in done:
             metrics[name] = collect(context)
+    if Stage.SYNTHESIZE in done:
+        metrics |= _deployment(context)
     if Stage.LEFT_OUT in done:
         metrics |= left_out.results(context)
     if Stage.EVALUATE in done:
@@ -47,6 +52,11 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "identify_on": facts.identify_on,
         "sample_period_s": context.population.sample_period_s,
         "channels": {c.name: c.unit for c in context.population.channels},
+        "measured": [c.name for c in context.population.channels if c.measured],
+        "inputs": list(context.population.inputs),
+        "episodes": _episodes(context),
+        "resolution": facts.resolution,
+        "dropped": facts.dropped,
     }
     if context.config.sensor:
         study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
@@ -61,6 +71,15 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if Stage.SYNTHESIZE in done:
         study["deployed"] = context.observers_record["deployed"]
     return study
+
+
+def _episodes(context: Context) -> dict[str, dict[str, int]]:
+    """Count episodes by condition, those for training and those held out."""
+    keys = {"train": context.facts.keys("train"), "held_out": context.facts.keys("test")}
+    return {
+        condition: {part: sum(k.condition == condition for k in found) for part, found in keys.items()}
+        for condition in context.population.conditions
+    }
 
 
 def _limit(limit: Limit, found: FoundLimit | None, declared: bool) -> dict[str, Any]:
@@ -102,9 +121,23 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     return rows
 
 
+def _calibration(context: Context) -> dict[str, Any]:
+    """Return what the phase of every unit belongs to; empty for a study without one."""
+    calibration = calibrate.load(context)
+    if calibration is None:
+        return {}
+    spec = calibration.spec
+    names = ("ratio", "angle", "parameter")
+    return {"calibration": {name: getattr(spec, name) for name in names} | {"lag_rad": calibration.lag_rad}}
+
+
 def _models(context: Context) -> dict[str, Any]:
     return {
-        name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)}
+        name: {
+            "order": m.lifting.n_lifted,
+            "functions": list(m.lifting.functions),
+            "spectral_radius_max": _pooled_radius(context, name),
+        }
         for name in context.identified.kinds
         for m in [context.identified.models(name)]
     }
@@ -160,7 +193,7 @@ def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
 
 def _observers(context: Context) -> dict[str, Any]:
     entries: dict[str, Any] = {}
-    written = context.store.files()
+    written, certified = context.store.files(), _certified(context)
     for name, facts in context.observers_record["facts"].items():
         entry = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
@@ -170,7 +203,42 @@ def _observers(context: Context) -> dict[str, Any]:
             if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
                 entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
         entries[name] = entry
-    return entries
+    return {name: entry | certified.get(name, {}) for name, entry in entries.items()}
+
+
+def _certified(context: Context) -> dict[str, dict[str, Any]]:
+    """Return assumptions of certificates, and bounds for recorded signals in the channels' units of measure."""
+    if not context.store.holds("observers", "relift.json"):
+        return {}
+    record = load_artifact(context.store.path("observers"), "relift")[0]
+    bounds = {
+        name: {"set_bound": dict(zip(own["states"], own["cover"], strict=True))}
+        for name, own in record.get("signals", {}).items()
+    }
+    proofs = record.get("certificates", {})
+    return {n: {"assumptions": own.get("assumptions", [])} | bounds.get(n, {}) for n, own in proofs.items()}
+
+
+def _deployment(context: Context) -> dict[str, Any]:
+    """Return what the deployed observer reads, estimates and needs."""
+    if not context.store.holds("observers", "deployed.json"):
+        return {}
+    observer = Observer.load(context.store.path("observers", "deployed.json"))
+    measured = [observer.lifting.states[i] for i in observer.measured]
+    sizes = observer.seen
+    ranges = [] if sizes is None else zip([*measured, *observer.inputs], [*sizes.measured, *sizes.inputs], strict=True)
+    content = {
+        "measured": measured,
+        "inputs": list(observer.inputs),
+        "estimates": list(observer.recorded),
+        "largest": dict(ranges),
+        "delay_samples": observer.runtime.delay,
+        "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
+        "functions": list(observer.lifting.functions),
+        "states": observer.lifting.n_states + observer.controller.n_states,
+        "sensor": observer.about.get("sensor", {}),
+    }
+    return {"deployment": content}
 
 
 def _observers_and_baselines(context: Context) -> dict[str, Any]:

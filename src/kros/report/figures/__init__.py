@@ -1,7 +1,6 @@
-"""Figures: one file a figure, one row of one table, in the order of the paper's argument.
+"""Figures: one row of one table each, in the order of the paper's argument.
 
-The function `draw` of a figure's file takes a `RunFolder`, and the options of its row, and returns the figure
-and what its caption says behind the sentence about what to see.
+The function of a row takes a `RunFolder` and the options of the row; it returns the figure and more of its caption.
 """
 
 from __future__ import annotations
@@ -11,9 +10,9 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ...core.errors import ConfigError
 from ..run_folder import NotShownError, RunFolder
 from ..theme import style
-from .see import SEE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -21,42 +20,42 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Row:
-    """A figure of the report: its title, the module that draws it, and what that is told."""
+    """A figure: its title, the module and function that draw it, the first sentence of its caption, and options."""
 
     title: str
-    module: str
+    function: str
+    see: str
     options: Mapping[str, Any] = field(default_factory=dict)
 
 
+_SMALL = "The smaller the error, the better the estimate."
 FIGURES: dict[str, Row] = {
-    "signals": Row("Recorded signals", "recordings.signals"),
-    "tracking_spectrum": Row("Tracking error at constant speed", "recordings.tracking_spectrum"),
-    "phase": Row("Phase calibration", "recordings.phase"),
-    "models": Row("Models of all units", "models.bode"),
-    "free_run": Row("Predictions of the models", "models.free_run"),
-    "free_run_spectra": Row("Spectra of the prediction errors", "models.free_run_spectra"),
-    "forms": Row("Six uncertainty forms", "uncertainty.forms"),
-    "weights": Row("Weights over the optimal cover", "uncertainty.weights"),
-    "forms_entrywise": Row("Six uncertainty forms, entry by entry", "uncertainty.forms_entrywise"),
-    "weights_entrywise": Row("Weights entry by entry", "uncertainty.weights_entrywise"),
-    "synthesis": Row("Plant, weights and correction filters", "synthesis.bode"),
-    "observers_in_time": Row("Estimates", "observers.in_time"),
-    "observers_in_time_paper": Row("Estimates of the paper's observers", "observers.in_time", {"paper": True}),
-    "observer_spectra": Row("Spectra of the estimation errors", "observers.spectra"),
-    "loaded_paper": Row("Errors of the paper's observers in the other condition", "observers.other_condition"),
-    "loaded_spectra": Row("Spectra of the errors in the other condition", "observers.other_condition_spectra"),
-    "load_torque": Row("Load torque", "observers.load_torque"),
-    "robustness": Row("Disturbed measurements", "observers.robustness"),
-    "outlier_scores": Row("Outlier scores", "outliers.scores"),
-    "outlier_residuals": Row("The highest-scoring unit, entry by entry", "outliers.residuals"),
+    "signals": Row("Recorded signals", "recordings:signals", "One held-out episode as recorded."),
+    "tracking_spectrum": Row("Tracking error", "recordings:tracking_spectrum", "Peaks are the modelled disturbance."),
+    "phase": Row("Phase calibration", "recordings:phase", "Lags should be nearly equal, concentrations near one."),
+    "models": Row("Models of all units", "models:bode", "The uncertain model has to bound the spread of the lines."),
+    "free_run": Row("Simulation of the models", "episodes:free_run", "The smaller the error, the better the model."),
+    "forms": Row("Six uncertainty forms", "uncertainty:forms", "Units differ least in the form with the lowest line."),
+    "weights": Row("Weights and optimal bounds", "uncertainty:weights", "Lines should lie close to their shade."),
+    "weights_entrywise": Row("Weights, entry by entry", "uncertainty:weights_entrywise", "Black bounds blue lines."),
+    "synthesis": Row("Plant, weights and filters", "synthesis:bode", "High weights need a large correction."),
+    "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
+    "observers_in_time_paper": Row("The paper's estimates", "episodes:estimates", _SMALL, {"paper": True}),
+    "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
+    "load_torque": Row("Load torque", "disturbed:load_torque", "The nearer to the declared load, the better."),
+    "robustness": Row("Disturbed measurements", "disturbed:robustness", "A line rises where the observer fails."),
+    "outlier_scores": Row(
+        "Outlier scores", "outliers:scores", "The higher a unit, the more it differs from all others."
+    ),
+    "outlier_residuals": Row(
+        "Highest score", "uncertainty:outlier_residuals", "The unit differs where red leaves black."
+    ),
 }
-LEFT_TO_FILES = ("forms_entrywise", "weights_entrywise", "outlier_residuals")
-ON_THE_PAGE = tuple(name for name in FIGURES if name not in LEFT_TO_FILES)
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """A figure that was drawn, or the reason why it was left out; `name` is also the name of its file."""
+    """A figure, or the reason why it is left out; `name` is also the name of its file."""
 
     name: str
     title: str
@@ -68,12 +67,23 @@ class Drawn:
 def draw(name: str, run: RunFolder) -> Drawn:
     """Draw one figure of a run; one that lacks an artifact comes with the reason instead."""
     row = FIGURES[name]
+    module, _, function = row.function.partition(":")
     with style():
         try:
-            figure, text = import_module(f".{row.module}", __name__).draw(run, **row.options)
-            return Drawn(name, row.title, figure, f"{SEE[name]} {text}")
+            figure, text = getattr(import_module(f".{module}", __name__), function)(run, **row.options)
+            return Drawn(name, row.title, figure, f"{row.see} {text}".strip())
         except NotShownError as absent:
             return Drawn(name, row.title, reason=str(absent))
+
+
+def run_figure(run: Any, name: str = "observers_in_time") -> Figure:
+    """Draw one figure of the result of a run, by default the estimates of the deployed observer."""
+    if name not in FIGURES:
+        raise ConfigError(f"Plot of a run: there is no figure {name!r}; choose one of {', '.join(FIGURES)}.")
+    drawn = draw(name, RunFolder(run.folder))
+    if drawn.figure is None:
+        raise ConfigError(f"Plot of a run: the figure {name!r} is left out, {drawn.reason}.")
+    return drawn.figure
 
 
 def draw_all(run: RunFolder) -> Iterator[Drawn]:

@@ -1,178 +1,201 @@
-"""Shared by the figures of signals in time: which episode, windows at constant speed, rows of channels with a zoom beside them."""
+"""Signals in time: recorded and estimated values, errors, and their spectra."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 
-from ...data.population import OUTLIERS, Channel, EpisodeKey, Role
-from ..canvas import Array, Axes, Figure, grid, label_below, legend, thin
-from ..names import Look, paper_pair, readable_unit, shorten
+from ...data import EpisodeBatch
+from ...data.population import Channel, Role
+from ...evaluate.errors import error_spectrum
+from ...evaluate.sensor import as_shown
+from ...identify.identified import IdentifiedModels
+from ...observer import Observer, run_observer
+from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
+from ..names import (
+    Look,
+    best_models,
+    condition_label,
+    deployed_pair,
+    episode_title,
+    model_label,
+    model_look,
+    observer_label,
+    observer_look,
+    paper_pair,
+    readable_unit,
+    shorten,
+    squared,
+    words,
+)
 from ..run_folder import NotShownError, RunFolder, Shown
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 
-Line = tuple[str, Array, Look]
-
-LINE = 14  # letters beside an axis of a strip
+TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
+_PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
 @dataclass(frozen=True)
-class Strip:
-    """Lines of one channel over time: near the first one, the recorded signal, in shares of its range; or errors, where that is None."""
+class Signals:
+    """What the signals of a figure are: channels, sampling period, samples of the enlarged part, gearbox band."""
 
-    channel: Channel
-    lines: Sequence[Line]
-    near: float | None = None
+    channels: Sequence[Channel]
+    sample_period_s: float
+    window: int
+    band_hz: tuple[float, float] | None = None
 
-
-TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
-_ABOUT_PAPER = "The paper's observers: mixed H2-H∞ synthesis, models of extended dynamic mode decomposition. "
-
-
-def recorded_episodes(run: RunFolder) -> list[Shown]:
-    """Return one held-out episode of one unit in every condition, the condition that was identified on first."""
-    try:
-        unit = run.shown[0].key.unit
-        found = [s for s in run.shown if s.key.unit == unit]
-    except NotShownError:
-        groups = run.facts["groups"]
-        unit = next((u for u, group in groups.items() if group != OUTLIERS), next(iter(groups)))
-        keys = {
-            key.condition: key for key in (EpisodeKey(*row) for row in reversed(run.facts["test"])) if key.unit == unit
-        }
-        found = [_read(run, key) for key in keys.values()]
-    return sorted(found, key=lambda s: s.key.condition != run.identify_on)
+    @classmethod
+    def of(cls, run: RunFolder) -> Signals:
+        """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
+        size = DRAWING.zoom if run.calibrated else len(run.shown[0].time_s) // 8
+        band = run.evaluation.get("band_hz")
+        return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 
 
-def _read(run: RunFolder, key: EpisodeKey) -> Shown:
-    states, inputs = run.population.read_parts(key)
-    return Shown(key, np.arange(len(states)) * run.sample_period_s, states, inputs, {}, {})
+@dataclass(frozen=True)
+class Block:
+    """One episode in a figure: its title, what is drawn beside the recorded signals, and of which states."""
+
+    title: str
+    shown: Shown
+    lines: Mapping[str, tuple[Array, Look]]  # values, shape (n_samples, n), by label
+    states: Sequence[int]
 
 
-def require_paper_pair(names: Iterable[str]) -> tuple[list[str], str]:
-    """Return the paper's linear and Koopman observer, and a sentence about them; raises `NotShownError` where the study made neither."""
-    found = paper_pair(names)
-    if not found:
-        reason = "this study has no observer of the paper's method; name mixed in synthesis.methods, and see why it failed where it did"
-        raise NotShownError(reason)
-    return found, _ABOUT_PAPER
+def free_run(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the simulation of a held-out episode of the nominal unit (the paper's Figures 5 and 6)."""
+    shown = run.shown[0]
+    names = best_models(shown.models)
+    if not names:
+        raise NotShownError("no model was simulated on the episode that is shown")
+    lines = {model_label(n): (shown.models[n], model_look(n)) for n in names}
+    block = Block(episode_title(shown.key), shown, lines, range(min(len(run.states), DRAWING.states)))
+    text = "Simulation from the first recorded state with the recorded inputs, without measurements."
+    return _figure(run, [block], text)
 
 
-def reference_columns(run: RunFolder) -> dict[str, int]:
-    """Return for every state the input column that is its reference, by the name ``target_<state>``."""
-    inputs = [c.name for c in run.channels if c.role is Role.INPUT]
-    return {c.name: inputs.index(f"target_{c.name}") for c in run.states if f"target_{c.name}" in inputs}
+def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
+    """Draw estimates for the nominal and the worst off-nominal unit (the paper's Figures 11 and 12)."""
+    shown = [s for s in run.shown if s.key.condition == run.identify_on][:2]
+    if not shown or not shown[0].observers:
+        raise NotShownError("no observer was run on the episodes that are shown")
+    known = list(shown[0].observers)
+    names = _paper(known) if paper else deployed_pair(known, run.deployed)
+    states = range(min(len(run.states), DRAWING.states)) if paper else run.hidden[:2]
+    blocks = [
+        _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
+        for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
+    ]
+    measured = " and ".join(words(c.name) for c in run.states if c.measured)
+    text = f"{_PAPER if paper else ''}Estimated from {measured} alone; errors are recorded minus estimated values."
+    return _figure(run, blocks, text)
 
 
-def steady_window(run: RunFolder, shown: Shown, n_samples: int) -> slice:
-    """Return a window at constant speed: in the longest stretch of the highest steady reference, else in the middle of the episode."""
-    size = min(n_samples, len(shown.time_s))
-    columns = reference_columns(run)
-    speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(len(shown.time_s))
-    start, stop = longest_steady(speed)
-    middle = (start + stop) // 2 if stop - start > size // 2 else len(shown.time_s) // 2
-    first = min(max(middle - size // 2, 0), len(shown.time_s) - size)
-    return slice(first, first + size)
+def other_condition(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the paper's pair in a condition that no model has seen (the paper's Figures 13 and 14)."""
+    shown = next((s for s in run.shown if s.key.condition != run.identify_on), None)
+    if shown is None or not shown.observers:
+        raise NotShownError("the recordings have one condition only")
+    pair = paper_pair(shown.observers)
+    names = pair or deployed_pair(list(shown.observers), run.deployed)
+    block = _observed(episode_title(shown.key), shown, names, range(min(len(run.states), DRAWING.states)))
+    text = _PAPER if pair else ""
+    text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
+    return _figure(run, [block], text)
 
 
-def longest_steady(speed: Array) -> tuple[int, int]:
-    """Return first and last sample of the longest stretch within 2 % of the highest speed; (0, 0) where nothing moves."""
-    return max(steady_stretches(speed), key=lambda r: r[1] - r[0], default=(0, 0))
+def _paper(names: Sequence[str]) -> list[str]:
+    pair = paper_pair(names)
+    if not pair:
+        raise NotShownError("this study has no observer of the paper's method; add mixed to synthesis.methods")
+    return pair
 
 
-def steady_stretches(speed: Array) -> list[tuple[int, int]]:
-    """Return all stretches within 2 % of the highest speed, each of one direction."""
-    top = float(np.max(np.abs(speed), initial=0.0))
-    if top == 0:
-        return []
-    found = []
-    for sign in (1, -1):
-        steady = sign * speed > 0.98 * top
-        edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
-        found += list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
-    return sorted(found)
+def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:
+    lines = {observer_label(n): (shown.observers[n], observer_look(n)) for n in names}
+    return Block(title, shown, lines, states)
 
 
-def overview_and_zoom(run: RunFolder, blocks: Sequence[tuple[str, Shown, Sequence[Strip]]], height_in: float) -> Figure:
-    """Draw whole episodes on the left and a zoom at constant speed on the right, one strip below the other."""
-    figure, axes = grid(sum(len(strips) for _, _, strips in blocks), 2, height_in, width_ratios=(1.4, 1))
+def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure, str]:
+    """Return the figure of some episodes of a run and its caption."""
+    signals = Signals.of(run)
+    text += " Shaded: the band around the gearbox frequency at top speed." if signals.band_hz else ""
+    return blocks_figure(signals, blocks), text
+
+
+def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
+    """Draw a row a state: the episode, a part of it, the error over time, and the error's power spectral density."""
+    figure, axes = grid(sum(len(block.states) for block in blocks), 4, 1.05, width_ratios=(1.2, 1, 1.2, 1))
     first = 0
-    for title, episode, strips in blocks:
-        panels = axes[first : first + len(strips)]
-        first += len(strips)
-        # some fifteen turns of a gearbox, for other plants an eighth of the episode
-        length_s = 300 * run.sample_period_s if run.calibrated else float(f"{episode.time_s[-1] / 8:.1g}")
-        window = steady_window(run, episode, round(length_s / run.sample_period_s))
-        for (full, zoom), strip in zip(panels, strips, strict=True):
-            draw_lines(full, episode.time_s, strip.lines, width=0.9)
-            draw_lines(zoom, episode.time_s, strip.lines, window, width=1.3)
-            if strip.near is not None:
-                clip_to(full, strip.lines[0][1], strip.near)
-                clip_to(zoom, strip.lines[0][1][window], 1.0)
-            else:
-                _clip_start(full, strip.lines)
-            shade(full, episode.time_s, window)
-        label_rows(
-            panels[:, 0],
-            [strip.channel for strip in strips],
-            [" error" if strip.near is None else "" for strip in strips],
-        )
-        hide_times(panels[:-1].ravel())
-        panels[0, 0].set_title(title)
-        panels[0, 1].set_title(f"{length_s:g} s of it" + (" at constant speed" if run.calibrated else ""))
-    label_below(axes[-1], "time (s)")
+    for block in blocks:
+        panels = axes[first : first + len(block.states)]
+        first += len(block.states)
+        window = steady_window(signals, block.shown)
+        for row, i in zip(panels, block.states, strict=True):
+            _draw_state(signals, row, block, i, window)
+        label_rows(panels[:, 0], [signals.channels[i] for i in block.states])
+        hide_times(panels[:-1, :3].ravel())
+        label_below(panels[-1, :3], "time (s)")
+        for column, title in ((0, block.title), (2, "error"), (3, "PSD of the error")):
+            panels[0, column].set_title(title)
+    label_below(axes[-1, 3:])
     figure.align_ylabels(axes[:, 0])
-    legend(figure, max(axes[:, 0], key=lambda panel: len(panel.get_legend_handles_labels()[0])))
+    legend(figure, axes[0, 0])
     return figure
 
 
-def _clip_start(axes: Axes, lines: Sequence[Line]) -> None:
-    """Keep the axis of errors near what they are after the first tenth: at the start an observer knows nothing yet."""
-    sizes = [np.abs(values[len(values) // 10 :]) for _, values, _ in lines]
-    largest = max((float(size.max()) for size in sizes if np.isfinite(size).all() and size.max() < 1e6), default=0.0)
-    if largest > 0:
-        axes.set_ylim(-1.5 * largest, 1.5 * largest)
+def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
+    """Draw one state of an episode in four panels."""
+    time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
+    near, start = _near(recorded), int(DRAWING.settled * len(recorded))
+    for panel, part in ((row[0], slice(None)), (row[1], window)):
+        draw_lines(panel, time_s[part], {"recorded": (recorded[part], TRUTH)})
+        for label, (values, look) in block.lines.items():
+            draw_lines(panel, time_s[part], {label: (_inside(values[part, i], near), look)})
+    row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
+    for label, (values, look) in block.lines.items():
+        error = recorded - values[:, i].astype(float)
+        if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
+            draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
+            freqs, density = error_spectrum(error, signals.sample_period_s)
+            row[3].plot(freqs[1:], density[1:], look.style, color=look.colour, lw=1.0)
+            frequency_axis(row[3], freqs, "", 4)
+    logarithmic(row[3])
+    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size=7)
+    if signals.band_hz is not None:
+        row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 
 
-def draw_lines(
-    axes: Axes, time_s: Array, lines: Sequence[Line], window: slice | None = None, width: float = 1.1
-) -> None:
-    """Draw lines over time, all of them or a window; what diverges is cut."""
-    part = slice(None) if window is None else window
-    for order, (label, values, look) in enumerate(lines):
-        x, y = thin(time_s[part], np.where(np.abs(values[part]) < 1e6, values[part], np.nan))
-        axes.plot(
-            x,
-            y,
-            look.style,
-            color=look.colour,
-            alpha=look.opacity,
-            label=label,
-            lw=width * look.weight,
-            zorder=2 + 0.1 * order,
-        )
-    axes.set_xlim(time_s[part][0], time_s[part][-1])
+def _near(recorded: Array) -> tuple[float, float]:
+    """Return the range in which lines are drawn: that of the recorded signal with a margin."""
+    low, high = float(recorded.min()), float(recorded.max())
+    room = 0.5 * max(high - low, np.finfo(float).tiny)
+    return low - room, high + room
 
 
-def clip_to(axes: Axes, values: Array, margin: float) -> None:
-    """Keep the vertical axis near the true signal, so that a diverging line does not hide the others."""
-    low, high = float(values.min()), float(values.max())
-    room = margin * max(high - low, 1e-12)
-    bottom, top = axes.get_ylim()
-    axes.set_ylim(max(bottom, low - room), min(top, high + room))
+def _inside(values: Array, limits: tuple[float, float]) -> Array:
+    """Return values with those outside of limits replaced by NaN, which ends a line."""
+    return np.where((values >= limits[0]) & (values <= limits[1]), values, np.nan)
 
 
-def label_rows(axes: Iterable[Axes], channels: Sequence[Channel], suffixes: Iterable[str] = repeat("")) -> None:
+def draw_lines(axes: Axes, time_s: Array, lines: Mapping[str, tuple[Array, Look]], width: float = 1.0) -> None:
+    """Draw lines over time, later ones in front."""
+    for label, (values, look) in lines.items():
+        x, y = thin(time_s, values)
+        axes.plot(x, y, look.style, color=look.colour, alpha=look.opacity, label=label, lw=width * look.weight)
+    axes.set_xlim(time_s[0], time_s[-1])
+
+
+def label_rows(axes: Iterable[Axes], channels: Sequence[Channel]) -> None:
     """Label the vertical axes with channel and unit of measure."""
-    for row, channel, suffix in zip(axes, channels, suffixes):  # noqa: B905 - suffixes may go on for ever
+    for row, channel in zip(axes, channels, strict=True):
         row.locator_params(axis="y", nbins=4)
-        lines = textwrap.wrap(f"{channel.name}{suffix}".replace("_", " "), LINE, break_long_words=False)[:2]
+        lines = [shorten(line, 14) for line in textwrap.wrap(words(channel.name), 14, break_long_words=False)[:2]]
         unit = readable_unit(channel.unit)
-        row.set_ylabel("\n".join([*(shorten(line, LINE) for line in lines), *([f"({unit})"] if unit else [])]))
+        row.set_ylabel("\n".join([*lines, *([f"({unit})"] if unit else [])]))
 
 
 def hide_times(rows: Iterable[Axes]) -> None:
@@ -181,6 +204,44 @@ def hide_times(rows: Iterable[Axes]) -> None:
         axes.tick_params(labelbottom=False)
 
 
-def shade(axes: Axes, time_s: Array, window: slice) -> None:
-    """Mark on an overview where its zoom lies."""
-    axes.axvspan(time_s[window][0], time_s[window][-1], color=Tone.GRID.light, lw=0, zorder=0.5)
+def references(channels: Sequence[Channel]) -> dict[str, int]:
+    """Return for every state the input column that is its reference, by the name ``target_<state>``."""
+    inputs = [c.name for c in channels if c.role is Role.INPUT]
+    states = [c.name for c in channels if c.role is Role.STATE]
+    return {name: inputs.index(f"target_{name}") for name in states if f"target_{name}" in inputs}
+
+
+def steady_window(signals: Signals, shown: Shown) -> slice:
+    """Return a window in the longest stretch of the highest steady reference, else in the middle of the episode."""
+    columns, samples = references(signals.channels), len(shown.time_s)
+    size = max(min(signals.window, samples), 2)
+    speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(samples)
+    start, stop = max(steady_stretches(speed), key=lambda r: r[1] - r[0], default=(0, 0))
+    middle = (start + stop) // 2 if stop - start > size // 2 else samples // 2
+    first = min(max(middle - size // 2, 0), samples - size)
+    return slice(first, first + size)
+
+
+def steady_stretches(speed: Array) -> list[tuple[int, int]]:
+    """Return all stretches within 2 % of the highest speed, each of one direction."""
+    top = float(np.max(np.abs(speed), initial=0.0))
+    stretches: list[tuple[int, int]] = []
+    for sign in (1, -1) if top else ():
+        steady = sign * speed > 0.98 * top
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
+        stretches += list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
+    return sorted(stretches)
+
+
+def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
+    """Draw estimates on the first held-out episode of the units behind the models."""
+    facts = models.facts
+    key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
+    batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
+    y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)
+    estimate = run_observer(observer, y, batch.inputs, batch.parameters or None)[:, 0]
+    time_s = np.arange(len(estimate)) * batch.sample_period_s
+    shown = Shown(key, time_s, batch.states[:, 0], batch.inputs[:, 0], {observer.name: estimate}, {})
+    channels = models.population.channels
+    block = _observed(episode_title(key), shown, [observer.name], range(shown.states.shape[1]))
+    return blocks_figure(Signals(channels, batch.sample_period_s, len(time_s) // 8), [block])

@@ -1,45 +1,20 @@
-"""Sections of the report, one file a section, first what was found, then where it comes from."""
+"""Sections of the report, from ``metrics.json`` alone: first what decides, then the evidence, which is folded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable
 
 from ..content import Section
-from ..run_folder import RunFolder
-from . import (
-    calibration,
-    deployment,
-    left_out,
-    making,
-    models,
-    observers,
-    other_conditions,
-    outliers,
-    recordings,
-    relift,
-    robustness,
-    synthesis,
-    trust,
-    uncertainty,
-    units,
-)
+from ..facts import Facts
+from .certificates import certificates
+from .deployment import deployment
+from .errors import errors, left_out, other_conditions
+from .evidence import calibration, models, recordings, robustness, run, spread, uncertainty
+from .units import units
 
-Metrics = Mapping[str, Any]
-
-Maker = Callable[[RunFolder, Metrics], Section | None]
-SECTIONS: tuple[Maker, ...] = (deployment.section, observers.section, units.section, trust.section)
+Maker = Callable[[Facts], Section | None]
+FIRST: tuple[Maker, ...] = (deployment, errors, units)
 EVIDENCE: tuple[Maker, ...] = (
-    recordings.section,
-    calibration.section,
-    models.section,
-    uncertainty.section,
-    synthesis.section,
-    relift.section,
-    outliers.section,
-    observers.estimates,
-    left_out.section,
-    robustness.section,
-    other_conditions.section,
-    making.section,
+    *(recordings, calibration, models, spread, uncertainty),
+    *(certificates, robustness, left_out, other_conditions, run),
 )

@@ -1,5 +1,5 @@
 "use strict";
-// The page is complete without this: it adds sorting, filtering, names under the pointer, and opens what a link leads to.
+// The page is complete without this: it adds sorting, filtering, names of units on hover, zoom on click, and opens what a link leads to.
 (() => {
   const all = (selector, root = document) => [...root.querySelectorAll(selector)];
   document.documentElement.className = "js";
@@ -53,12 +53,19 @@
 
   const tip = Object.assign(document.createElement("div"), { className: "tip", hidden: true });
   document.body.append(tip);
+  let marked = "";
+  const mark = unit => {
+    if (unit === marked) return;
+    all(".near").forEach(one => one.classList.remove("near"));
+    if (unit) all("svg [data-unit]").forEach(one => one.classList.toggle("near", one.dataset.unit === unit));
+    marked = unit;
+  };
   for (const picture of all("figure svg")) {
-    let marked = null;
+    picture.parentElement.onclick = () => picture.classList.toggle("zoomed");
     picture.onpointermove = event => {
       const near = [[0, 0], [0, 3], [0, -3], [3, 0], [-3, 0]].flatMap(([x, y]) => document.elementsFromPoint(event.clientX + x, event.clientY + y));
       const found = near.map(one => one.closest("[data-unit]")).find(Boolean) ?? null;
-      if (found !== marked) { marked?.classList.remove("near"); found?.classList.add("near"); marked = found; }
+      mark(found ? found.dataset.unit : "");
       tip.hidden = !found;
       if (found) {
         tip.textContent = found.dataset.unit;
@@ -66,7 +73,7 @@
         tip.style.top = `${event.clientY + 14}px`;
       }
     };
-    picture.onpointerleave = () => { tip.hidden = true; marked?.classList.remove("near"); marked = null; };
+    picture.onpointerleave = () => { tip.hidden = true; mark(""); };
   }
 
   if (window.IntersectionObserver) {

@@ -2,76 +2,57 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from ...core.artifacts import load_artifact, read_json
-from ...report.caveats import confounded_text
+from ...report.facts import Facts
+from ...report.verdict import judge
 from ..config import Stage
 from ..engine.run_folder import open_finished
 from ..pipeline import RunResult
 
 
 def summary_lines(result: RunResult) -> list[str]:
-    """Return what was found and where the report is."""
-    metrics = result.metrics
-    study = metrics["study"]
-    lines = [
-        f"{study['units']} units, conditions {', '.join(study['conditions'])}, {metrics['timing_s']['total']:.1f} s in all"
-    ]
-    lines += [f"look at: {alert}" for alert in study.get("alerts", ())]
-    lines += [*confounded_text(metrics), *observer_lines(result)]
-    flagged = sorted({f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]})
-    if "outliers" in metrics:
-        lines.append(f"flagged as outliers: {', '.join(flagged) if flagged else 'none'}{_silent(metrics['outliers'])}")
-    report = result.folder / "report.html"
-    lines.append(f"report: {report}" if report.exists() else f"results: {result.folder}")
-    return lines
+    """Return the verdict, three numbers, and where the report is."""
+    facts, report = Facts(result.metrics), result.folder / "report.html"
+    if not facts.deployed:
+        units = f"{facts.study['units']} units: no observer has been designed yet"
+        return [units, *(f"check: {alert}" for alert in facts.study.get("alerts", ())), f"results: {result.folder}"]
+    verdict = judge(facts)
+    numbers = [f"{n.label} {n.value} {n.unit} ({n.notes[-1]})" for n in verdict.numbers]
+    lines = [f"{verdict.status.value}: {verdict.sentence}", *(["; ".join(numbers)] if numbers else [])]
+    return [*lines, f"report: {report}" if report.exists() else f"results: {result.folder}"]
 
 
-def _silent(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return how many scores say nothing about their unit."""
-    silent = sum(row.get("status") in ("not enough data", "cannot tell") for row in rows)
-    return f"; {silent} of {len(rows)} scores say nothing about their unit" if silent else ""
-
-
-def observer_lines(result: RunResult) -> list[str]:
-    """Return one line an observer: mean error of all units in the condition that was identified on."""
-    metrics = result.metrics
-    rows = [
-        r
-        for r in metrics.get("evaluation", [])
-        if r["condition"] == metrics["study"]["identify_on"] and r["role"] != "outlier"
-    ]
-    channels = list(dict.fromkeys(r["channel"] for r in rows))
-    if not rows:
+def ranking(facts: Facts) -> list[str]:
+    """Return one line an observer, the smallest error of the hidden channels first."""
+    table = facts.table
+    if table is None:
         return []
-    width = max(len(r["observer"]) for r in rows)
-    wide = {c: max(12, len(c) + 2) for c in channels}
-    lines = [
-        "mean error over all units, in percent of the largest value:",
-        f"{'':<{width}}  " + "".join(f"{c:>{wide[c]}}" for c in channels),
-    ]
-    for name in dict.fromkeys(r["observer"] for r in rows):
-        means = []
-        for channel in channels:
-            values = [r["error_percent"] for r in rows if r["observer"] == name and r["channel"] == channel]
-            known = "diverged" if None in values else f"{sum(values) / max(len(values), 1):.4g}"
-            means.append(f"{known if values else '–':>{wide[channel]}}")  # some observers estimate one channel only
-        mark = "  <- deployed" if name == metrics["study"].get("deployed") else ""
-        lines.append(f"{name:<{width}}  {''.join(means)}{mark}")
+    hidden = table.hidden(facts.measured)
+    names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
+    width, wide = max(map(len, names)), {c: max(12, len(c) + 2) for c in hidden}
+    head = f"{'':<{width}}  " + "".join(f"{c:>{wide[c]}}" for c in hidden)
+    lines = ["observers by mean error on held-out episodes, percent of the largest value:", head]
+    for name in names:
+        cells = [table.cells[name].get(c) for c in hidden]
+        texts = ["–" if c is None else "diverged" if c.mean is None else f"{c.mean:.4g}" for c in cells]
+        mark = "  <- deployed" if name == facts.deployed else ""
+        lines.append(
+            f"{name:<{width}}  " + "".join(f"{t:>{wide[c]}}" for t, c in zip(texts, hidden, strict=True)) + mark
+        )
     return lines
 
 
 def list_run(run: Path) -> list[str]:
-    """Return what was studied, which stages are done, which observers there are by name, and how well they do."""
+    """Return what was studied, which stages are done, the observers in the order of their errors, and the verdict."""
     with open_finished(run) as (config, store):
         records = {stage.value: store.record(stage) for stage in Stage}
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.is_kept("metrics.json"):
-            return lines + summary_lines(RunResult(store.folder, read_json(store.path("metrics.json")), ()))
+            result = RunResult(store.folder, read_json(store.path("metrics.json")), ())
+            return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]
             lines += [f"observers: {', '.join(names)}"]

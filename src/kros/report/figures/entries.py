@@ -1,0 +1,97 @@
+"""Residuals of every unit, entry by entry, with their bound and its fit."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ...identify import ModelSet
+from ...uncertainty import Form, UncertainModel
+from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
+from ..names import model_label, shorten, words
+from ..theme import DRAWING, Tone
+
+Names = tuple[Sequence[str], Sequence[str]]
+_OUTPUT_ROWS = (Form.ADDITIVE, Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+_OUTPUT_COLUMNS = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_ADDITIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+
+
+def entry_names(form: Form, models: ModelSet) -> Names:
+    """Return the signals behind the rows and the columns of a form's residual."""
+    outputs, inputs = models.lifting.names, models.inputs
+    return outputs if form in _OUTPUT_ROWS else inputs, outputs if form in _OUTPUT_COLUMNS else inputs
+
+
+def short(name: str) -> str:
+    """Return a signal's name for a title; of a formula the outer function."""
+    text = name if len(name) <= 16 or "(" not in name else f"{name.partition('(')[0]}(…)"
+    return shorten(words(text), 18)
+
+
+def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
+    """Return the residuals of all units relative to the weights of an uncertain model."""
+    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.points)]
+    scale = model.input_scale / model.output_scale[:, None]
+    responses = models.systems(model.unit_ids).frequency_response(freqs) * scale
+    nominal_response = model.scaled_nominal().frequency_response(freqs)
+    dt, units, nominal = model.sample_period_s, model.unit_ids, model.nominal_id
+    return unit_residuals(
+        model.form, nominal_response, responses, model.weight, freqs, dt, unit_ids=units, nominal_id=nominal
+    )
+
+
+def differing(residuals: UnitResiduals) -> list[int]:
+    """Return the rows of the units that the weights bound, without the nominal one, whose residual is zero."""
+    return [k for k in residuals.rows(inside=True) if residuals.unit_ids[k] != residuals.nominal_id]
+
+
+def entries_figure(
+    residuals_of: Mapping[str, UnitResiduals], names: Mapping[str, Names], alarm: str | None = None
+) -> Figure:
+    """Draw entries of all units with their bound and its fit, models side by side or one below the other."""
+    sizes = {
+        name: (min(r.largest.shape[1], DRAWING.states), min(r.largest.shape[2], DRAWING.states))
+        for name, r in residuals_of.items()
+    }
+    together = sum(columns for _, columns in sizes.values()) <= DRAWING.states
+    rows = (max if together else sum)(p for p, _ in sizes.values())
+    columns = (sum if together else max)(m for _, m in sizes.values())
+    figure, axes = grid(rows, columns, 1.45, sharex=True, sharey=True)
+    for panel in axes.ravel():
+        panel.axis("off")
+    top, left = 0, 0
+    for name, residuals in residuals_of.items():
+        p, m = sizes[name]
+        _draw_block(axes[top : top + p, left : left + m], residuals, names[name], model_label(name), alarm)
+        left, top = (left + m, top) if together else (left, top + p)
+    legend(figure, axes[0, 0])
+    return figure
+
+
+def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, alarm: str | None) -> None:
+    """Draw the entries of one kind of model."""
+    inside, freqs = differing(residuals), residuals.freqs_hz
+    units = [residuals.unit_ids[k] for k in inside]
+    levels, bound, fitted = decibel(residuals.entries), decibel(residuals.largest), decibel(residuals.entry_weights)
+    for i, row in enumerate(block):
+        for j, panel in enumerate(row):
+            panel.axis("on")
+            lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units", units)
+            panel.plot(freqs, bound[:, i, j], color=Tone.BLUE.light, lw=2.6, alpha=0.45, label="largest")
+            panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, lw=1.1, label="fitted weight")
+            _mark_unit(panel, residuals, levels[..., i, j], alarm)
+            frequency_axis(panel, freqs, "", 4)
+            order = f"order {residuals.entry_orders[i, j]}"
+            note(panel, order, (0, 0), (3, 3), size=7, color=Tone.SOFT.light)
+        row[0].set_ylabel(f"to {short(names[0][i])}\n(dB)")
+    for j, panel in enumerate(block[0]):
+        panel.set_title(f"{label},\nfrom {short(names[1][j])}")
+    label_below(block[-1])
+
+
+def _mark_unit(axes: Axes, residuals: UnitResiduals, levels: Array, alarm: str | None) -> None:
+    """Draw the unit that stands out in red."""
+    if alarm in residuals.unit_ids:
+        line = levels[residuals.unit_ids.index(str(alarm))]
+        axes.plot(residuals.freqs_hz, line, color=Tone.ALARM.light, lw=1.5, label=f"unit {alarm}")

@@ -1,1 +1,0 @@
-"""Figures of errors and estimates of the observers."""

@@ -1,0 +1,68 @@
+"""Outlier scores of all units beside the threshold, with their range over all nominal units, a row a condition."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ...data.population import natural_key
+from ...uncertainty import OutlierModel, OutlierScore
+from ..canvas import Axes, Figure, grid, name_units, note, units_axis
+from ..names import condition_label, number, some_of, words
+from ..run_folder import RunFolder
+from ..theme import Tone
+
+
+def scores(run: RunFolder) -> tuple[Figure, str]:
+    """Draw one point a unit with its range, flagged ones in the colour of alarm."""
+    models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
+    first = next(iter(models.values()))
+    flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
+    about = (
+        f"Excess of the largest {words(first.form.value)} residual of a unit over those of all others: median over all "
+        "nominal units, and as a bar the range over them"
+    )
+    rate = number(100 * first.false_alarm_rate, 2)
+    text = f"{about}. The threshold has a false-alarm rate of {rate} % for a good unit"
+    text += "; with so few units the rate rests on an exponential tail. " if first.extrapolated else ". "
+    text += f"Above it: {some_of(flagged)}." if flagged else "No unit is above it."
+    if not any(np.isfinite(m.threshold_db) for m in models.values()):
+        text = f"{about}. There is no threshold with fewer than eight units."
+    return scores_figure(models), text
+
+
+def scores_figure(models: Mapping[str, OutlierModel] | OutlierModel) -> Figure:
+    """Draw scores with their ranges, a column a condition."""
+    conditions = {"": models} if isinstance(models, OutlierModel) else models
+    units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
+    figure, axes = grid(1, len(conditions), 1.9, sharey=True)
+    for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):
+        _panel(panel, model, units)
+        panel.set_title(condition_label(condition))
+        units_axis(panel, units)
+    axes[0, 0].set_ylabel("score (dB)")
+    return figure
+
+
+def referred_range(score: OutlierScore) -> tuple[float, float]:
+    """Return the range of a score over the nominal units, relative to the threshold as the score itself is, dB."""
+    shift = score.score_db - score.excess_db
+    return score.lowest_db + shift, score.highest_db + shift
+
+
+def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
+    places, highest = {u: i for i, u in enumerate(units)}, max(model.scores, key=lambda s: s.score_db)
+    for score in model.scores:
+        tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
+        low, high = referred_range(score)
+        axes.plot([place, place], [low, high], color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
+        (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
+        name_units(point, [score.unit])
+        if score.outlier or score is highest:
+            note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
+    if np.isfinite(model.threshold_db):
+        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=0.9, ls="--")
+        text = f"threshold, {number(model.threshold_db)} dB"
+        note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
+    axes.margins(y=0.15)

@@ -1,1 +1,0 @@
-"""Figures of units that do not belong to the batch."""

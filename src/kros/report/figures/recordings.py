@@ -1,0 +1,145 @@
+"""Figures of the recordings: signals, the tracking error's spectrum, and the phase of every unit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...core.errors import ConfigError
+from ...data.population import OUTLIERS, EpisodeKey, Population, Role
+from ...evaluate.errors import error_spectrum
+from ...identify import PhaseCalibration
+from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
+from ..names import Look, episode_title, minus, some_of, squared, words
+from ..run_folder import NotShownError, RunFolder, Shown
+from ..theme import DRAWING, Tone
+from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
+
+_RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.55)
+
+
+def recorded_episodes(run: RunFolder) -> list[Shown]:
+    """Return one held-out episode of one unit in every condition, the condition of the models first."""
+    try:
+        unit = run.shown[0].key.unit
+        episodes = [s for s in run.shown if s.key.unit == unit]
+    except NotShownError:
+        groups = run.facts["groups"]
+        unit = next((u for u, group in groups.items() if group != OUTLIERS), next(iter(groups)))
+        keys = [EpisodeKey(*row) for row in reversed(run.facts["test"])]
+        episodes = [_read(run, key) for key in {k.condition: k for k in keys if k.unit == unit}.values()]
+    return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
+
+
+def _read(run: RunFolder, key: EpisodeKey) -> Shown:
+    states, inputs = run.population.read_parts(key)
+    return Shown(key, np.arange(len(states)) * run.sample_period_s, states, inputs, {}, {})
+
+
+def signals(run: RunFolder) -> tuple[Figure, str]:
+    """Draw one episode in at most two conditions, side by side, with references."""
+    shown, channels, targets = recorded_episodes(run)[:2], run.states[:5], references(run.channels)
+    figure, axes = grid(len(channels), len(shown), 1.1, sharey="row", sharex="col")
+    for column, episode in zip(axes.T, shown, strict=True):
+        for i, channel in enumerate(channels):
+            if channel.name in targets:
+                reference = episode.inputs[:, targets[channel.name]]
+                draw_lines(column[i], episode.time_s, {"reference": (reference, _REFERENCE)})
+            draw_lines(column[i], episode.time_s, {"recorded": (episode.states[:, i], _RECORDED)})
+        column[0].set_title(episode_title(episode.key))
+        hide_times(column[:-1])
+    label_rows(axes[:, 0], channels)
+    label_below(axes[-1], "time (s)")
+    figure.align_ylabels(axes[:, 0])
+    legend(figure, axes[0, 0])
+    return figure, "The same unit in two conditions." if len(shown) == 2 else ""
+
+
+def population_figure(population: Population) -> Figure:
+    """Draw all channels of the first episode of a population, inputs in gold."""
+    if not population.episodes:
+        raise ConfigError("Plot: the population has no episodes; read some first.")
+    key = population.episodes[0]
+    values = population.read(key)
+    figure, axes = grid(len(population.channels), 1, 1.1, sharex=True)
+    time_s = np.arange(len(values)) * population.sample_period_s
+    for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
+        draw_lines(panel, time_s, {channel.name: (line, _RECORDED if channel.role is Role.STATE else _REFERENCE)})
+    label_rows(axes[:, 0], population.channels)
+    axes[0, 0].set_title(episode_title(key))
+    label_below(axes[-1], "time (s)")
+    return figure
+
+
+def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
+    spec = run.calibration.spec
+    figure, axes = grid(1, 1, 2.3)
+    panel, frequency = axes[0, 0], 0.0
+    for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
+        freqs, density, frequency = _tracking(run, shown)
+        panel.plot(freqs[1:], density[1:], color=tone.light, label=episode_title(shown.key))
+    logarithmic(panel)
+    top = 0.5 / run.sample_period_s
+    for multiple in range(1, min(6, int(top / frequency)) + 1):
+        place = multiple * frequency
+        panel.axvline(place, color=Tone.SOFT.light, lw=0.7, ls=":", zorder=1)
+        note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
+    panel.set_xlim(0, min(top, 6.6 * frequency))
+    panel.set_xlabel("frequency (Hz)")
+    unit = next(c.unit for c in run.channels if c.name == spec.measured)
+    panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
+    legend(figure, panel)
+    text = f"{words(spec.reference)} minus {words(spec.measured)} at the highest speed. Dotted: {frequency:.3g} Hz, "
+    return figure, text + f"which is {spec.ratio:g} times the speed, and its multiples."
+
+
+def _tracking(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:
+    """Return frequencies, density and the disturbance's frequency."""
+    spec, names = run.calibration.spec, [c.name for c in run.channels]
+    values = np.hstack([shown.states, shown.inputs]).astype(float)
+    reference, measured = values[:, names.index(spec.reference)], values[:, names.index(spec.measured)]
+    settle = round(spec.settle * len(reference))
+    stretches = [slice(a + settle, b) for a, b in steady_stretches(reference)]
+    segment = min(DRAWING.segment, max((s.stop - s.start for s in stretches), default=0))
+    if segment < 64:
+        raise NotShownError(f"{shown.key} has no stretch of constant speed that is long enough")
+    used = [s for s in stretches if s.stop - s.start >= segment]
+    spectra = [error_spectrum((reference - measured)[s], run.sample_period_s, segment) for s in used]
+    density = np.average([d for _, d in spectra], axis=0, weights=[s.stop - s.start for s in used])
+    return spectra[0][0], density, spec.ratio * float(np.abs(reference).max()) / (2 * np.pi)
+
+
+def phase(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the phase calibration of a run (Appendix B)."""
+    calibration = run.calibration
+    lags = np.degrees([c.lag_rad for u, c in calibration.units.items() if u not in run.set_aside])
+    weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
+    mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
+    text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
+    text += f" Concentration below {DRAWING.concentrated:g}: {some_of(weak)}." if weak else ""
+    return phase_figure(calibration, run.set_aside), text
+
+
+def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = None) -> Figure:
+    """Draw phase, lag and concentration of every unit; units that are set aside are drawn hollow."""
+    units = list(calibration.units)
+    values = [calibration.units[u] for u in units]
+    figure, axes = grid(1, 3, 1.9)
+    columns = (
+        (np.degrees([v.phase_rad for v in values]), "phase (°)"),
+        (np.degrees([v.lag_rad for v in values]), "lag (°)"),
+        (np.array([v.concentration for v in values]), "concentration"),
+    )
+    places, inside = np.arange(len(units)), np.array([u not in (set_aside or []) for u in units])
+    for (column, label), panel in zip(columns, axes[0], strict=True):
+        for chosen, look in ((inside, {"ms": 4, "mec": "none"}), (~inside, {"ms": 5, "mfc": "none", "mew": 1.2})):
+            (drawn,) = panel.plot(places[chosen], column[chosen], "o", color=Tone.BLUE.light, **look)
+            name_units(drawn, [u for u, mark in zip(units, chosen, strict=True) if mark])
+        panel.set_title(label)
+        units_axis(panel, units)
+    axes[0, 0].set_ylim(-12, 372)
+    axes[0, 0].set_yticks([0, 90, 180, 270, 360])
+    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=0.8, ls="--")
+    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=0.8, ls="--")
+    axes[0, 2].set_ylim(min(0.7, columns[2][0].min() - 0.02), 1.03)
+    return figure

@@ -1,1 +1,0 @@
-"""Figures of correction filters and what is certified about them."""

@@ -1,0 +1,196 @@
+"""Figures of residuals and weights: six forms, weights over the optimal bound, entries of single units."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ...core.errors import ConfigError
+from ...identify import ModelSet
+from ...uncertainty import Cover, Form, UncertainModel, bounds
+from ...uncertainty.quantify import UncertainModels
+from ...uncertainty.unit_residuals import UnitResiduals
+from ..canvas import (
+    Array,
+    Axes,
+    Figure,
+    decibel,
+    frequency_axis,
+    grid,
+    label_below,
+    legend,
+    line_over_shade,
+    lines_of_units,
+    note,
+)
+from ..names import best_models, model_label, number, words
+from ..run_folder import RunFolder
+from ..theme import DRAWING, HUES, Tone
+from .entries import beside, differing, entries_figure, entry_names
+
+FORM_TONES = {
+    Form.ADDITIVE: Tone.INK,
+    Form.INPUT_MULTIPLICATIVE: Tone.SKY,
+    Form.OUTPUT_MULTIPLICATIVE: Tone.GOLD,
+    Form.INVERSE_ADDITIVE: Tone.GREY,
+    Form.INVERSE_INPUT_MULTIPLICATIVE: Tone.BLUE,
+    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Tone.ORANGE,
+}
+_PUBLISHED = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)  # the input forms agree for tall plants
+_INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
+
+
+def forms(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
+    chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
+    published = {n: published_bounds(m, run.models[n]) for n, m in chosen.items() if n in run.models and is_tall(m)}
+    used = words(next(iter(chosen.values())).form.value)
+    text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
+    text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
+    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
+    for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
+        draw_forms(panel, model)
+        for form, (freqs, bound) in published.get(name, {}).items():
+            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
+        panel.set_title(model_label(name))
+    axes[0, 0].set_ylabel("largest residual (dB)")
+    legend(figure, axes[0, 0], 3)
+    return figure, text
+
+
+def is_tall(model: UncertainModel) -> bool:
+    """Tell whether there are more outputs than inputs, where the published output forms contain the identity."""
+    return len(model.output_scale) > len(model.input_scale)
+
+
+def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:
+    """Return frequencies and bounds of the output forms as published."""
+    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.frequencies)]
+    response = models.scaled_responses(freqs, model.unit_ids)
+    rows = {form: model.nominals.get(form) for form in _PUBLISHED}
+    nominals = {f: model.unit_ids.index(unit) if unit in model.unit_ids else 0 for f, unit in rows.items()}
+    return {f: (freqs, bounds(f, response, paper=True, nominals=[row])[0]) for f, row in nominals.items()}
+
+
+def draw_forms(axes: Axes, model: UncertainModel) -> None:
+    """Draw the bounds of all forms over frequency, the form in use thick."""
+    for form, bound in model.bounds.items():
+        width, label = 2.4 if form is model.form else 1.2, words(form.value)
+        style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
+        axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
+    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
+    frequency_axis(axes, model.freqs_hz)
+
+
+def weights(run: RunFolder) -> tuple[Figure, str]:
+    """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
+    chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
+    figure, axes = grid(len(chosen), 3, 2.0, sharex=True)
+    for row, (name, model) in zip(axes, chosen.items(), strict=True):
+        _weights_row(row, model, run.models[name])
+        ratio_panel(row[2], run.unit_residuals[name])
+        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
+        panel.set_title(title)
+    label_below(axes[-1])
+    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
+    return figure, (
+        "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free "
+        f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
+    )
+
+
+def _weights_row(row: Sequence[Axes], model: UncertainModel, models: ModelSet | None) -> None:
+    """Draw left weights and right weights."""
+    names = models.inputs if models is not None and model.form in _INPUT_SIDE else ()
+    fitted = model.weight.magnitudes(model.freqs_hz)
+    cover = in_gauge(model.cover, fitted)
+    _side(row[0], model.freqs_hz, fitted.left, cover.left, names)
+    _side(row[1], model.freqs_hz, fitted.right, cover.right, names)
+
+
+def in_gauge(cover: Cover, other: Cover) -> Cover:
+    """Return a cover with the scale between left and right of another: equal means of right entries in dB."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = np.exp((np.log(other.right) - np.log(cover.right)).mean(axis=1, keepdims=True))
+    scale = np.where(np.isfinite(scale) & (scale > 0), scale, 1.0)
+    return Cover(cover.left / scale, cover.right * scale)
+
+
+def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: Sequence[str]) -> None:
+    """Draw the entries of one weight, each with its name."""
+    columns = range(magnitudes.shape[1])
+    labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
+    for i, tone in zip(columns, HUES, strict=False):
+        line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
+        note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
+    frequency_axis(axes, freqs_hz, "", 4)
+    low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
+    axes.set_ylim(low, high + 0.13 * (high - low) * len(columns))
+
+
+def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
+    """Draw every unit relative to the weights, dB, the largest one dark; the dashed line is what the weights allow."""
+    rows, freqs = differing(residuals), residuals.freqs_hz
+    levels = decibel(residuals.ratio)[rows]
+    names = [residuals.unit_ids[k] for k in rows]
+    lines_of_units(axes, freqs, levels, Tone.BLUE.light, "units", names)
+    first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
+    axes.plot(freqs, levels[first], color=Tone.INK.light, lw=1.1)
+    note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
+    axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
+    frequency_axis(axes, freqs, "", 4)
+
+
+def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
+    """Draw residuals entry by entry with their fitted weights (the paper's Figure 8 as published)."""
+    chosen = {n: run.unit_residuals[n] for n in best_models(run.unit_residuals)}
+    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
+    first = next(iter(chosen.values()))
+    text = f"Magnitudes of the entries of all {words(first.form.value)} residuals relative to unit {first.nominal_id}. "
+    excess = [f"{number(r.entry_excess)} ({model_label(n)})" for n, r in chosen.items() if r.entry_excess > 1]
+    text += "Bounds of entries do not bound a full perturbation"
+    text += f": σmax(W⁻¹E) reaches {' and '.join(excess)}." if excess else "."
+    return entries_figure(chosen, names), text
+
+
+def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
+    """Draw the residual of the highest-scoring unit beside those of the others (the paper's Figure 15)."""
+    residuals = {name.partition("@")[0]: one for name, one in run.others.items()}
+    first = next(iter(residuals.values()))
+    unit = first.outside[0]
+    chosen = {n: residuals[n] for n in best_models(residuals)}
+    names = {n: entry_names(r.form, run.models[n]) for n, r in chosen.items()}
+    text = f"Entries of the {words(first.form.value)} residuals relative to unit {first.nominal_id}, weights fitted to "
+    return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
+
+
+def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
+    """Draw forms and weights of an uncertain model, and with its models every unit relative to the weights."""
+    if entries:
+        if models is None:
+            raise ConfigError("Plot of an uncertain model: entries need models= the ModelSet that it was made of.")
+        return entries_figure({models.name: beside(model, models)}, {models.name: entry_names(model.form, models)})
+    figure, axes = grid(2, 2, 2.4, sharex=True)
+    draw_forms(axes[0, 0], model)
+    legend(figure, axes[0, 0], 3)
+    _weights_row(axes[1], model, models)
+    if models is None:
+        axes[0, 1].remove()
+    else:
+        ratio_panel(axes[0, 1], beside(model, models))
+        axes[0, 1].set_title("units relative to the weights (dB)")
+    axes[0, 0].set_title(f"largest residual (dB), nominal {model.nominal_id}")
+    axes[1, 0].set_title("left weight (dB)")
+    axes[1, 1].set_title("right weight (dB)")
+    label_below(axes[1])
+    return figure
+
+
+def sets_figure(models: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
+    """Draw the uncertain model of one kind, the first by default."""
+    name = kind or next(iter(models.sets))
+    if name not in models.sets:
+        raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
+    return uncertain_figure(models.sets[name], models.models.models(name), entries)

@@ -1,1 +1,0 @@
-"""Figures of residuals, their bounds and the weights."""

@@ -1,0 +1,89 @@
+"""What is certified about every observer, under which assumptions, and how it was recomputed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ...core.linalg import radius_text
+from ..content import Column, Section, Table, build
+from ..error_tables import ErrorCell
+from ..facts import Facts
+from ..names import BASELINES, axis_label, minus, observer_label, split_observer
+
+_TEXT = (
+    "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
+    "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the "
+    "recorded power in every band of frequency, beside the worst RMS error on held-out episodes. At run time: a bound "
+    "on the gain from the model's one-step residual to the error, with the state re-lifted at every step. The "
+    "estimator has no model: its bound for recorded signals is the largest error on a unit left out of its regression."
+)
+_ASSUMED = (
+    "The recorded units represent those to come: another batch and wear are not covered.",
+    "The recorded signals depended on no estimate: the certificates do not hold if a controller uses the estimate.",
+    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form.",
+    "The recorded signals: residuals have at most the recorded power in every band of frequency.",
+    "Errors are those relative to the recorded sensors, unless the true signal is known.",
+)
+_RECOMPUTED = (
+    "Errors are evaluated on held-out episodes that are used nowhere else.",
+    "Norms are recomputed after every solver: H2 by Lyapunov equations, H∞ by the bounded-real bisection.",
+    "Weights are verified on the responses of every unit at all frequencies.",
+    "Every artifact has a checksum; the same recordings and settings give the same bytes.",
+)
+
+
+def certificates(facts: Facts) -> Section | None:
+    """Return certificates, assumptions and reasons; None where no observer was designed."""
+    if not facts.observers:
+        return None
+    assumed = facts.entry.get("assumptions")
+    more = [f"“{facts.label}” at run time: {'; '.join(assumed)}."] if assumed else []
+    lists = [("Assumptions", [*_ASSUMED, *more]), ("How it is verified", _RECOMPUTED)]
+    tables = [_table(facts), _reasons(facts.observers)]
+    return Section("certificates", "Certificates", [_TEXT], tables=tables, lists=lists)
+
+
+def _table(facts: Facts) -> Table | None:
+    """Return one row an observer with a model."""
+    entries = {n: e for n, e in facts.observers.items() if e.get("status") != "failed" and split_observer(n)[0]}
+    rows, errors = list(entries.values()), facts.tables[0].cells if facts.tables else {}
+    robust = [split_observer(n)[1] not in BASELINES for n in entries]  # a baseline's optimum bounds no worst case
+    bounds = [e.get("lower_bound") or None if r else None for e, r in zip(rows, robust, strict=True)]
+    gaps = [e.get("gap_percent") if b else None for e, b in zip(rows, bounds, strict=True)]
+    radii = [e.get("spectral_radius_max") for e in rows]
+    columns = [
+        Column("observer", [observer_label(name) for name in entries]),
+        Column("states of the filter", [e.get("order") for e in rows]),
+        Column("spectral radius", [None if r is None else minus(radius_text(r)) for r in radii]),
+        Column("H2 norm at most", [e.get("worst_case_h2") for e in rows], "set of plants"),
+        Column("lower bound", bounds, "set of plants"),
+        Column("gap (%)", gaps, "set of plants"),
+    ]
+    for channel in dict.fromkeys(c for e in rows for c in e.get("set_bound") or {} if c not in facts.measured):
+        worst = [errors.get(n, {}).get(channel, ErrorCell()).worst_rms for n in entries]
+        group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
+        columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in rows], group))
+        columns.append(Column("worst RMS error", worst, group))
+    columns += [
+        Column("gain at most", [e.get("relift_gain") for e in rows], "at run time"),
+        Column("losses certified", [e.get("dropout_certified") for e in rows], "at run time"),
+    ]
+    return build("Certificates of all observers", columns, facts.label, sortable=True)
+
+
+def _reasons(entries: Mapping[str, Mapping[str, Any]]) -> Table | None:
+    """Return why an observer could not be designed or certified; observers with the same reason share a row."""
+    reasons: dict[tuple[str, str], list[str]] = {}
+    for name, entry in entries.items():
+        first = "not designed" if entry.get("status") == "failed" else "set of plants"
+        for kind, key in ((first, "reason"), ("recorded signals", "set_reason"), ("at run time", "relift_reason")):
+            if entry.get(key):
+                text = "; ".join(dict.fromkeys(entry[key].split("; ")))
+                reasons.setdefault((kind, text), []).append(observer_label(name))
+    columns = [
+        Column("observer", ["; ".join(names) for names in reasons.values()]),
+        Column("without", [kind for kind, _ in reasons]),
+        Column("reason", [text for _, text in reasons]),
+    ]
+    return build("Without a certificate, and why", columns, prose=True, folded=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, MACHINES, apart, drive, in_python, moving, replaced, samples, watched
+from machines import LIMITS, MACHINES, apart, drive, filters, in_python, samples, watched
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c
@@ -73,7 +73,7 @@ def test_a_machine_that_is_told_its_condition(precision, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", ["lifted", "limits", "through the input", "replaced"])
+@pytest.mark.parametrize("kind", ["lifted", "limits", "through the input", "filter bank"])
 def test_a_parameter_that_follows_the_machine(kind, tmp_path):
     observer, (y, u) = MACHINES[kind](), samples(800)
     wanted, status = in_python(observer, y, u, "phase")
@@ -164,7 +164,7 @@ def test_everything_compiles_without_a_warning(precision, tmp_path):
 @needs_compiler
 def test_the_numerical_error_on_held_out_recordings(tmp_path):
     """Beside the truth that is known; columns that cancel, a reference's and a measurement's, cost single precision nothing."""
-    observer, (y, u) = replace(replaced(), seen=None), samples(3000, faults=False)
+    observer, (y, u) = replace(filters(), seen=None), samples(3000, faults=False)
     A, B = observer.A.copy(), observer.B.copy()
     A[1:5, 0], B[1:5, 0] = 900.0 + A[1:5, 0], -900.0
     controller = replace(observer.controller, D=A[:, :1])
@@ -184,7 +184,7 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
 @pytest.mark.skipif(bool(missing_tools()), reason="the tools for a Cortex-M4F are not on the PATH")
 def test_the_selftest_passes_on_a_board(tmp_path):
     found = json.loads(
-        (export_c(replaced(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text()
+        (export_c(filters(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text()
     )
     assert found["cortex_m4f"]["selftest"] == 0
     assert found["cortex_m4f"]["state"] == found["state_bytes"]
@@ -195,7 +195,7 @@ def test_the_selftest_passes_on_a_board(tmp_path):
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")
 def test_misra_deviations_are_those_that_the_documentation_lists(tmp_path):
     outputs = LoadOutput(AngleLoad(2.0, 1e-3, limit=0.3), load="velocity")
-    folder = export_c(watched(moving(drive(**LIMITS))), tmp_path / "c", "drive", "float", track="phase", load=outputs)
+    folder = export_c(watched(drive(**LIMITS)), tmp_path / "c", "drive", "float", track="phase", load=outputs)
     sources = ("drive.c", "drive_selftest.c", "example_main.c")
     command = ["cppcheck", "-q", "--addon=misra", "--std=c99", "--enable=style", *sources]
     said = subprocess.run(command, cwd=folder, check=True, capture_output=True, text=True)

@@ -22,12 +22,11 @@ from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import blocks_along, compiler, filtered, find_compiler, lattice_along, library, recursion
+from kros.loops import compiler, filtered, find_compiler, library, recursion
 from kros.observer import Monitor
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.monitor import octaves
 from kros.observer.simulate import run_innovations, run_observer, run_observers, run_some_at_a_time
-from kros.observer.tuning.blocks import blocks_of, moved
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector
@@ -213,19 +212,15 @@ def test_filters_and_recursions_are_alike(every, both):
     rng = np.random.default_rng(4)
     x, rest = rng.normal(size=(3, 13, 301)) + 1e3, 1e3 * np.ones((3, 13))
     F, driven = 0.9 * np.eye(5) + 0.02 * rng.normal(size=(5, 5)), rng.normal(size=(200, MACHINE_COUNT, 5))
-    blocks = blocks_of(F, rng.normal(size=(5, 2)), rng.normal(size=(3, 5)))
 
     def run():
         return (
             *filtered(x, rest, -1.99, 0.9902, every),
             recursion(F, driven, driven[0]),
-            moved(blocks, x[:2] - 1e3, every, 2),
         )
 
     found, wanted = both(run)
     assert_same(found, wanted)
-    whole = sum(np.tensordot(b.G.T, b.responses(x[:2] - 1e3, np.zeros((2, 13)), every), 1) for b in blocks)[..., 2:]
-    assert_same([found[-1]], [whole.reshape(found[-1].shape)])
 
 
 @needs_compiler
@@ -236,29 +231,6 @@ def test_a_sample_that_is_no_number_is_not_felt_before_it_is_there(lost, both):
     found, wanted = both(lambda: filtered(x, np.zeros(1), -1.2, 0.5))
     assert_same(found, wanted)
     assert np.isfinite(found[0]).sum() == lost + 1
-
-
-@needs_compiler
-@pytest.mark.parametrize("every", [1, 4, 70])
-def test_models_in_blocks_and_lattices_are_alike(every, both):
-    rng = np.random.default_rng(5)
-    F, G, H = 0.5 * np.eye(2) + 0.2 * rng.normal(size=(5, 2, 2)), rng.normal(size=(5, 2, 3)), rng.normal(size=(4, 5, 2))
-    z, rest, held = (
-        rng.normal(size=(3, MACHINE_COUNT, 301)) + 1e3,
-        1e3 * np.ones((3, MACHINE_COUNT)),
-        rng.normal(size=(5, 2, MACHINE_COUNT)),
-    )
-    reflections = np.array([[-0.9, 0.5], [0.3, np.nan], [-0.99, 0.95], [-0.5, -0.3]])
-
-    def run():
-        model = F, G, H, z, rest, held
-        return (
-            blocks_along(*model, every),
-            blocks_along(*model, states=False),
-            lattice_along(reflections, z[0] - 1e3, every),
-        )
-
-    assert_same(*both(run))
 
 
 SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"

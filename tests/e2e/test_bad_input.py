@@ -53,7 +53,7 @@ def test_missing_study(kros, tmp_path):
         ("[nonsense]\na = 1", ("nonsense", "unknown key")),
         ("[lifting]\nfunctions = ['sin(positoin)']", ("positoin", "position")),
         ("[lifting]\nfunctions = ['__import__(\"os\").abort()']", ("not allowed",)),
-        ("[predictor]\nimportance = {speed = 4}", ("speed", "velocity, current")),
+        ("[estimator]\nrows = 4", ("estimator", "rows", "1000")),
         ("[calibrate]\nangle = 'theta'", ("theta", "position")),
         ("[split]\ntest = ['0', '1', '2', '3']", ("split.test",)),
         ("[data.csv]\nfiles = 1\n[data.x]", ("data.x",)),

@@ -123,7 +123,7 @@ def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
         'synthesis.methods=["worst_case_h2"]',
         "identify.refine=false",
     ]
-    quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "predictor.effort=quick"]
+    quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "estimator.rows=20000"]
     result = kros(
         "run",
         tmp_path / "study.toml",

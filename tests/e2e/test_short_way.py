@@ -16,9 +16,8 @@ import pytest
 import kros
 from kros.data import write_parquet
 from kros.design import Design
-from kros.design.methods import predictor, table
+from kros.design.methods import table
 from kros.observer import Observer
-from kros.observer.residual import signal_bounds
 from kros.plants import PLANTS
 from kros.study import load_config, run_study
 from kros.uncertainty import UncertainModels
@@ -36,11 +35,8 @@ FEWER: dict[str, Any] = {
         m for m in table.suitable(*asked) if ONCE.get(m.name, asked[1]) == asked[1]
     ],
     "design.methods.disturbance_model._CORNERS": (1e-3,),
-    "design.methods.predictor.EFFORTS": {"full": predictor.EFFORTS["quick"]},
-    "design.methods.signals._ROUNDS": 0,
-    "observer.residual.signal_bounds._BASES": signal_bounds._BASES[:1],
 }
-ONCE = {"memory": "koopman", "worst_case_h2": "linear_edmd", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
+ONCE = {"estimator": "koopman", "worst_case_h2": "linear_edmd", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
 LIFTING = "sin(100*position + phase)"
 
 

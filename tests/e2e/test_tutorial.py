@@ -18,7 +18,7 @@ QUICKER = [
     'observer.baselines=["open_loop"]',
     "synthesis.input_weight=3.0",
 ]
-QUICKER += ["evaluate.robustness=false", "predictor.effort=quick", "uncertainty.n_freqs=60"]
+QUICKER += ["evaluate.robustness=false", "estimator.rows=20000", "uncertainty.n_freqs=60"]
 
 
 def steps() -> list[tuple[str, str]]:

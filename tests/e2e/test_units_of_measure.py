@@ -52,7 +52,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "uncertainty": {"n_freqs": 50, "max_order": 1},
         "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "memory"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
-        "predictor": {"states": 2, "steps": 1},
+        "estimator": {"rows": 10000},
         "evaluate": {"robustness": False},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics

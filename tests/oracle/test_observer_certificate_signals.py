@@ -15,9 +15,7 @@ from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
 from kros.observer.certificate import majorants as majorants_of
 from kros.observer.certificate.majorants import energy, majorants
-from kros.observer.certificate.report import relift_report
 from kros.observer.certificate.signals import signal_bound
-from kros.observer.start import Start
 from kros.synthesis import Injection
 from kros.synthesis.worst_case.arcs import Enclosure
 from kros.uncertainty.coprime.bands import band_edges
@@ -137,23 +135,6 @@ def test_bounds_hold_for_every_unit_and_are_close(case: str, noise: float) -> No
     assert ((found.ratios >= 1) & (found.ratios <= close)).all()
     assert (found.cover >= found.bounds.max(axis=0) * (1 - 1e-9) - 1e-9).all() or case == "limits"
     assert (found.cover <= 3 * found.bounds.max(axis=0)).all()
-
-
-@pytest.mark.parametrize("functions", [(), ("0.3*sin(3*a)",)])
-def test_bounds_hold_with_a_start_in_motion(functions: tuple[str, ...]) -> None:
-    rng, (x, u) = np.random.default_rng(2), recordings()
-    start = Start(
-        np.vstack([np.zeros((1, 2)), rng.normal(size=(2, 2))]),
-        np.concatenate([np.zeros((4, 1, 1)), 0.5 * rng.normal(size=(4, 2, 1))], axis=1),
-    )
-    o = replace(observer(functions), start_in_motion=start)
-    batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
-    certificate = relift_certificate(o, mismatch=False)
-    found = signal_bound(certificate, o, batch)
-    assert found.certified
-    assert ((found.ratios >= 1) & (found.ratios <= 1.5)).all()
-    rows = relift_report(certificate, o, batch)
-    assert all(row.error <= row.bound * (1 + 1e-9) for row in rows)
 
 
 @pytest.mark.parametrize("case", ["linear", "slopes"])

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import DT, LIMITS, drive, moving, samples, watched
+from machines import DT, LIMITS, drive, filters, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
@@ -30,7 +30,7 @@ def levels(observer, y, u):
     return np.array(found), np.array(status)
 
 
-@pytest.mark.parametrize("machine", [drive(), drive(delay=2, **LIMITS), moving(drive())])
+@pytest.mark.parametrize("machine", [drive(), drive(delay=2, **LIMITS), filters()])
 def test_one_machine_is_watched_as_many_at_once(machine):
     observer, (y, u) = watched(machine), samples(800)
     found, status = levels(observer, y, u)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, apart, drive, in_python, moving, replaced, samples
+from machines import LIMITS, apart, drive, in_python, samples
 
 from kros.export import CompiledObserver, export_c
 from kros.loops import find_compiler
@@ -24,8 +24,6 @@ def unbound(observer, **changes):
 KINDS = {
     "lifted": lambda: unbound(drive()),
     "linear": lambda: unbound(drive(())),
-    "replaced": lambda: unbound(replaced()),
-    "in motion": lambda: unbound(moving(drive())),
     "limits": lambda: cancelling(unbound(drive(correction=np.full(5, 0.004), **LIMITS)), 0.0),
     "late": lambda: unbound(drive(delay=3)),
 }

@@ -5,10 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from kros.core import StateSpace
-from kros.observer.certificate.majorants import energy, majorants
-from kros.observer.residual.signal_bounds import scaled_into, signal_lower_bounds
-from kros.synthesis.residual_shaped.shaping_filter import Basis, circle_weights, shaping_filter
-from kros.uncertainty.coprime.bands import BandEnergies
+from kros.synthesis.residual_shaped.shaping_filter import circle_weights
 from kros.uncertainty.coprime.signals import SignalSet
 
 RNG = np.random.default_rng(11)
@@ -42,49 +39,3 @@ def closed(K: StateSpace) -> StateSpace:
         np.zeros((2, 2)),
         DT,
     )
-
-
-def test_no_observer_that_is_tried_falls_below_the_lower_bound_of_the_set() -> None:
-    r, units = residuals()
-    signals = SignalSet.of(r, [399] * 3, units, edges=np.linspace(0, np.pi, 31))
-    noise = np.array([0.05])
-    lower = signal_lower_bounds(F, C, noise, signals, DT)
-    assert (lower > 0).all()
-    best = np.full(2, np.inf)
-    for _ in range(60):
-        L = RNG.uniform([[0.3], [-0.6]], [[1.3], [0.4]])
-        K = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((2, 0)), L, DT)
-        T = closed(K)
-        if T.is_stable():
-            M = majorants(T, signals.energies.edges, signals.cover.energy)
-            best = np.minimum(best, np.sqrt(energy(M, signals.cover.energy)))
-    assert (lower <= best).all()
-    assert (lower >= 0.1 * best).all()
-
-
-def test_lower_bound_of_white_residuals_is_the_kalman_predictor_s() -> None:
-    edges = np.linspace(0, np.pi, 9)
-    signals = SignalSet(("u",), BandEnergies(edges, np.full((1, 8, 1, 1), 0.25 / 8)))
-    a, q, v = 0.9, 0.25, 0.4
-    p = q
-    for _ in range(500):
-        p = a * a * p * v / (p + v) + q
-    found = signal_lower_bounds(np.array([[a]]), np.eye(1), np.array([np.sqrt(v)]), signals, DT)
-    np.testing.assert_allclose(found, np.sqrt(p), rtol=2e-3)
-    assert found[0] <= np.sqrt(p)
-
-
-def test_a_filter_scaled_into_energies_is_inside_by_quadrature() -> None:
-    r, units = residuals()
-    signals = SignalSet.of(r, [399] * 3, units, edges=np.linspace(0, np.pi, 21))
-    mean = signals.energies.energy.mean(axis=0)
-    G = scaled_into(
-        shaping_filter(signals.spectrum(513, np.full(3, 1 / 3)), Basis(4, (0.9,)), DT), signals.energies.edges, mean
-    )
-    theta = np.linspace(signals.energies.edges[:-1], signals.energies.edges[1:], 41, axis=-1)
-    response = G.frequency_response(theta.ravel() / (2 * np.pi * DT)).reshape(20, 41, 2, -1)
-    density = np.einsum("btik,btjk->btij", response, response.conj())
-    inside = np.trapezoid(density, theta[..., None, None], axis=1) / np.pi
-    root = np.linalg.inv(np.linalg.cholesky(mean))
-    ratio = np.linalg.eigvalsh(root @ inside @ root.conj().swapaxes(-1, -2))
-    assert 0.5 < ratio.max() <= 1 + 1e-6

@@ -6,9 +6,8 @@ import numpy as np
 
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, Runtime, Seen
+from kros.observer import FilterBank, Monitor, Observer, Runtime, Seen
 from kros.observer.monitor import octaves
-from kros.observer.start import Start
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3
@@ -62,52 +61,56 @@ MACHINES = {
         ("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate"), delay=3
     ),
     "input functions": lambda: drive(inputs=("target", "rate"), gamma=("rate*velocity",)),
-    "replaced": lambda: replaced(),
-    "start in motion": lambda: moving(drive()),
-    "start in motion, delay and limits": lambda: moving(drive(delay=2, **LIMITS)),
-    "start in motion, replaced": lambda: moving(replaced()),
+    "filter bank": lambda: filters(),
+    "filter bank with limits": lambda: filters(cut=True),
+    "filter bank without functions": lambda: filters(()),
     "monitor": lambda: watched(drive()),
     "monitor and delay": lambda: watched(drive(delay=2, **LIMITS)),
 }
 
 
-def replaced():
-    """A measurement takes the place of the estimate; two internal states."""
-    lifting = Lifting((*STATES, "memory_1", "memory_2"), GEAR, ("phase",))
-    rng = np.random.default_rng(3)
-    A = np.zeros((7, 7))
-    A[:5, :5] = 0.9 * np.eye(5) + 0.01 * rng.normal(size=(5, 5))
-    A[:5, 5:] = 1e-3 * rng.normal(size=(5, 2))
-    A[0, 0] = 1.0
-    B = np.vstack([0.01 * rng.normal(size=(5, 2)), np.zeros((2, 2))])
-    gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((7, 0)), A[:, :1], DT)
-    seen = Seen(np.array([1.5]), np.array([2.0, 9.0]))
+def filters(functions=GEAR, cut=False):
+    """A filter bank with two filters, one of inputs alone, and shares of the fallback that rise with the level of losses."""
+    parameters = ("phase",) if functions else ()
+    fallback = tuple(f"{name}_from_inputs" for name in STATES)
+    states = (*STATES, "filter_1", "filter_2", "input_filter_1", *fallback)
+    lifting = Lifting(states, functions, parameters, ("target", "rate"), ("rate*position", "1"))
+    rng, n, p = np.random.default_rng(3), lifting.n_states, lifting.n_lifted
+    A, B = np.zeros((p, p)), np.zeros((p, 4))
+    seen = [0, *range(n, p)]
+    A[:5, seen], B[:5] = 0.1 * rng.normal(size=(5, len(seen))), 0.1 * rng.normal(size=(5, 4))
+    A[:5, 3:5] = [[0.1, 0.0], [0.5, 0.1], [0.0, 0.7], [0.9, 0.1], [-0.1, 0.9]]
+    A[0, 0] += 1.0
+    A[5, 5], B[5, [0, 1, 3]] = 0.95, [0.05, 0.01, 0.02]
+    A[6:9, 5], B[6:9, [0, 1, 3]] = [0.3, 0.1, 0.0], [[0.7, 0.01, 0.0], [0.0, 0.9, 0.1], [0.1, 0.1, 0.1]]
+    start = 0.1 * rng.normal(size=(n, p + 4))
+    start[:, 1:n] = 0.0  # states that are not measured are not known
+    bank = FilterBank(
+        2,
+        start,
+        np.array([0.99, 0.9, 0.5]),
+        0.9,
+        np.array([0.0, 0.3, 1.0]),
+        np.array([[0, 0, 0], [0.5, 0.2, 1], [1, 0.4, 1]]),
+    )
+    none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
+    low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
+    runtime = Runtime(0, low, high, relift=False) if cut else Runtime()
     return Observer(
-        "r",
+        "filters",
         lifting,
         A,
         B,
         (0,),
         ("target", "rate"),
-        gain,
+        none,
         Injection.STATE,
         DT,
-        {"phase": 0.3},
-        seen=seen,
-        replaces=True,
-        internal=2,
+        {"phase": 0.3} if functions else {},
+        runtime,
+        Seen(np.array([1.5]), np.array([2.0, 9.0])),
+        bank=bank,
     )
-
-
-def moving(observer):
-    """With a start that differs from rest wherever the command is not the position."""
-    rng, n = np.random.default_rng(7), observer.lifting.n_states
-    hidden = (np.arange(n) > 0)[:, None]
-    gain = 0.3 * rng.normal(size=(n, 1)) * hidden * np.array([1.0, -1.0, 0.0]) + 0.05 * rng.normal(
-        size=(n, 1)
-    ) * hidden * np.array([0, 0, 1.0])
-    rest = np.array([[1.0, -1.0, 0.0], [0.0, 0.0, 1.0]]) / 0.02
-    return replace(observer, start_in_motion=Start(gain, 0.5 * rng.normal(size=(5, n, 1)) * hidden, rest))
 
 
 def watched(observer, bound=1.0):

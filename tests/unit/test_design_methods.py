@@ -18,9 +18,12 @@ def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
     assert not caplog.records
     assert [m.name for m in suitable(wanted, "koopman", refined=True)] == ["open_loop", "worst_case_h2"]
     assert "koopman/mixed is not made for refined models" in caplog.text
-    assert [m.name for m in suitable(("residual_h2", "memory"), "linear", refined=True)] == ["residual_h2", "memory"]
-    assert [m.name for m in suitable(("residual_h2", "memory"), "linear_edmd", refined=False)] == ["residual_h2"]
-    assert "linear_edmd/memory is made for refined models alone: it is fitted to recordings" in caplog.text
+    assert [m.name for m in suitable(("residual_h2", "estimator"), "linear", refined=True)] == [
+        "residual_h2",
+        "estimator",
+    ]
+    assert [m.name for m in suitable(("residual_h2", "estimator"), "linear_edmd", refined=False)] == ["residual_h2"]
+    assert "linear_edmd/estimator is made for refined models alone: it is fitted to recordings" in caplog.text
 
 
 def test_the_slowest_start_first_and_the_best_guarantee_is_deployed():

@@ -3,6 +3,7 @@
 import json
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import pytest
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime
+from kros.observer import FilterBank, Observer, Runtime
 from kros.synthesis.result import Injection
 
 
@@ -137,20 +138,41 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
     assert not (tmp_path / "o.json").exists()
 
 
-def predictor(**changes: Any) -> Observer:
-    """Measurements replace the estimate of the position; the last state is the observer's own."""
-    lifting, A = (
-        Lifting(("position", "memory_1"), ("sin(position)",)),
-        np.array([[0.9, 0.1, 0.0], [0.2, 0.5, 0.3], [0.0, 0.0, 0.0]]),
-    )
-    kinds = {"replaces": True, "internal": 1} | changes
+def filters(**changes: Any) -> Observer:
+    """A filter bank of one filter, and no filter of inputs."""
+    lifting = Lifting(("position", "filter_1", "position_from_inputs"), (), (), ("torque",), ("1",))
+    bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "memory": 0.5} | changes
+    own = FilterBank(**{"levels": np.array([0.0, 1.0]), "shares": np.array([[0.0], [1.0]])} | bank)
+    none = gain(np.zeros((3, 1)), 0.01)
     return Observer(
-        "p", lifting, A, np.ones((3, 1)), (0,), ("torque",), gain(A[:, :1], 0.01), Injection.STATE, 0.01, **kinds
+        "f", lifting, 0.5 * np.eye(3), np.ones((3, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=own
     )
 
 
-def test_a_kind_that_the_matrices_do_not_have_is_refused() -> None:
-    with pytest.raises(DimensionError, match="where measurements replace estimates"):
-        observer(replaces=True)
-    with pytest.raises(DimensionError, match="2 internal states"):
-        predictor(internal=2)
+def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
+    filters().save(tmp_path / "observer.json")
+    loaded = Observer.load(tmp_path / "observer.json")
+    assert loaded.bank is not None
+    assert loaded.recorded == ("position",)
+    np.testing.assert_array_equal(loaded.bank.start, np.ones((3, 5)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "match"),
+    [
+        ({"forget": np.array([1.5])}, DataError, "between 0 and 1"),
+        ({"levels": np.array([0.5, 0.5])}, DataError, "should increase"),
+        ({"start": np.ones((2, 5))}, DimensionError, "start"),
+        ({"filters": 4}, DimensionError, "at most 1 filters"),
+    ],
+)
+def test_a_filter_bank_that_does_not_fit_is_refused(
+    changes: dict[str, Any], error: type[Exception], match: str
+) -> None:
+    with pytest.raises(error, match=match):
+        filters(**changes)
+
+
+def test_a_filter_bank_has_no_correction() -> None:
+    with pytest.raises(DimensionError, match="has no correction"):
+        replace(filters(), controller=gain(np.ones((3, 1)), 0.01))

@@ -104,10 +104,6 @@ def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
             {"sensor": {"velocity": {"noise": 1e-3}}},
             "sensor: velocity should be among the states that are measured, position",
         ),
-        (
-            {"predictor": {"importance": {"position": 2.0}}},
-            "predictor.importance: position should be among the states that are not measured",
-        ),
     ],
 )
 def test_settings_of_channels_name_channels_that_they_are_for(tmp_path, section, reason):

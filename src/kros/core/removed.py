@@ -7,7 +7,11 @@ from typing import Any
 
 # A sentence, then the public names ``kros.package.name``, the keys of a study ``section.key``, and their values ``section.key=value`` that it is for.
 REMOVED: tuple[tuple[str, str], ...] = (
-    ("The section [memory] of a study is called [predictor]; rename it.", "memory"),
+    (
+        "Subspace-identified predictors are no longer part of kros; use the method estimator, whose settings are in [estimator].",
+        "memory predictor synthesis.methods=memory kros.observer.identify_predictor kros.observer.PastMoments",
+    ),
+    ("The load observer chooses its own order; remove the key memories.", "load.memories"),
     (
         "Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.",
         "synthesis.noise",
@@ -48,7 +52,7 @@ REMOVED: tuple[tuple[str, str], ...] = (
     ),
     (
         "Steps of the design of predictors and residual-shaped observers are no longer public; use synthesize with method "
-        "memory or residual_h2.",
+        "estimator or residual_h2.",
         "kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal kros.observer.residual_models "
         "kros.observer.tune_observer kros.observer.in_sizes",
     ),

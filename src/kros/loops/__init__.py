@@ -7,7 +7,7 @@ all liftings, models and observers, compiled once on a machine. Where there is n
 from __future__ import annotations
 
 from .compiler import COMPILERS, find_compiler
-from .filtering import all_pole, blocks_along, filtered, lattice, lattice_along, recursion
+from .filtering import all_pole, filtered, recursion
 from .library import Library, formulas, library
 from .tape import Tape, tape_of
 
@@ -16,12 +16,9 @@ __all__ = [
     "Library",
     "Tape",
     "all_pole",
-    "blocks_along",
     "filtered",
     "find_compiler",
     "formulas",
-    "lattice",
-    "lattice_along",
     "library",
     "recursion",
     "tape_of",

@@ -64,7 +64,7 @@ class Bank:
         sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
         ends = at + self.taps[-1] + 1
         means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in pairwise(self.taps)]
-        parts = [moving[at], *(one - other for one, other in zip(means, means[1:], strict=False))]
+        parts = [moving[at], *(one - other for one, other in pairwise(means))]
         for tau in self.lags:
             a = np.exp(-1 / tau)
             parts.append(lfilter([1 - a], [1, -a], moving, axis=0, zi=a * moving[:1])[0][at])

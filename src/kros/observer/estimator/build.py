@@ -87,7 +87,9 @@ def identify_estimator(
     filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
     first = first_estimate(channels, recordings)
     observer = assembled(name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {})
-    forget = forgetting(observer, recordings, settings)
+    assert observer.bank is not None
+    forget, memory = forgetting(observer, recordings, settings), settings.memory(readout.design.bank.taps[-1])
+    observer = replace(observer, bank=replace(observer.bank, forget=forget, memory=memory))
     observer = replace(observer, bank=shares_of(observer, recordings, settings))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)

@@ -1,4 +1,4 @@
-"""The examples in docstrings and documents run, the configurations in documents are valid, and the README stays short."""
+"""The examples in docstrings and documents run, the configurations in documents are valid, and pages keep their form and length."""
 
 from __future__ import annotations
 
@@ -102,10 +102,48 @@ def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPa
     )
 
 
-def test_the_drawn_ways_name_modules_that_are_there() -> None:
-    drawn = re.findall(r">([a-z_/0-9]+\.py)<", (ROOT / "docs" / "two-ways.svg").read_text())
-    assert len(drawn) <= 16
-    assert [name for name in drawn if not (ROOT / "src" / "kros" / name).is_file()] == []
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+
+
+def opening(text: str) -> str:
+    """What stands before the first heading of a section."""
+    return re.split(r"^## ", text, maxsplit=1, flags=re.MULTILINE)[0]
+
+
+def without_question_or_example(text: str) -> list[str]:
+    """What a page lacks: the reader's question, or an example, within its first forty lines."""
+    first = "\n".join(text.splitlines()[:40])
+    question = re.search(r"\*[^*]+\?\*", " ".join(opening(text).split()))
+    example = re.search(r"^```(python|console|toml)$", first, flags=re.MULTILINE)
+    return [what for what, there in (("question", question), ("example", example)) if not there]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
+def test_pages_begin_with_a_question_and_an_example(path: Path) -> None:
+    assert without_question_or_example(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_page_without_question_is_found() -> None:
+    assert without_question_or_example("# A\n\nWhat?\n\n## B\n\n*Why?*\n") == ["question", "example"]
+
+
+MOST_WORDS = {"README.md": 950, "docs/limits.md": 1200, "docs/*.md": 26_000}
+
+
+@pytest.mark.parametrize("pattern", MOST_WORDS)
+def test_documents_stay_short(pattern: str) -> None:
+    assert sum(len(path.read_text(encoding="utf-8").split()) for path in ROOT.glob(pattern)) <= MOST_WORDS[pattern]
+
+
+def test_the_glossary_has_at_most_forty_terms() -> None:
+    rows = re.findall(r"^\| (?!-)", (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert 20 < len(rows) - 1 <= 40
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = "\n".join(blocks(index, r"\{toctree\}")).split()
+    assert sorted({path.stem for path in PAGES} - {"index"} - set(listed)) == []
 
 
 def page_of_keys(monkeypatch: pytest.MonkeyPatch) -> str:

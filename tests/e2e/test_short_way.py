@@ -40,7 +40,7 @@ FEWER: dict[str, Any] = {
     "design.methods.signals._ROUNDS": 0,
     "observer.residual.signal_bounds._BASES": signal_bounds._BASES[:1],
 }
-ONCE = {"memory": "koopman", "worst_case_h2": "koopman", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
+ONCE = {"memory": "koopman", "worst_case_h2": "linear", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
 LIFTING = "sin(100*position + phase)"
 README_LIFTING = "sin(position)"
 
@@ -101,7 +101,7 @@ def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> Non
     study = kros.run(names["population"], "runs/x", lifting=[README_LIFTING])
     observers = folder / "runs" / "x" / "observers"
     assert without_study(observers / "deployed.json") == saved(names["design"], folder / "deployed.json")
-    named = kros.synthesize(names["uncertain"], method="worst_case_h2")
+    named = kros.synthesize(names["uncertain"], method="linear/worst_case_h2")
     assert without_study(observers / f"{named.name}.json") == saved(named, folder / "named.json")
     assert named.lower_bound == named.synthesis.lower_bound > 0
     other = replace(named.synthesis, worst_case_h2=None)

@@ -24,14 +24,15 @@ HEAD = """# Benchmarks
 $ make bench
 ```
 
-Each computation is compared with other packages and with the published algorithm in plain NumPy (`benchmarks/plain.py`, `benchmarks/paper_slsqp.py`), on the same problem in
-the same run. `benchmarks/benchmarks_page.py` generates this page.
+Each computation is compared with other packages and with the published algorithm in plain NumPy (`benchmarks/plain.py`,
+`benchmarks/paper_slsqp.py`), on the same problem in the same run. `benchmarks/benchmarks_page.py` generates this page.
 
 {facts}
 
-Times are medians of the processor time of one process on one core, without imports. The results are compared before a time counts: *differs by* is the largest relative
-difference. If another implementation is too slow for the whole problem, it solves the named share, and its time is divided by this share. The ratio is its time over that of
-kros: **above one, kros is faster; below one, the other is**.
+Times are medians of the processor time of one process on one core, without imports. The results are compared before a
+time counts: *differs by* is the largest relative difference. If another implementation is too slow for the whole problem,
+it solves the named share, and its time is divided by this share. The ratio is its time over that of kros: **above one,
+kros is faster; below one, the other is**.
 
 ## Stages
 
@@ -39,7 +40,8 @@ kros: **above one, kros is faster; below one, the other is**.
 GROWTH = """
 ## Growth
 
-The exponent is the slope of a straight line through the logarithms of sizes and times; one means proportional. `benchmarks/bench_growth.py` defines the problems.
+The exponent is the slope of a straight line through the logarithms of sizes and times; one means proportional.
+`benchmarks/bench_growth.py` defines the problems.
 """
 
 

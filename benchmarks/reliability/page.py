@@ -22,9 +22,10 @@ INTRODUCTION = f"""# Reliability
 $ python benchmarks/reliability/formulas.py --seed 1
 ```
 
-Each campaign runs kros on random, damaged or adversarial inputs and compares the results with an independent truth. A case fails if a bound is false, if an
-exception other than those of kros occurs, if a change of the input remains unreported, or if the case takes longer than {LONGEST_S:g} s.
-`benchmarks/reliability/page.py` generates this page from `benchmarks/reliability/results`, where notes on single rows are, too.
+Each campaign runs kros on random, damaged or adversarial inputs and compares the results with an independent truth. A
+case fails if a bound is false, if an exception other than those of kros occurs, or if a change of the input remains
+unreported. A case that takes longer than {LONGEST_S:g} s fails, too. `benchmarks/reliability/page.py` generates this page
+from `benchmarks/reliability/results`, where notes on single rows are.
 
 """
 
@@ -41,9 +42,7 @@ def render() -> str:
     failed = sum(sum(tally["failures"].values()) for result in results.values() for tally in result["tallies"])
     summary = f"**{tried} cases in {len(results)} campaigns, {failed} failures.**\n"
     waiting = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - results.keys() - {"campaign", "page"})
-    missing = (
-        f"\nNot run for this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
-    )
+    missing = f"\nNot run for this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
     return INTRODUCTION + summary + missing + "".join(_campaign(name, result) for name, result in results.items())
 
 

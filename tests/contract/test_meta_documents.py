@@ -10,14 +10,18 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+import typer
 
 import kros
+from kros.cli import app
 from kros.core import ConfigError
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md"), *(ROOT / "examples").rglob("*.md")])
+PAGES = sorted((ROOT / "docs").glob("*.md"))
 MODULES = sorted(m.name for m in pkgutil.walk_packages(kros.__path__, "kros."))
 
 
@@ -74,6 +78,13 @@ def test_examples_of_documents_run(path: Path) -> None:
     assert run_examples([doctest.DocTestParser().get_doctest(text, {}, path.name, str(path), 0)]) == []
 
 
+@pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
+def test_python_of_pages_is_run(path: Path) -> None:
+    """A block is a doctest, or the tutorial's, which `tests/e2e/test_tutorial.py` runs."""
+    python = blocks(path.read_text(encoding="utf-8"), "python")
+    assert path.name == "tutorial.md" or [block for block in python if not block.startswith(">>> ")] == []
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
 def test_configurations_of_documents_are_valid(path: Path) -> None:
     for block in blocks(path.read_text(encoding="utf-8"), "toml"):
@@ -83,6 +94,54 @@ def test_configurations_of_documents_are_valid(path: Path) -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
 def test_names_in_documents_exist(path: Path) -> None:
     assert unknown_names(path.read_text(encoding="utf-8")) == []
+
+
+def command(names: list[str]) -> Any:
+    """The command that a line begins with; None if it does not exist."""
+    command: Any = typer.main.get_command(app)
+    for name in names:
+        if not hasattr(command, "commands"):
+            return command
+        command = command.commands.get(name)
+        if command is None:
+            return None
+    return command
+
+
+def unknown_commands(text: str) -> list[str]:
+    """Lines of consoles with a command or an option that kros does not have."""
+    lines = re.findall(r"^\$ (?:\S*/)?kros (.*?)(?:\s+#.*)?$", "\n".join(blocks(text, "console")), flags=re.MULTILINE)
+    unknown = []
+    for line in lines:
+        words = line.split(" && ")[0].split()
+        called = command([word for word in words if not word.startswith("-")])
+        options = {word.partition("=")[0] for word in words if word.startswith("--")} - {
+            "--help",
+            "--version",
+            "--debug",
+        }
+        known = {option for parameter in called.params for option in parameter.opts} if called else set()
+        if called is None or not options <= known:
+            unknown.append(line)
+    return unknown
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_commands_in_documents_exist(path: Path) -> None:
+    assert unknown_commands(path.read_text(encoding="utf-8")) == []
+
+
+def test_unknown_commands_are_found() -> None:
+    text = "```console\n$ kros runs study.toml\n$ .venv/bin/kros run study.toml --set a.b=1  # why\n$ kros check a b --jsn\n```\n"
+    assert unknown_commands(text) == ["runs study.toml", "check a b --jsn"]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_functions_in_c_of_documents_are_generated(path: Path) -> None:
+    header = (ROOT / "src/kros/export/c99/templates/observer.h.jinja").read_text(encoding="utf-8")
+    declared = set(re.findall(r"\{\{ name \}\}_(\w+?)(?:\{\{ \w+ \}\})?\(", header))
+    called = set(re.findall(r"\baxis_(\w+)\(", "\n".join(blocks(path.read_text(encoding="utf-8"), "c"))))
+    assert {name for name in called if name not in declared and name.rpartition("_")[0] + "_" not in declared} == set()
 
 
 def test_an_unknown_key_is_found() -> None:
@@ -100,9 +159,6 @@ def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPa
     assert (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8") == page.render(), (
         "run benchmarks/reliability/page.py"
     )
-
-
-PAGES = sorted((ROOT / "docs").glob("*.md"))
 
 
 def opening(text: str) -> str:

@@ -94,28 +94,27 @@ def settings_rows(model: type[Settings]) -> list[tuple[str, str, str, str]]:
 
 
 def documented(kind: type) -> dict[str, str]:
-    """Return the descriptions in the section *Parameters* of a docstring, by name."""
+    """Return what the section *Parameters* of a docstring says, by name."""
     text = inspect.getdoc(kind) or ""
     parts = re.split(r"^(\w+) : .*$", text.partition("----------\n")[2], flags=re.MULTILINE)
-    return {name: " ".join(text.split()) for name, text in zip(parts[1::2], parts[2::2], strict=True)}
+    return {name: " ".join(says.split()) for name, says in zip(parts[1::2], parts[2::2], strict=True)}
 
 
 def dataclass_rows(kind: type) -> list[tuple[str, str, str, str]]:
     """Return the rows of a table that is read into a dataclass."""
-    hints, descriptions = typing.get_type_hints(kind), documented(kind)
+    hints, says = typing.get_type_hints(kind), documented(kind)
     rows = []
     for field in dataclasses.fields(kind):
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         said = "required" if required else default(None if field.default is dataclasses.MISSING else field.default)
-        text = descriptions.get(field.name, "").replace("``", "`")
+        text = says.get(field.name, "").replace("``", "`")
         rows.append((f"`{field.name}`", written(hints[field.name]), said, text))
     return rows
 
 
 def summary(kind: type) -> str:
     """Return the docstring before its sections, with code in single backticks."""
-    text = inspect.getdoc(kind) or ""
-    return re.split(r"\n\n[A-Z]\w+\n-{3,}\n", text)[0].replace("``", "`")
+    return (inspect.getdoc(kind) or "").split("\n\nParameters\n")[0].replace("``", "`")
 
 
 def study_keys() -> str:
@@ -148,7 +147,7 @@ TABLES = {"study": study_keys, "mapping": mapping_keys, "steps": step_keys}
 
 def fill(text: str) -> str:
     """Return a page with its comments `<!-- keys: study -->` replaced by tables."""
-    return re.sub(r"^<!-- keys: (\w+) -->$", lambda match: TABLES[match[1]](), text, flags=re.MULTILINE)
+    return re.sub(r"^<!-- keys: (\w+) -->$", lambda found: TABLES[found[1]](), text, flags=re.MULTILINE)
 
 
 def setup(app: typing.Any) -> dict[str, bool]:

@@ -1,9 +1,9 @@
-"""Kill -9 runs at random moments and just after random files appeared, resume them, and compare with an uninterrupted run.
+"""Kill -9 runs at random moments and just after random files appeared, resume them, and compare with a run that nobody killed.
 
     python benchmarks/reliability/kill_points.py --count 100 --demo-count 5
 
 Runs are those of the command line with two worker processes. Up to four kills follow one another in one run folder before it is let finish; then
-its files are compared one by one. Moments are drawn over the measured time of the uninterrupted run, so a slow machine changes nothing.
+its files are compared one by one. Moments are drawn over the measured time of the run that nobody killed, so a slow machine changes nothing.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ STAGES = ("simulate", "read", "calibrate", "identify", "quantify", "synthesize",
 IN_A_ROW, PATIENCE = (
     4,
     10,
-)  # kills before a run is let finish; times that an uninterrupted run takes, after which one hangs
+)  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
 _TIMED_TABLE = re.compile(
     r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL
 )
@@ -57,7 +57,7 @@ _LAST_CELL = re.compile(r"<td[^>]*>[^<]*</td>(?=\s*</tr>)")
 
 @dataclass
 class Campaign:
-    """One command, the run folder it writes, and what it leaves if it is not killed."""
+    """One command, the run folder it writes, and what it leaves when nobody kills it."""
 
     command: tuple[str, ...]
     folder: Path
@@ -225,7 +225,7 @@ def run(count: int, seed: int, demo_count: int) -> list[Tally]:
     tallies = []
     with tempfile.TemporaryDirectory() as scratch:
         for (cases, campaign), wanted in zip(campaigns(Path(scratch), seed), (count, demo_count), strict=True):
-            tally = Tally(cases, "the files and processes of an uninterrupted run")
+            tally = Tally(cases, "the files of a run that nobody killed, and the processes that it started")
             if wanted:
                 campaign.measure()
                 campaign.kills(wanted, tally)

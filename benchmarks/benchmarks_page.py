@@ -18,14 +18,21 @@ PAGE = Path(__file__).parents[1] / "docs" / "benchmarks.md"
 PACKAGES = ("kros", "numpy", "scipy", "clarabel", "cvxpy", "pandas", "pykoop", "control", "slycot", "dkpy")
 HEAD = """# Benchmarks
 
-Each stage beside other packages and the published algorithm written plainly (`benchmarks/plain.py`, `benchmarks/paper_slsqp.py`), in the same run on
-the same problem, and how costs grow. This page is written by `benchmarks/benchmarks_page.py` from what `make bench` measured; nothing in it is typed.
+*How fast is each computation of kros beside other packages, and how does its time grow?*
+
+```console
+$ make bench
+```
+
+Each computation is compared with other packages and with the published algorithm in plain NumPy (`benchmarks/plain.py`,
+`benchmarks/paper_slsqp.py`), on the same problem in the same run. `benchmarks/benchmarks_page.py` generates this page.
 
 {facts}
 
-Times are medians of the processor time of one process on one core, imports excluded, caches warm. What another one returned was compared with
-what kros returned before its time counted: *differs by* is the largest relative difference. A contestant too slow for the whole problem was given the
-share that is named, and its time is divided by it. The ratio is its time over that of kros: **above one kros is faster, below one the other is**.
+Times are medians of the processor time of one process on one core, without imports. The results are compared before a
+time counts: *differs by* is the largest relative difference. If another implementation is too slow for the whole problem,
+it solves the named share, and its time is divided by this share. The ratio is its time over that of kros: **above one,
+kros is faster; below one, the other is**.
 
 ## Stages
 
@@ -33,7 +40,8 @@ share that is named, and its time is divided by it. The ratio is its time over t
 GROWTH = """
 ## Growth
 
-The exponent is the slope of a straight line through the logarithms of sizes and times: one is proportional. `benchmarks/bench_growth.py` has the problems.
+The exponent is the slope of a straight line through the logarithms of sizes and times; one means proportional.
+`benchmarks/bench_growth.py` defines the problems.
 """
 
 

@@ -65,7 +65,7 @@ def main() -> None:
     parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[])
     parser.add_argument("--out", type=Path)
     parser.add_argument(
-        "--markdown", action="store_true", help="print tables as in docs/observers.md, of the observers named there"
+        "--markdown", action="store_true", help="print tables as in docs/experiments.md, of the observers named there"
     )
     options = parser.parse_args()
     verdicts = []

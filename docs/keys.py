@@ -60,7 +60,7 @@ def default(value: object) -> str:
 
 def table(rows: list[tuple[str, str, str, str]]) -> str:
     """Return a table of keys in Markdown."""
-    cells = [("key", "value", "default", "says"), ("---",) * 4, *rows]
+    cells = [("key", "value", "default", "meaning"), ("---",) * 4, *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in cells) + "\n"
 
 

@@ -48,13 +48,13 @@ def names() -> tuple[str, ...]:
 def get(name: str) -> object:
     """Return an object by its full name; a module of the same name (`kros.data.prepare`) is another."""
     package, _, last = name.rpartition(".")
-    found: object = getattr(importlib.import_module(package), last)
-    return found
+    target: object = getattr(importlib.import_module(package), last)
+    return target
 
 
-def summary(found: object) -> str:
+def summary(target: object) -> str:
     """Return the first sentence of a docstring, for a cell of a table in Markdown."""
-    first = " ".join((inspect.getdoc(found) or "").split("\n\n")[0].split()).replace("``", "`").replace("|", "\\|")
+    first = " ".join((inspect.getdoc(target) or "").split("\n\n")[0].split()).replace("``", "`").replace("|", "\\|")
     return re.split(r"(?<=[^.]\.)\s+(?=[A-Z])", first)[0]
 
 
@@ -66,11 +66,11 @@ def title(text: str, line: str = "=") -> str:
 @cache
 def named() -> dict[str, list[str]]:
     """Return the pages that name an object in code, by its full name."""
-    found: dict[str, list[str]] = {}
+    places: dict[str, list[str]] = {}
     for path in sorted({*DOCS.glob("*.md")} - {DOCS / "api.md"}):
         for name in sorted(set(re.findall(r"`(kros(?:\.\w+)+)", path.read_text(encoding="utf-8")))):
-            found.setdefault(name, []).append(path.stem)
-    return found
+            places.setdefault(name, []).append(path.stem)
+    return places
 
 
 def object_page(name: str) -> str:
@@ -78,12 +78,14 @@ def object_page(name: str) -> str:
 
     It is in no table of contents: the sidebar of every page would be longer by all objects, and the build three times as long.
     """
-    found = get(name)
-    kind = "function" if not isinstance(found, type) else "exception" if issubclass(found, BaseException) else "class"
+    target = get(name)
+    kind = "function"
+    if isinstance(target, type):
+        kind = "exception" if issubclass(target, BaseException) else "class"
     places = named().get(name, [])
-    seen = f"\nNamed in: {', '.join(f':doc:`/{place}`' for place in places)}.\n" if places else ""
+    links = f"\nNamed in: {', '.join(f':doc:`/{place}`' for place in places)}.\n" if places else ""
     package, _, last = name.rpartition(".")
-    return f":orphan:\n\n{title(name)}\nOf :doc:`{package}`.\n\n.. currentmodule:: {package}\n\n.. auto{kind}:: {last}\n{seen}"
+    return f":orphan:\n\n{title(name)}\nOf :doc:`{package}`.\n\n.. currentmodule:: {package}\n\n.. auto{kind}:: {last}\n{links}"
 
 
 def package_page(package: ModuleType) -> str:

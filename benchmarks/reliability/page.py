@@ -14,11 +14,18 @@ from typing import Any
 from campaign import LONGEST_S, RESULTS
 
 PAGE = Path(__file__).parents[2] / "docs" / "reliability.md"
-INTRODUCTION = f"""# Reliability: what was tried
+INTRODUCTION = f"""# Reliability
 
-What kros states was tested against independent truths on random, damaged and adversarial inputs. This page is written by `benchmarks/reliability/page.py`
-from the results of the campaigns in that folder, each of which can be run again, with another `--seed` or `--count`. A case that takes longer than
-{LONGEST_S:g} s counts as a failure, as do a false bound, an exception other than kros's own with a reason, and a change that nobody is told of.
+*How was kros tested for wrong results, beyond its own tests?*
+
+```console
+$ python benchmarks/reliability/formulas.py --seed 1
+```
+
+Each campaign runs kros on random, damaged or adversarial inputs and compares the results with an independent truth. A
+case fails if a bound is false, if an exception other than those of kros occurs, or if a change of the input remains
+unreported. A case that takes longer than {LONGEST_S:g} s fails, too. `benchmarks/reliability/page.py` generates this page
+from `benchmarks/reliability/results`, where notes on single rows are.
 
 """
 
@@ -35,31 +42,23 @@ def render() -> str:
     failed = sum(sum(tally["failures"].values()) for result in results.values() for tally in result["tallies"])
     summary = f"**{tried} cases in {len(results)} campaigns, {failed} failures.**\n"
     waiting = sorted({path.stem for path in Path(__file__).parent.glob("*.py")} - results.keys() - {"campaign", "page"})
-    missing = (
-        f"\nWithout a result in this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
-    )
+    missing = f"\nNot run for this version: {', '.join(f'`{name}.py`' for name in waiting)}.\n" if waiting else ""
     return INTRODUCTION + summary + missing + "".join(_campaign(name, result) for name, result in results.items())
 
 
 def _campaign(name: str, result: dict[str, Any]) -> str:
-    rows = "".join(_row(tally) for tally in result["tallies"])
-    notes = "".join(
-        f"\n{tally['cases'].capitalize()}: {tally['note'].strip()}\n" for tally in result["tallies"] if tally["note"]
-    )
-    command = f"`python benchmarks/reliability/{name}.py --seed {result['seed']}`, {result['seconds'] / 60:.1f} minutes on one core"
-    head = "| cases | compared with | tried | outcomes | failures | slowest (s) |\n|---|---|---|---|---|---|\n"
-    return f"\n## {result['title']}\n\n{command}\n\n{head}{rows}{notes}"
+    """Return a section: the truths that a campaign compares with, and a row for each of its kinds of cases."""
+    tallies = result["tallies"]
+    truths = dict.fromkeys(tally["truth"] for tally in tallies)
+    rows = "".join(_row(tally) for tally in tallies)
+    command = f"`{name}.py --seed {result['seed']}`, {result['seconds'] / 60:.1f} minutes on one core."
+    head = "| cases | number | outcomes | failures |\n|---|---|---|---|\n"
+    return f"\n## {result['title']}\n\n{command} Compared with: {'; '.join(truths)}.\n\n{head}{rows}"
 
 
 def _row(tally: dict[str, Any]) -> str:
-    cells = [
-        tally["cases"],
-        tally["truth"],
-        str(tally["tried"]),
-        _counts(tally["outcomes"]),
-        _counts(tally["failures"]),
-    ]
-    return f"| {' | '.join(cells)} | {tally['slowest_s']:.2g} |\n"
+    cells = [tally["cases"], str(tally["tried"]), _counts(tally["outcomes"]), _counts(tally["failures"])]
+    return f"| {' | '.join(cells)} |\n"
 
 
 def _counts(counts: dict[str, int]) -> str:

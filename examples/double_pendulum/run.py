@@ -1,4 +1,4 @@
-"""Run `study.toml` on the measured recordings: dfki_double_pendulum below the folder that the environment variable KROS_DATA names."""
+"""Run `study.toml` on the measured recordings: `dfki_double_pendulum` in the folder of the environment variable KROS_DATA."""
 
 import os
 import sys

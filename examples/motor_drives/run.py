@@ -1,6 +1,6 @@
-"""Make the paper's study, on the published recordings where `--recordings` names their folder, else on simulated drives in the same layout.
+"""Run the paper's study on the published recordings (`--recordings` names their folder) or on simulated drives.
 
-Options that are not listed go on to `kros run`.
+Options that are not listed are passed to `kros run`.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 
 
 def call(*arguments: object) -> None:
-    """Call the command line, and end with its exit code where something is wrong."""
+    """Call the command line, and end with its exit code if it fails."""
     if code := app([str(argument) for argument in arguments], standalone_mode=False):
         sys.exit(code)
 

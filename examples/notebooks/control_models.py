@@ -2,16 +2,18 @@
 Uncertainty of models you have: lists of python-control systems
 ===============================================================
 
-You have a model of every machine, from whatever identification you use, and want what robust control asks for: a nominal model, a form of uncertainty and
-weights. Nothing of recordings, liftings or observers is needed for that. The models are ``control.ss``, ``control.tf`` or ``control.frd``, continuous or
-discrete; nominal and weights come back as such.
+I have a model of every machine. What are the nominal model and the weights for robust control?
+
+The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss``,
+``control.tf`` or ``control.frd``, continuous or discrete. Nominal and weights are returned as systems of python-control.
 """
 
 # %%
 # The models
 # ----------
 #
-# Eight servo axes: a motor drives a load through a shaft. Inertias, friction, stiffness and gain of the amplifier differ by 3 to 20 percent.
+# Eight servo axes: a motor drives a load through a shaft. Inertias, friction, stiffness and gain of the amplifier differ by
+# 3 to 20 percent.
 
 import control
 import numpy as np
@@ -55,8 +57,8 @@ print(models["axis 1"])
 # inverse output multiplicative  :math:`(G_p - G)G_p^+`
 # =============================  =================================
 #
-# All six are computed at once, for every choice of the nominal, whichever is asked for. An axis has two outputs and one input, so that a form with one
-# residual at the input can leave out what differs between the outputs; the misfit says how much.
+# kros computes all six. An axis has two outputs and one input. A form with one residual at the input cannot represent
+# differences between the outputs; ``misfit`` is the approximation error.
 
 from kros.interop import quantify_models
 from kros.uncertainty import Form
@@ -70,10 +72,10 @@ for form, result in results.items():
     print(f"{form.value:30s} {model.nominal_id:8s} {peak:9.1f}  {misfit:6.3f}  {states}")
 
 # %%
-# Peaks of different forms cannot be compared: an additive residual is the difference itself, a multiplicative one its ratio to the plant. A multiplicative
-# residual below one (0 dB) leaves the phase of the plant within 90 degrees, and an inverse one below one leaves every member of the set well posed. At low
-# frequencies gain and friction differ, near 12 Hz the shaft's resonance, and above it inertias. The output multiplicative form leaves nothing out and is
-# below -10 dB everywhere; it is taken here.
+# Peaks of different forms are not comparable. An additive residual is the difference itself; a multiplicative one is relative
+# to the plant. If an inverse residual is below one (0 dB), every plant in the set is well-posed. At low frequencies the axes
+# differ in gain and friction, near 12 Hz in the resonance of the shaft, and above it in the inertias. The output multiplicative
+# form has no approximation error and is below -10 dB everywhere, so we take it.
 
 import matplotlib.pyplot as plt
 
@@ -92,7 +94,7 @@ plt.show()
 # Nominal and weights
 # -------------------
 #
-# The result is made of python-control systems. ``certificate`` says in words where the bound is known to hold.
+# The result consists of python-control systems. ``certificate`` states where the bound holds.
 
 chosen = results[Form.OUTPUT_MULTIPLICATIVE]
 print("nominal:", chosen.model.nominal_id)
@@ -108,8 +110,8 @@ kros.report.plot(chosen.model)
 # Check it by hand
 # ----------------
 #
-# With python-control and numpy alone: every axis is in the set, :math:`\bar\sigma(W_L^{-1} E W_R^{-1}) \le 1`. Weights act on scaled signals, whose scales
-# are in the result.
+# We verify :math:`\bar\sigma(W_L^{-1} E W_R^{-1}) \le 1` for every axis with python-control and numpy alone. Weights act on
+# scaled signals; the scales are in the result.
 
 omega = 2 * np.pi * np.geomspace(0.1, 100, 1000)
 

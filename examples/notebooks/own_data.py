@@ -2,19 +2,21 @@
 From your own arrays to a running observer
 ==========================================
 
-Eight machines of one batch were recorded on a test bench, with a sensor more than the product will have. From these arrays comes one observer that runs on
-every machine of the batch, also on those that were never recorded, and that is certified for a set which contains them all.
+How do I get from arrays of recordings to an observer?
 
-The machines here are pendulums driven by a motor: the encoder of the angle is built into every one, the rate was recorded on the bench alone. Replace the
-first cell by your own arrays and the names behind them; the rest stays as it is.
+Eight machines of one batch were recorded on a test bench, which has one sensor more than the product. From these arrays we
+design one observer for all machines of the batch.
+
+The machines are pendulums driven by a motor. Every machine has an encoder for the angle. The rate was recorded on the bench
+only. Replace the first cell by your own arrays and their names; the other cells stay as they are.
 """
 
 # %%
 # The recordings
 # --------------
 #
-# A recording is an array with one row a sample and one column a channel: states first, inputs behind them. Recordings of one machine are a list, and
-# machines are the keys of a dictionary. Every machine has its own gravity, damping and gain:
+# Each episode is an array of shape (samples, channels): states first, then inputs. The episodes of one machine are a list,
+# and the machines are the keys of a dictionary. Gravity, damping and gain differ from machine to machine:
 #
 # .. math:: \ddot\theta = -a \sin\theta - b \dot\theta + g u
 
@@ -58,7 +60,7 @@ for name in "ABCDEFGH":
     recordings[name] = [record(parameters)[0] for _ in range(5)]
 
 # %%
-# Say what the columns are, and which states the observer will be given when it runs.
+# Name the columns, and the states that are measured at run time.
 
 import kros
 
@@ -76,8 +78,8 @@ kros.report.plot(population)
 # Identify
 # --------
 #
-# The restoring torque goes with the sine of the angle, so that is the function to lift with: the model of a machine is linear in angle, rate and sine.
-# Linear models without it are identified beside it. The last episode of every machine is held out.
+# The restoring torque is proportional to the sine of the angle, so we lift with this function: the model of a machine is
+# linear in angle, rate and sine. kros also identifies linear models without it. The last episode of every machine is held out.
 
 models = kros.identify(population, lifting=["sin(angle)"])
 print(models)
@@ -87,8 +89,8 @@ kros.report.plot(models)
 # Quantify how the machines differ
 # --------------------------------
 #
-# Six forms of uncertainty are computed at once. *Additive* describes any difference exactly; forms that leave something out are said to do so in a warning.
-# The nominal machine is the one from which the farthest other is nearest. The last panel shows every machine below one: the set contains all of them.
+# kros computes six forms of uncertainty. The additive form represents every difference exactly. The nominal machine is the
+# one from which the farthest other machine is nearest. In the last panel all machines are below one: the set contains them.
 
 uncertain = kros.quantify(models, form="additive")
 found = uncertain.sets["koopman"]
@@ -100,8 +102,8 @@ kros.report.plot(uncertain)
 # Synthesize
 # ----------
 #
-# One observer for the whole set, with the smallest bound of its mean square error over all members of the set. ``kros.synthesize(uncertain)`` without the
-# name of a method tries them all and returns what a study would deploy, which takes longer.
+# ``worst_case_h2`` minimises the mean square error over the uncertain set. Without the name of a method,
+# ``kros.synthesize(uncertain)`` compares all methods and returns the observer that a study would deploy. That takes longer.
 
 design = kros.synthesize(uncertain, "worst_case_h2", methods=())
 linear = kros.synthesize(uncertain, "linear/worst_case_h2", methods=())
@@ -110,11 +112,11 @@ print(linear)
 kros.report.plot(design, models=models)
 
 # %%
-# Run it on a machine that nobody recorded
-# ----------------------------------------
+# Run it on a new machine
+# -----------------------
 #
-# A ninth machine of the batch, from which nothing was learned. ``step`` takes the measurement and the input of a sample and returns the estimate of the next
-# one, which is what a controller needs.
+# The ninth machine of the batch took no part in the design. ``step`` takes the measurement and the input of one sample and
+# returns the estimate of the next sample.
 
 recording, truth = record(machine())
 
@@ -157,10 +159,10 @@ below.legend(loc="upper right", ncols=3, fontsize="small")
 plt.show()
 
 # %%
-# Keep it
+# Save it
 # -------
 #
-# A design is a folder of JSON and arrays, and comes back as it was. ``kros.export.export_c`` writes the observer as C99 with a self-test, for the board.
+# A design is saved as a folder with JSON and arrays. ``kros.export.export_c`` writes the observer as C99 with a self-test.
 
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -1,7 +1,8 @@
-"""Run `study.toml` on the measured recordings: pneumatic_cc0 below the folder that the environment variable KROS_DATA names.
+"""Run `study.toml` on the measured recordings: `pneumatic_cc0` in the folder of the environment variable KROS_DATA.
 
-Stroke is what the test bench imposes; its speed and the sign of it, which friction follows, are inputs as well. They are differences of
-samples that lie in the past, so that a running observer can take them. The mean of each signal over the first 70 % is taken off.
+The test bench imposes the stroke. Its speed and the sign of its speed, on which friction depends, are inputs as well.
+They are differences of past samples, so that a running observer can compute them. The mean of each signal over the first
+70 % is subtracted.
 """
 
 from __future__ import annotations

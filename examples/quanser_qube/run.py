@@ -1,4 +1,4 @@
-"""Run `study.toml` on the measured recordings: quanser_qube below the folder that the environment variable KROS_DATA names."""
+"""Run `study.toml` on the measured recordings: `quanser_qube` in the folder of the environment variable KROS_DATA."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""The examples in docstrings and documents run, the configurations in documents are valid, and the README stays short."""
+"""The examples in docstrings and documents run, the configurations in documents are valid, and pages keep their form and length."""
 
 from __future__ import annotations
 
@@ -10,14 +10,18 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import pytest
+import typer
 
 import kros
+from kros.cli import app
 from kros.core import ConfigError
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = sorted([*(ROOT / "docs").glob("*.md"), *ROOT.glob("*.md"), *(ROOT / "examples").rglob("*.md")])
+PAGES = sorted((ROOT / "docs").glob("*.md"))
 MODULES = sorted(m.name for m in pkgutil.walk_packages(kros.__path__, "kros."))
 
 
@@ -74,6 +78,13 @@ def test_examples_of_documents_run(path: Path) -> None:
     assert run_examples([doctest.DocTestParser().get_doctest(text, {}, path.name, str(path), 0)]) == []
 
 
+@pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
+def test_python_of_pages_is_run(path: Path) -> None:
+    """A block is a doctest, or the tutorial's, which `tests/e2e/test_tutorial.py` runs."""
+    python = blocks(path.read_text(encoding="utf-8"), "python")
+    assert path.name == "tutorial.md" or [block for block in python if not block.startswith(">>> ")] == []
+
+
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
 def test_configurations_of_documents_are_valid(path: Path) -> None:
     for block in blocks(path.read_text(encoding="utf-8"), "toml"):
@@ -83,6 +94,54 @@ def test_configurations_of_documents_are_valid(path: Path) -> None:
 @pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
 def test_names_in_documents_exist(path: Path) -> None:
     assert unknown_names(path.read_text(encoding="utf-8")) == []
+
+
+def command(names: list[str]) -> Any:
+    """The command that a line begins with; None if it does not exist."""
+    command: Any = typer.main.get_command(app)
+    for name in names:
+        if not hasattr(command, "commands"):
+            return command
+        command = command.commands.get(name)
+        if command is None:
+            return None
+    return command
+
+
+def unknown_commands(text: str) -> list[str]:
+    """Lines of consoles with a command or an option that kros does not have."""
+    lines = re.findall(r"^\$ (?:\S*/)?kros (.*?)(?:\s+#.*)?$", "\n".join(blocks(text, "console")), flags=re.MULTILINE)
+    unknown = []
+    for line in lines:
+        words = line.split(" && ")[0].split()
+        called = command([word for word in words if not word.startswith("-")])
+        options = {word.partition("=")[0] for word in words if word.startswith("--")} - {
+            "--help",
+            "--version",
+            "--debug",
+        }
+        known = {option for parameter in called.params for option in parameter.opts} if called else set()
+        if called is None or not options <= known:
+            unknown.append(line)
+    return unknown
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_commands_in_documents_exist(path: Path) -> None:
+    assert unknown_commands(path.read_text(encoding="utf-8")) == []
+
+
+def test_unknown_commands_are_found() -> None:
+    text = "```console\n$ kros runs study.toml\n$ .venv/bin/kros run study.toml --set a.b=1  # why\n$ kros check a b --jsn\n```\n"
+    assert unknown_commands(text) == ["runs study.toml", "check a b --jsn"]
+
+
+@pytest.mark.parametrize("path", DOCUMENTS, ids=[str(p.relative_to(ROOT)) for p in DOCUMENTS])
+def test_functions_in_c_of_documents_are_generated(path: Path) -> None:
+    header = (ROOT / "src/kros/export/c99/templates/observer.h.jinja").read_text(encoding="utf-8")
+    declared = set(re.findall(r"\{\{ name \}\}_(\w+?)(?:\{\{ \w+ \}\})?\(", header))
+    called = set(re.findall(r"\baxis_(\w+)\(", "\n".join(blocks(path.read_text(encoding="utf-8"), "c"))))
+    assert {name for name in called if name not in declared and name.rpartition("_")[0] + "_" not in declared} == set()
 
 
 def test_an_unknown_key_is_found() -> None:
@@ -102,10 +161,45 @@ def test_page_of_reliability_is_that_of_the_results(monkeypatch: pytest.MonkeyPa
     )
 
 
-def test_the_drawn_ways_name_modules_that_are_there() -> None:
-    drawn = re.findall(r">([a-z_/0-9]+\.py)<", (ROOT / "docs" / "two-ways.svg").read_text())
-    assert len(drawn) <= 16
-    assert [name for name in drawn if not (ROOT / "src" / "kros" / name).is_file()] == []
+def opening(text: str) -> str:
+    """What stands before the first heading of a section."""
+    return re.split(r"^## ", text, maxsplit=1, flags=re.MULTILINE)[0]
+
+
+def without_question_or_example(text: str) -> list[str]:
+    """What a page lacks: the reader's question, or an example, within its first forty lines."""
+    first = "\n".join(text.splitlines()[:40])
+    question = re.search(r"\*[^*]+\?\*", " ".join(opening(text).split()))
+    example = re.search(r"^```(python|console|toml)$", first, flags=re.MULTILINE)
+    return [what for what, there in (("question", question), ("example", example)) if not there]
+
+
+@pytest.mark.parametrize("path", PAGES, ids=[path.name for path in PAGES])
+def test_pages_begin_with_a_question_and_an_example(path: Path) -> None:
+    assert without_question_or_example(path.read_text(encoding="utf-8")) == []
+
+
+def test_a_page_without_question_is_found() -> None:
+    assert without_question_or_example("# A\n\nWhat?\n\n## B\n\n*Why?*\n") == ["question", "example"]
+
+
+MOST_WORDS = {"README.md": 950, "docs/limits.md": 1200, "docs/*.md": 26_000}
+
+
+@pytest.mark.parametrize("pattern", MOST_WORDS)
+def test_documents_stay_short(pattern: str) -> None:
+    assert sum(len(path.read_text(encoding="utf-8").split()) for path in ROOT.glob(pattern)) <= MOST_WORDS[pattern]
+
+
+def test_the_glossary_has_at_most_forty_terms() -> None:
+    rows = re.findall(r"^\| (?!-)", (ROOT / "docs" / "glossary.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    assert 20 < len(rows) - 1 <= 40
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (ROOT / "docs" / "index.md").read_text(encoding="utf-8")
+    listed = "\n".join(blocks(index, r"\{toctree\}")).split()
+    assert sorted({path.stem for path in PAGES} - {"index"} - set(listed)) == []
 
 
 def page_of_keys(monkeypatch: pytest.MonkeyPatch) -> str:

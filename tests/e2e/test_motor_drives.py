@@ -1,4 +1,4 @@
-"""The paper's study among the examples: its settings are those that are published, and its table of claims says what metrics.json says."""
+"""The paper's study among the examples: its settings are those that are published, and its table of claims agrees with metrics.json."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_settings_are_the_published_ones():
 
 def test_claims_are_those_of_the_run(claims, metrics):
     found = list(claims.claims(metrics))
-    assert all(section and says and answer for section, says, answer in found)
+    assert all(section and claim and answer for section, claim, answer in found)
     assert [len(row.split(" | ")) for row in claims.table(metrics).splitlines()] == [3] * (len(found) + 2)
 
     def band(kind):
@@ -42,7 +42,7 @@ def test_claims_are_those_of_the_run(claims, metrics):
         )
 
     ratio = 10 * math.log10(band("koopman_edmd") / band("linear_edmd"))
-    (ripple,) = [answer for _, says, answer in found if "off-nominal" in says and "gearbox" in says]
+    (ripple,) = [answer for _, claim, answer in found if "off-nominal" in claim and "gearbox" in claim]
     assert ripple.endswith(f"current {ratio:+.1f} dB")
     assert ratio < 0
 

@@ -6,7 +6,7 @@ r"""The error of an observer that retracts and lifts its state at every step, as
      p │    └────────────────────────────┘   │ q
        └────────────── diag(d_k) ◄───────────┘            -1 <= d_k <= 1 in every entry, arbitrary from step to step
 
-For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this exactly (`docs/relift.md`
+For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this exactly (`docs/proofs.md`
 has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i its slope at a point between the two, hence in the
 box of its slopes; the middle of the box goes into A, every entry that can move into a channel of its own.
 

@@ -92,6 +92,7 @@ def filters(functions=GEAR, cut=False):
         0.9,
         np.array([0.0, 0.3, 1.0]),
         np.array([[0, 0, 0], [0.5, 0.2, 1], [1, 0.4, 1]]),
+        np.array([0.05]),
     )
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))

@@ -142,7 +142,7 @@ def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
     lifting = Lifting(("position", "filter_1", "position_from_inputs"), (), (), ("torque",), ("1",))
     bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "memory": 0.5} | changes
-    own = FilterBank(**{"levels": np.array([0.0, 1.0]), "shares": np.array([[0.0], [1.0]])} | bank)
+    own = FilterBank(**{"levels": np.array([0.0, 1.0]), "shares": np.array([[0.0], [1.0]]), "reach": np.ones(1)} | bank)
     none = gain(np.zeros((3, 1)), 0.01)
     return Observer(
         "f", lifting, 0.5 * np.eye(3), np.ones((3, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=own

@@ -127,7 +127,9 @@ class ObserverData:
             )
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.bank is not None:
-            self.bank.require_fit(self.name, len(self.recorded), n, self.A.shape[0] + self.B.shape[1])
+            self.bank.require_fit(
+                self.name, len(self.recorded), n, self.A.shape[0] + self.B.shape[1], len(self.measured)
+            )
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."

@@ -137,7 +137,7 @@ def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
     _known(content, [*observer_content(observer), *optional], where)
     about = content.get("about", {})
     _require(isinstance(about, dict), f"{where}: about should be an object", about)
-    return replace(observer, bank=_bank(content.get("filter_bank"), lifting.n_states, n + m, where), about=about)
+    return replace(observer, bank=_bank(content.get("filter_bank"), lifting.n_states, n + m, q, where), about=about)
 
 
 def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
@@ -228,19 +228,21 @@ def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
     return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
 
 
-def _bank(found: Any, n: int, columns: int, where: str) -> FilterBank | None:
+def _bank(found: Any, n: int, columns: int, measured: int, where: str) -> FilterBank | None:
     if found is None:
         return None
     _known(found, FilterBank.__dataclass_fields__, f"{where}: filter_bank")
     count = len(found["levels"]) if isinstance(found["levels"], list) else 0
     recorded = len(found["forget"]) if isinstance(found["forget"], list) else 0
-    shapes = {"forget": (1, recorded), "levels": (1, count)}
+    shapes = {"forget": (1, recorded), "levels": (1, count), "reach": (1, measured)}
     rows = {k: matrix([found[k]], shape, f"{where}: filter_bank.{k}")[0] for k, shape in shapes.items()}
     start = matrix(found["start"], (n, columns), f"{where}: filter_bank.start")
     shares = matrix(found["shares"], (count, recorded), f"{where}: filter_bank.shares")
     _require(type(found["filters"]) is int, f"{where}: filter_bank.filters should be a whole number", found["filters"])
     _require(_is_finite(found["memory"]), f"{where}: filter_bank.memory should be a number", found["memory"])
-    return FilterBank(found["filters"], start, rows["forget"], float(found["memory"]), rows["levels"], shares)
+    return FilterBank(
+        found["filters"], start, rows["forget"], float(found["memory"]), rows["levels"], shares, rows["reach"]
+    )
 
 
 def _guard(found: Any, n: int, order: int, where: str) -> Guard | None:

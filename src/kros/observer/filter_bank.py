@@ -1,16 +1,16 @@
 r"""What makes an observer a filter bank: how it starts, and what stands for measurements that are missing.
 
-A filter bank feeds nothing back that it estimates. Behind the recorded states x its internal states are the filters z of measurements and inputs, and
+While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its internal states are the filters z of measurements and inputs, and
 the filters w of inputs alone with their own estimate :math:`x^u` of all recorded states. While measurements arrive, the estimate is that of z. The
 fallback
 
 .. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
 
-continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. It stands for measurements that are missing. When one
-returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is corrected by
-:math:`r (y - f) / (g + 1)` after g samples. With the level :math:`m_{k+1} = \lambda m_k + (1 - \lambda) [\text{missing}]` the estimate changes over
-from z to the fallback by shares :math:`\beta(m)` that training chose. All of this is stable for any pattern of losses: every recursion is a
-contraction driven by bounded signals.
+continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. With the level :math:`m = 1 - \lambda^g` of a gap
+of g samples so far, zero as soon as all measurements arrive, the estimate changes over from z to the fallback by shares :math:`\beta(m)` that training
+chose. A missing measurement is replaced by its estimate, at most :math:`(1 - m)` times a reach away from the fallback: what the filters see is bounded
+for any pattern of losses, and so are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
+ramp was run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ..core.errors import DataError, DimensionError
 
 Array = npt.NDArray[np.float64]
-_ARRAYS = ("start", "forget", "levels", "shares")
+_ARRAYS = ("start", "forget", "levels", "shares", "reach")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +46,8 @@ class FilterBank:
         Levels m, increasing from zero to one.
     shares : ndarray, shape (k, n)
         beta at these levels, between zero and one; on straight lines between them.
+    reach : ndarray, shape (q,)
+        Largest distance between what stands for a missing measurement and the fallback, at level zero.
 
     Raises
     ------
@@ -59,24 +61,27 @@ class FilterBank:
     memory: float
     levels: Array
     shares: Array
+    reach: Array
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         shares = [self.forget, self.shares, self.levels, np.array(self.memory)]
-        if not np.isfinite(self.start).all() or not all(((v >= 0) & (v <= 1)).all() for v in shares):
+        if not (np.isfinite(self.start).all() and np.isfinite(self.reach).all() and (self.reach >= 0).all()) or not all(
+            ((v >= 0) & (v <= 1)).all() for v in shares
+        ):
             raise DataError(
-                f"Filter bank: the start should be finite, and forget {self.forget}, memory {self.memory}, levels and shares between 0 and 1."
+                f"Filter bank: start and reach should be finite, and forget {self.forget}, memory {self.memory}, levels and shares between 0 and 1."
             )
         if not (len(self.levels) == len(self.shares) and (np.diff(self.levels) > 0).all()):
             raise DataError(f"Filter bank: levels {self.levels} should increase, with shares for each.")
 
-    def require_fit(self, name: str, recorded: int, n: int, columns: int) -> None:
+    def require_fit(self, name: str, recorded: int, n: int, columns: int, measured: int) -> None:
         """Refuse arrays of another size than the observer's."""
-        sizes = (self.start.shape, self.forget.shape, self.shares.shape[1:])
-        if sizes != ((n, columns), (recorded,), (recorded,)) or not 0 <= self.filters <= n - 2 * recorded:
+        sizes = (self.start.shape, self.forget.shape, self.shares.shape[1:], self.reach.shape)
+        if sizes != ((n, columns), (recorded,), (recorded,), (measured,)) or not 0 <= self.filters <= n - 2 * recorded:
             raise DimensionError(
-                f"Observer {name}: its filter bank should have a start {(n, columns)} and {recorded} values of forget and shares, found {sizes}, and "
+                f"Observer {name}: its filter bank should have a start {(n, columns)} and {recorded} values of forget and shares and {measured} of reach, found {sizes}, and "
                 f"at most {n - 2 * recorded} filters, found {self.filters}."
             )
 
@@ -86,9 +91,9 @@ class FilterBank:
         part = (level - self.levels[at]) / (self.levels[at + 1] - self.levels[at])
         return np.asarray(self.shares[at] + part[..., None] * (self.shares[at + 1] - self.shares[at]))
 
-    def times(self, x: Array, columns: Array) -> FilterBank:
-        """Return the bank in other units of measure, by the factors of all states and of the columns of `start`."""
-        return replace(self, start=self.start * x[:, None] / columns)
+    def times(self, x: Array, columns: Array, y: Array) -> FilterBank:
+        """Return the bank in other units of measure, by the factors of all states, of the columns of `start` and of measurements."""
+        return replace(self, start=self.start * x[:, None] / columns, reach=self.reach * y)
 
     def turned(self, turn: Array) -> FilterBank:
         """Return the bank for states ``turn @ x``, shape (n, n), which leaves recorded states and fallback alone."""
@@ -117,6 +122,7 @@ class Gaps:
         self.fallback = slice(n - recorded, n)
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
         self.offset, self.level = np.zeros((batch, recorded)), np.zeros(batch)
+        self.held = np.zeros((batch, q))  # the fallback of measurements
         self.filtered = self.expected = np.zeros((batch, recorded))  # by filters and by the fallback, after a step
         self.ramp, self.count = np.zeros((batch, bank.filters, q)), np.zeros((batch, q))
 
@@ -125,21 +131,25 @@ class Gaps:
         for values in (self.offset, self.level, self.ramp, self.count):
             values[rows] = 0.0
 
-    def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> Array:
-        """Put measurements (batch, q) and what stands for missing ones into states (batch, n), bridge gaps that end; return the states before."""
-        expected = (x[:, self.fallback] + self.offset)[:, self.measured]
+    def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
+        """Put measurements (batch, q) and what stands for missing ones into states (batch, n), and bridge gaps that end."""
+        self.held = (x[:, self.fallback] + self.offset)[:, self.measured]
+        reach = (1 - self.level[:, None]) * self.bank.reach
+        near = np.clip(x[:, self.measured] - self.held, -reach, reach)
+        expected = self.held + near
         ends = ~missing & (self.count > 0)
         if ends.any():
             jump = np.where(ends, (np.where(missing, 0.0, y) - expected) / (self.count + 1), 0.0)
             x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
         x[:, self.measured] = np.where(missing, expected, y)
-        return expected
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Change over to the fallback in the next states (batch, n), and move levels, ramps and offsets on; x as `fill` left it."""
         bank, some = self.bank, missing.any(axis=1)
-        offset = bank.forget * (x[:, : self.recorded] - x[:, self.fallback])
-        level = bank.memory * self.level + (1 - bank.memory) * some
+        last = x[:, : self.recorded].copy()
+        last[:, self.measured] = np.where(missing, self.held, last[:, self.measured])
+        offset = bank.forget * (last - x[:, self.fallback])
+        level = np.where(some, bank.memory * self.level + (1 - bank.memory), 0.0)
         count = np.where(missing, self.count + 1, 0.0)
         share = bank.share(level)
         fallback = following[:, self.fallback] + offset

@@ -35,7 +35,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
         monitor=None if observer.monitor is None else observer.monitor.times(y),
         guard=None if observer.guard is None else observer.guard.times(x[: lifting.n_states]),
-        bank=None if observer.bank is None else observer.bank.times(x[: lifting.n_states], np.concatenate([x, u])),
+        bank=None if observer.bank is None else observer.bank.times(x[: lifting.n_states], np.concatenate([x, u]), y),
         sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
     )
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 
-from ...observer import Recordings, Runtime, identify_estimator
+import numpy as np
+
+from ...observer import Recordings, identify_estimator
 from ...observer.limits import sides
 from ...synthesis import Status, Synthesis
 from ..task import DesignResult, DesignTask
@@ -29,10 +31,11 @@ def design_estimator(task: DesignTask) -> DesignResult:
         nominal,
         task.estimator,
     )
-    lower, upper = sides(task.limits, found.observer.lifting.states) if task.limits else (None, None)
+    lower, upper = sides(task.limits, found.observer.lifting.states)
+    bounds = found.observer.runtime
     observer = replace(
         found.observer,
-        runtime=Runtime(0, lower, upper, relift=False),
+        runtime=replace(bounds, lower=np.maximum(lower, bounds.lower), upper=np.minimum(upper, bounds.upper)),
         seen=training.seen,
         sensor=task.sensor,
     )

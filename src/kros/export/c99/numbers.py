@@ -262,6 +262,7 @@ class Source:
             "fallback": o.lifting.n_states - first,
             "start": self.sums(self.realised.start),
             "forget": self.numbers(own.forget),
+            "reach": self.numbers(own.reach),
             "memory": self.precision.literal(own.memory),
             "rest": self.precision.literal(1 - own.memory),
             "levels": self.numbers(own.levels[:-1]),

@@ -14,9 +14,10 @@ from ...lifting import Lifting
 from ...synthesis.result import Injection
 from ..filter_bank import FilterBank
 from ..observer import Observer
+from ..runtime import Runtime
 from .bank import Bank
 from .channels import FAMILIES, Channels, channels_of
-from .gaps import forgetting, shares_of
+from .gaps import with_gaps
 from .reduction import Filters, reduced
 from .regression import Design, Readout, Recordings
 from .settings import EstimatorSettings
@@ -86,11 +87,12 @@ def identify_estimator(
     blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
     filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
     first = first_estimate(channels, recordings)
-    observer = assembled(name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {})
-    assert observer.bank is not None
-    forget, memory = forgetting(observer, recordings, settings), settings.memory(readout.design.bank.taps[-1])
-    observer = replace(observer, bank=replace(observer.bank, forget=forget, memory=memory))
-    observer = replace(observer, bank=shares_of(observer, recordings, settings))
+    reach = settings.reach * recordings.size[list(measured)]
+    observer = assembled(
+        name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
+    )
+    observer = replace(observer, bank=with_gaps(observer, recordings, settings))
+    observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
     growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
@@ -108,6 +110,15 @@ def identify_estimator(
         "settle_samples": settle_samples(filters, fallback, observer.bank),
     }
     return Identified(observer, readout, family, facts)
+
+
+def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
+    """Return limits of the estimates of hidden states: their ranges in training, widened by a share."""
+    low, high = recordings.ranges
+    lower, upper = (np.full(observer.lifting.n_states, end) for end in (-np.inf, np.inf))
+    hidden = [i for i in range(len(low)) if i not in observer.measured]
+    lower[hidden], upper[hidden] = (low - room * (high - low))[hidden], (high + room * (high - low))[hidden]
+    return Runtime(0, lower, upper, relift=False)
 
 
 def best_family(
@@ -212,6 +223,7 @@ def assembled(
     first: tuple[Array, Array],
     sample_period_s: float,
     parameters: Mapping[str, float],
+    reach: Array,
 ) -> Observer:
     """Write filters with their readouts into the model of an observer."""
     n, r, s = lifting.n_states, len(filters.A), len(fallback.A)
@@ -241,7 +253,7 @@ def assembled(
     model[at, at] += 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
-    bank = FilterBank(r, start, np.ones(n), 0.0, np.array([0.0, 1.0]), np.zeros((2, n)))
+    bank = FilterBank(r, start, np.ones(n), 0.0, np.array([0.0, 1.0]), np.zeros((2, n)), reach)
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(

@@ -53,7 +53,7 @@ def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSe
 
 def losses(rng: np.random.Generator, shape: tuple[int, int, int]) -> Flags:
     """Return which measurements are missing: independent or in bursts, differing from episode to episode; half of the time all arrive."""
-    n_samples, batch, q = shape
+    n_samples, batch, _ = shape
     missing = np.zeros(shape, dtype=bool)
     for i in range(batch):
         share, mean = rng.choice([0.1, 0.3, 0.5, 0.7, 0.9]), np.exp(rng.uniform(0, np.log(max(2, n_samples / 8))))
@@ -69,21 +69,29 @@ def losses(rng: np.random.Generator, shape: tuple[int, int, int]) -> Flags:
     return missing
 
 
-def shares_of(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
-    """Return the filter bank with shares of the fallback that make the error under simulated losses least, level by level."""
+def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+    """Return the filter bank with the forgetting, memory and shares that make errors under simulated losses least."""
     bank = observer.bank
     assert bank is not None
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
     n, at = len(observer.recorded), list(observer.measured)
     missing = losses(np.random.default_rng(settings.seed), shown[..., at].shape)
     y = np.where(missing, np.nan, shown[..., at])
-    levels = np.array([0.0, 0.05, 0.15, 0.3, 0.5, 0.7, 0.85, 1.0])
-    shares = np.repeat(levels[:, None], n, axis=1)
-    for _ in range(settings.gap_rounds):
-        bank = replace(bank, levels=levels, shares=shares)
-        main, fallback, level = alternatives(replace(observer, bank=bank), y, inputs, parameters)
+    levels = np.append(0.0, np.geomspace(settings.lowest_level, 1.0, settings.levels))
+    bank = replace(
+        bank, forget=forgetting(observer, recordings, settings), levels=levels, shares=np.zeros((len(levels), n))
+    )
+    tried = []
+    for share in settings.memories:
+        one = replace(bank, memory=settings.memory(share))
+        main, fallback, level = alternatives(replace(observer, bank=one), y, inputs, parameters)
         shares = best_shares(states, main, fallback, level, levels)
-    return replace(bank, levels=levels, shares=shares)
+        shares[:, at] = 0.0  # they stand for measurements, near the fallback
+        one = replace(one, shares=shares)
+        estimate = main + one.share(level) * (fallback - main)
+        error = np.mean((estimate - states)[level > 0] ** 2, axis=0)
+        tried.append((float(np.log(np.maximum(error, np.finfo(float).tiny)).mean()), one))
+    return min(tried, key=lambda pair: pair[0])[1]
 
 
 def alternatives(observer: Observer, y: Array, u: Array, parameters: dict[str, Array]) -> tuple[Array, Array, Array]:

@@ -9,7 +9,7 @@ those of coefficients that know neither the unit nor its episodes.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -47,14 +47,17 @@ class Recordings:
     lengths: tuple[int, ...]
     read: Read
     size: Array  # (n,), sizes of the recorded states
+    ranges: tuple[Array, Array]  # (n,), their least and largest values
 
     @classmethod
     def of(cls, keys: Sequence[EpisodeKey], read: Read) -> Recordings:
         """Return the episodes with their lengths and the sizes of their states."""
         batches = [read(key) for key in keys]
-        size = np.max([np.abs(b.states[: b.lengths[0]]).max(axis=(0, 1)) for b in batches], axis=0)
+        low = np.min([b.states[: b.lengths[0]].min(axis=(0, 1)) for b in batches], axis=0)
+        high = np.max([b.states[: b.lengths[0]].max(axis=(0, 1)) for b in batches], axis=0)
+        size = np.maximum(np.abs(low), np.abs(high))
         size[size == 0] = 1.0
-        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size)
+        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size, (low, high))
 
     @property
     def length(self) -> float:
@@ -66,7 +69,7 @@ class Recordings:
         if len(self.keys) <= count:
             return self
         at = np.unique(np.linspace(0, len(self.keys) - 1, count).round().astype(int))
-        return Recordings(tuple(self.keys[i] for i in at), tuple(self.lengths[i] for i in at), self.read, self.size)
+        return replace(self, keys=tuple(self.keys[i] for i in at), lengths=tuple(self.lengths[i] for i in at))
 
     def groups(self, folds: int, parts: int) -> list[Group]:
         """Return the group of every episode: those of one name are in one part, and a unit is in one fold."""
@@ -212,10 +215,12 @@ class Moments:
         weights = weights / weights.sum()
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
+        rounding = 16 * len(gram) * np.finfo(float).eps
         for penalty in penalties:
             A = gram + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
-            yield q[:, None] * cho_solve(cho_factor(A * q[:, None] * q, check_finite=False), q[:, None] * cross)
+            scaled = A * q[:, None] * q + rounding * np.eye(len(q))
+            yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
     def known(self, group: Group) -> npt.NDArray[np.bool_]:
         """Return which groups know neither the units nor the episodes of one; of one fold or one part there is no other."""

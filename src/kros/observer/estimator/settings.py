@@ -59,16 +59,26 @@ class EstimatorSettings(Settings):
         ge=1,
         description="how many times less an error of a measured state counts in the reduction than one of a hidden state",
     )
-    memory_share: float = Field(
+    memories: tuple[float, ...] = Field(
+        (0.3, 1.0, 3.0, 10.0),
+        description="time constants of the level of a gap that are tried, in longest delays; the level decides how far the fallback counts",
+    )
+    room: float = Field(
+        0.5,
+        ge=0,
+        description="share of its range in training by which the estimate of a hidden state may leave it; it is cut off there",
+    )
+    levels: int = Field(8, ge=2, description="levels of a gap at which shares of the fallback are fitted")
+    lowest_level: float = Field(0.01, gt=0, lt=1, description="the lowest of these levels")
+    reach: float = Field(
         0.25,
-        gt=0,
-        description="time constant of the level of losses, as a share of the longest delay; the level decides how far the fallback counts",
+        ge=0,
+        description="share of a measurement's range by which its estimate may differ from the fallback where it is missing",
     )
     gap_samples: int = Field(
         2000, ge=100, description="samples of an episode on which losses are simulated in training"
     )
     gap_episodes: int = Field(12, ge=1, description="episodes on which losses are simulated")
-    gap_rounds: int = Field(2, ge=1, description="rounds in which the shares of the fallback are fitted")
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 
     def lags(self, length: float) -> tuple[float, ...]:
@@ -87,6 +97,6 @@ class EstimatorSettings(Settings):
             edges.append(min(longest, edges[-1] + int(np.ceil(width))))
         return tuple(edges)
 
-    def memory(self, longest: int) -> float:
-        """Return the pole of the level of losses, for a longest delay in samples."""
-        return float(np.exp(-1 / max(1.0, self.memory_share * longest)))
+    def memory(self, share: float) -> float:
+        """Return the pole of the level of a gap, for a time constant in longest delays."""
+        return float(np.exp(-1 / max(1.0, share * self.longest)))

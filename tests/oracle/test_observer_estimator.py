@@ -1,0 +1,217 @@
+"""The filter-bank estimator against what is known otherwise: its system, least squares, exact plants, and straight lines over gaps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import kros
+from kros.data import EpisodeBatch, EpisodeKey
+from kros.lifting import Lifting
+from kros.observer import EstimatorSettings, Observer, Recordings, identify_estimator, run_observer, run_with_status
+from kros.observer.estimator.bank import Bank
+from kros.observer.estimator.channels import FAMILIES, channels_of
+from kros.observer.estimator.reduction import reduced
+from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated
+
+FEW = EstimatorSettings(rows=4000, sample=1500, dense=6, longest=20, gap_samples=300, gap_episodes=4)
+DT = 0.01
+
+
+def plant(units=4, episodes=3, samples=400, spread=0.0):
+    """Return recordings of a second-order plant of which the position is measured; hidden are its velocity and a lag of the input."""
+    rng, batches = np.random.default_rng(0), {}
+    for unit in range(units):
+        factor = 1 + spread * rng.normal()
+        A, B = np.array([[1, 0.1, 0], [-0.1 * factor, 0.8, 0.2], [0, 0, 0.9]]), np.array([0.0, 0.0, 0.1])
+        for episode in range(episodes):
+            u = np.convolve(rng.normal(size=samples), np.ones(10) / 3, "same")
+            x = np.zeros((samples, 3))
+            for k in range(samples - 1):
+                x[k + 1] = A @ x[k] + B * u[k]
+            key = EpisodeKey(f"{unit}", "", f"{episode}")
+            batches[key] = EpisodeBatch((key,), np.array([samples]), x[:, None], u[:, None, None], DT)
+    return Recordings.of(list(batches), batches.__getitem__), batches
+
+
+LIFTING = Lifting(("position", "velocity", "force"))
+
+
+def design(recordings, family="linear", settings=FEW):
+    ranges = {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}
+    channels = channels_of(LIFTING, (0,), ("u",), family, ranges, settings)
+    return Design(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+
+
+@pytest.fixture(scope="module")
+def exact():
+    recordings, batches = plant()
+    return identify_estimator("plant", LIFTING, (0,), ("u",), recordings, DT, settings=FEW), batches
+
+
+@pytest.fixture(scope="module")
+def motors() -> tuple[Observer, EpisodeBatch]:
+    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    recordings = Recordings.of(list(population.keys()), lambda key: EpisodeBatch.read(population, [key]))
+    found = identify_estimator(
+        "motor", Lifting(population.states), (0,), population.inputs, recordings, 1e-3, settings=FEW
+    )
+    return found.observer, EpisodeBatch.read(population, list(population.keys()))
+
+
+def test_a_bank_is_its_system_and_blocks_are_sums_of_steps():
+    rng = np.random.default_rng(0)
+    bank = Bank(4, 3, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0))
+    v = np.column_stack([rng.normal(size=(60, 3)), np.ones(60)])
+    coarse, fine = bank.rows(v, np.arange(60)), bank.fine.rows(v, np.arange(60))
+    A, B, S = bank.fine.system()
+    state = S @ v[0]
+    for k in range(60):
+        state = A @ state + B @ v[k]
+        np.testing.assert_allclose(state, fine[k], atol=1e-12)
+    coefficients = rng.normal(size=(len(bank), 2))
+    np.testing.assert_allclose(coarse @ coefficients, fine @ bank.refined(coefficients), atol=1e-12)
+    assert (len(bank), len(bank.fine)) == (coarse.shape[1], fine.shape[1])
+
+
+def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
+    recordings, _ = plant(units=3, spread=0.1)
+    made = design(recordings)
+    whitening = Whitening.of(made)
+    moments = Moments.of(made, whitening)
+    penalty = 1e-6
+    (found,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    parts: dict = {}
+    for key, rows, targets, weights in made.rows(recordings, FEW.rows):
+        parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
+    X, T = [], []
+    for own in parts.values():
+        size = np.sqrt(sum(w.sum() for *_, w in own) * len(parts))
+        X += [F * np.sqrt(w)[:, None] / size for F, _, w in own]
+        T += [t * np.sqrt(w)[:, None] / size for _, t, w in own]
+    root = np.linalg.cholesky(whitening.trust + penalty * np.diag(whitening.penalty)).T
+    stacked = np.vstack([*X, root]), np.vstack([*T, np.zeros((len(root), 3))])
+    np.testing.assert_allclose(found, np.linalg.lstsq(*stacked, rcond=None)[0], atol=1e-6 * np.abs(found).max())
+
+
+def test_an_exact_plant_is_estimated_exactly(exact):
+    found, batches = exact
+    batch = next(iter(batches.values()))
+    estimate = run_observer(found.observer, batch.states[..., :1], batch.inputs)
+    error = np.sqrt(np.mean((estimate[1:, 0, :3] - batch.states[1:, 0]) ** 2, axis=0))
+    assert found.family == "linear"
+    assert (error[1:] < 1e-3 * np.abs(batch.states).max(axis=(0, 1))[1:]).all()
+
+
+def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
+    recordings, batches = plant(units=3, spread=0.2)
+    readout = Readout.of(design(recordings))
+    errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2) * recordings.size
+    batch = next(iter(batches.values()))
+    v = readout.design.channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
+    wanted = readout.design.bank.rows(v, np.arange(len(v))) @ readout.coefficients
+    apart = []
+    for order in (1, 3, 6, 12):
+        filters = reduced(readout, errors, order, 0.01)
+        assert np.abs(np.linalg.eigvals(filters.A)).max() < 1
+        z, estimates = filters.S @ v[0], []
+        for row in v:
+            estimates.append(filters.C @ z + filters.D @ row)
+            z = filters.A @ z + filters.B @ row
+        apart.append(np.sqrt(np.mean((np.array(estimates) - wanted)[:, 1:] ** 2)))
+    assert apart[-1] < 0.02 * apart[0]
+
+
+def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
+    recordings, _ = plant(units=3, episodes=2, spread=0.3)
+    settings = FEW.model_copy(update={"parts": 2, "rows": 100_000})
+    readout = Readout.of(design(recordings, settings=settings))
+    key = recordings.keys[0]
+    others = [k for k in recordings.keys if k.unit != key.unit and k.episode != key.episode]
+    alone = replace(recordings, keys=tuple(others), lengths=recordings.lengths[: len(others)])
+    made = design(alone, settings=settings)
+    whitening = Whitening.of(readout.design)
+    moments = Moments.of(made, whitening)
+    penalty = float(readout.penalties[1])
+    (coefficients,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    group = readout.design.groups[key]
+    np.testing.assert_allclose(
+        readout.others[group][:, 1],
+        whitening.directions @ coefficients[:, 1],
+        rtol=1e-4,
+        atol=1e-6 * np.abs(coefficients).max(),
+    )
+
+
+@pytest.mark.parametrize("gap", [1, 7, 40])
+def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
+    observer = exact[0].observer
+    assert observer.bank is not None
+    bank = replace(observer.bank, shares=np.zeros_like(observer.bank.shares), forget=np.ones(3), reach=np.zeros(1))
+    A, B = observer.A.copy(), observer.B.copy()
+    A[-3:], B[-3:] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses a straight line linearly
+    observer = replace(observer, bank=bank, A=A, B=B)
+    y, u = np.linspace(0.0, 2.0, 200)[:, None, None], np.zeros((200, 1, 1))
+    lost = y.copy()
+    lost[100 : 100 + gap] = np.nan
+    found, wanted = (run_observer(observer, given, u) for given in (lost, y))
+    after = slice(101 + gap, None)
+    size = np.abs(wanted[after, 0, :3]).max(axis=0)
+    np.testing.assert_allclose(found[after, 0, :3] / size, wanted[after, 0, :3] / size, atol=1e-8)
+    assert not np.allclose(found[101 : 100 + gap + 1, 0, :3], wanted[101 : 100 + gap + 1, 0, :3])
+
+
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.6, 0.9, 0.95])
+def test_any_pattern_of_losses_leaves_the_estimate_bounded_and_is_forgotten(motors, share):
+    observer, batch = motors
+    rng = np.random.default_rng(int(100 * share))
+    y, size = batch.states[..., :1], np.abs(batch.states).max(axis=(0, 1))
+    lost = rng.random(y.shape) < share
+    lost[0], lost[300:] = False, False
+    estimate, status = run_with_status(observer, np.where(lost, np.nan, y), batch.inputs)
+    assert (np.abs(estimate[..., :3]) < 3 * size).all()
+    assert set(np.unique(status)) <= {0, 1, 4, 5}
+    undisturbed = run_observer(observer, y, batch.inputs)
+    apart = np.abs(estimate - undisturbed)[..., :3].max(axis=1) / size
+    assert (apart[-1] < 0.05).all()
+    assert (apart[-1] <= apart[300:].max(axis=0) + 1e-12).all()
+
+
+def test_batches_and_single_machines_are_alike_with_and_without_gaps(motors):
+    observer, batch = motors
+    y = batch.states[:300, :, :1].copy()
+    y[40:60, 0], y[100::3, 1] = np.nan, np.nan
+    wanted = run_observer(observer, y, batch.inputs[:300])
+    for machine in (0, 1, 2):
+        running = observer.start(y[0, machine])
+        rows = [np.asarray(running.step(y[k, machine], batch.inputs[k, machine])) for k in range(299)]
+        np.testing.assert_allclose(rows, wanted[1:, machine], atol=1e-8 * np.abs(wanted).max())
+
+
+def test_units_of_measure_change_nothing():
+    recordings, batches = plant(units=3, spread=0.1)
+    factors, u_factor = np.array([1000.0, 60.0, 0.01]), 7.0
+    scaled = {
+        key: replace(batch, states=batch.states * factors, inputs=batch.inputs * u_factor)
+        for key, batch in batches.items()
+    }
+    other = Recordings.of(list(scaled), scaled.__getitem__)
+    one, two = (
+        identify_estimator("plant", LIFTING, (0,), ("u",), r, DT, settings=FEW).observer for r in (recordings, other)
+    )
+    batch = next(iter(batches.values()))
+    here = run_observer(one, batch.states[..., :1], batch.inputs)[..., :3]
+    there = run_observer(two, factors[0] * batch.states[..., :1], u_factor * batch.inputs)[..., :3] / factors
+    np.testing.assert_allclose(here, there, atol=1e-4 * np.abs(here).max())
+
+
+def test_families_grow_and_a_measurement_that_never_arrives_is_refused():
+    recordings, _ = plant(units=2, episodes=1)
+    sizes = [len(design(recordings, family).channels) for family in FAMILIES]
+    assert sizes == sorted(set(sizes))
+    with pytest.raises(kros.core.errors.DataError, match="no sample of a measurement arrives"):
+        interpolated(np.full((10, 1), np.nan))
+    line = np.arange(10.0)[:, None]
+    np.testing.assert_allclose(interpolated(np.where(line % 3 == 1, np.nan, line)), line)

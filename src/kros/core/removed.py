@@ -138,6 +138,14 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "key injection.",
         "synthesis.injection",
     ),
+    (
+        "Parts of the phase calibration are no longer public; kros.identify calibrates, and its result has the calibration.",
+        "kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase",
+    ),
+    (
+        "Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.",
+        "kros.identify.lifted_factor kros.identify.reduce_episode",
+    ),
 )
 
 

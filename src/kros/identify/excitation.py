@@ -24,13 +24,11 @@ def require_excitation(
     still = high - low <= _ROUNDING * np.maximum(np.abs(low), np.abs(high))
     dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
     for i, j in np.argwhere(still):
-        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {'zero' if low[i, j] == 0 else 'constant'} ({low[i, j]:g}) over all training episodes"
+        kind = "zero" if low[i, j] == 0 else "constant"
+        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {kind} ({low[i, j]:g}) over all training episodes"
         if not alpha or inputs[j] in dead:
-            remedy = (
-                "declare it as another role or drop the channel"
-                if inputs[j] in dead
-                else "excite it, drop the channel, or use alpha > 0"
-            )
+            zero = "declare it as another role or drop the channel"
+            remedy = zero if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
             raise IdentificationError(
                 f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
             )
@@ -39,10 +37,10 @@ def require_excitation(
 
 def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
     """Refuse lifted data in which one column follows from those before it."""
-    found = dependent_column(factor.R, len(names))
-    if found is not None:
-        unit, column = found
+    dependent = dependent_column(factor.R, len(names))
+    if dependent is not None:
+        unit, column = dependent
         raise IdentificationError(
-            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs before it ({', '.join(names[:column])}) "
-            "on its training episodes; remove it, excite it, or use alpha > 0."
+            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs before it "
+            f"({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
         )

@@ -24,6 +24,7 @@ from ..core.errors import DataError
 from ..core.linalg import qr_triangle
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
+from .edmd import relative_pivots
 
 Array = npt.NDArray[np.float64]
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
@@ -45,12 +46,11 @@ class Factor:
     Examples
     --------
     >>> import numpy as np
-    >>> from kros.identify import reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
-    >>> factor = reduce_episode(x, u, Lifting(("x",)))
-    >>> factor.R.shape, int(factor.n_samples)
-    ((3, 3), 49)
+    >>> from kros.identify import Factor, combine
+    >>> rows = np.random.default_rng(0).normal(size=(3, 49, 2))  # three episodes of [x, u]
+    >>> parts = Factor(np.linalg.qr(rows, mode="r"), np.abs(rows).max(axis=1), np.full(3, 49))
+    >>> combine(parts).R.shape, int(combine(parts).n_samples)
+    ((2, 2), 147)
     """
 
     R: Array
@@ -67,34 +67,7 @@ class Factor:
 
 
 def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
-    """Reduce one episode to its factor.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples, n)
-    u : ndarray, shape (n_samples, m)
-    lifting : Lifting
-
-    Returns
-    -------
-    Factor
-
-    Raises
-    ------
-    DataError
-        When the episode is too short for the lifting's history and one step.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import edmd, reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> u, x = np.random.default_rng(0).normal(size=(50, 1)), np.zeros((50, 1))
-    >>> for k in range(49):
-    ...     x[k + 1] = 0.9 * x[k] + 0.1 * u[k]
-    >>> edmd(reduce_episode(x, u, Lifting(("x",))).R, n_lifted=1).A.round(6).tolist()
-    [[0.9]]
-    """
+    """Reduce one episode to its factor: states x (n_samples, n) and inputs u (n_samples, m)."""
     lifting.window.require(len(x), beyond=1)
     window = lifting.windows(x, u)
     x, u = x[lifting.history :], u[lifting.history :]
@@ -123,13 +96,13 @@ def combine(factors: Factor) -> Factor:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from kros.identify import Factor, combine, reduce_episode
+    >>> import kros
+    >>> from kros.identify import combine, episode_factors
     >>> from kros.lifting import Lifting
-    >>> rng = np.random.default_rng(0)
-    >>> parts = [reduce_episode(rng.normal(size=(50, 1)), rng.normal(size=(50, 1)), Lifting(("x",))) for _ in range(3)]
-    >>> int(combine(Factor.stack(parts)).n_samples)
-    147
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> combine(episode_factors(motors, keys, Lifting(motors.states))).R.shape[0]
+    2
     """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
@@ -181,39 +154,15 @@ def episode_factors(
             f"Factors by episode: {len(keys)} units without an episode among them; pass keys as population.keys(unit) gives them."
         )
     rows = [[reduce_episode(*population.read_parts(key), lifting) for key in episodes] for episodes in keys.values()]
+    values = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
     first = next(f for row in rows for f in row)
     none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
-    own = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
-    stacked = Factor.stack(
-        [Factor.stack([replace(f, input_range=None) for f in row] + [none] * (most - len(row))) for row in rows]
-    )
-    return lifted_factor(stacked, lifting, own, lifting)
+    padded = [[replace(f, input_range=None) for f in row] + [none] * (most - len(row)) for row in rows]
+    return lifted_factor(Factor.stack([Factor.stack(row) for row in padded]), lifting, values, lifting)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
-    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's own lifting.
-
-    Parameters
-    ----------
-    factor : Factor
-        Batch over units.
-    lifting : Lifting
-        The lifting that the factors were reduced with.
-    parameters : dict of ndarray, shape (unit,)
-    model : Lifting
-        The model's lifting: that lifting itself, or the linear one with the same states.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import Factor, lifted_factor, reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> gearbox = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
-    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
-    >>> factor = Factor.stack([reduce_episode(x, u, gearbox)])  # holds sine and cosine, so that any phase is a linear map of it
-    >>> lifted_factor(factor, gearbox, {"phase": np.array([0.3])}, gearbox).R.shape
-    (1, 5, 5)
-    """
+    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's lifting: `lifting` itself, or the linear one."""
     n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
     m = factor.R.shape[-1] - 2 * (n + b) - r
     batch = factor.R.shape[:-2]
@@ -246,9 +195,5 @@ def _peaks(M: Array, peak: Array) -> Array:
 
 def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
     """Return unit and column of the first of `n_columns` that depends on those before it, or None; R (unit, p, p)."""
-    part = R[..., :n_columns]
-    pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(
-        np.linalg.norm(part, axis=-2), np.finfo(float).tiny
-    )
-    found = np.argwhere(pivots < n_columns * np.finfo(float).eps)
-    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
+    dependent = np.argwhere(relative_pivots(R[..., :n_columns]) < n_columns * np.finfo(float).eps)
+    return (int(dependent[0, 0]), int(dependent[0, 1])) if len(dependent) else None

@@ -22,7 +22,7 @@ from .calibration import PhaseCalibration
 from .factors import Factor
 from .kinds import KINDS, kinds_for
 from .model_set import ModelSet
-from .refine.model import RefinedModels
+from .refine.model import Refinement
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -109,8 +109,8 @@ class IdentifiedModels:
         By `place`: kind, and condition where it is not that of synthesis.
     factors : mapping of str to EpisodeFactors
         By condition.
-    refined : mapping of str to RefinedModels
-        What the refinement found out, by kind.
+    refined : mapping of str to Refinement
+        What the refinement brought beside the models, by kind.
 
     Examples
     --------
@@ -129,7 +129,7 @@ class IdentifiedModels:
     kinds: tuple[str, ...] = ()
     sets: Mapping[str, ModelSet] = field(default_factory=dict)
     factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)
-    refined: Mapping[str, RefinedModels] = field(default_factory=dict)
+    refined: Mapping[str, Refinement] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         facts = self.facts
@@ -225,7 +225,7 @@ class IdentifiedModels:
         factors = Stored(
             EpisodeFactors.load, {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
         )
-        refined = Stored(RefinedModels.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
+        refined = Stored(Refinement.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
         lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)

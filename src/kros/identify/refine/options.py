@@ -2,24 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ...core.errors import ConfigError
-
-LARGEST_RESIDUAL = (
-    0.5  # peak residual beyond which the set of models that covers a population is too large for a robust observer
-)
-NEGLIGIBLE_RESIDUAL = 0.1  # peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides
-TOLERANCE = 0.1  # the strongest prior whose held-out error exceeds the lowest by no more than this share is chosen
-GUARD = 2e-3  # spectral radii above one less this are penalised, so that the search slides along the edge of stability
-ALPHA_FACTOR = 4.0  # the start is a pooled EDMD model with this times the smallest alpha that stabilises it
-LEAST_GAIN = 1e-3  # relative decrease of the cost below which a horizon is done
-SEED = 0  # where the segments start
+from .gauss_newton import GaussNewton
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Settings of `refine_population`.
+    """Settings of `refine_population`; all errors are of channels divided by their ranges.
 
     Parameters
     ----------
@@ -27,24 +18,55 @@ class RefineOptions:
         Samples of the free runs, from short to long; the last is the one that the result minimises.
     segments : int
         Stretches of recordings used of every unit, spread over its training episodes.
+    pooled_segments : int
+        Segments of all units together from which the pooled model is sought; it is finished on all.
+    compared : int
+        Residuals of a state that a segment contributes, at least: at long horizons neighbouring errors say the same.
+    seed : int
+        Where the segments start.
+    starts : tuple of (int, float)
+        First horizons and weighings from which the pooled model is sought, since the cost has several minima; the end whose whole free
+        runs are best is taken.
+    balance : float
+        A state's error counts in units of ``error**balance``, with the free-run error of the EDMD model: 0 weighs states by their
+        range, 1 asks every state for the same improvement.
+    least_error : float
+        Least free-run error, relative to a state's range: exact data have none to scale by.
+    trial_iterations : int
+        Steps within the edge of stability before the ends of the starts are compared.
+    shortenings : int
+        Steps in which the rows of lifted functions are shortened when a model is unstable.
+    penalties : int
+        Decades over which the weight of the edge of stability then grows.
+    alpha_factor : float
+        The pooled EDMD model has this times the smallest alpha that stabilises it.
     strengths : tuple of float
         Strengths of the prior to choose from, tried from the strongest on until weaker ones do not improve the held-out error. At 1 a
         residual of one at all frequencies costs as much as the free-run error of the pooled model (with ``power = 1``; see `metric`).
-    balance : float
-        A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
-        model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
-    starts : tuple of (int, float)
-        First horizons and weighings from which the pooled model is sought; the end whose whole free runs are best is taken.
-    pooled_segments : int
-        Segments of all units together from which the pooled model is sought; it is finished on all.
+    patience : int
+        Strengths over which the held-out error must improve by half of `tolerance`.
+    tolerance : float
+        The strongest prior whose held-out error exceeds the lowest by no more than this share is chosen.
+    largest_residual : float
+        Peak residual beyond which the set of models that covers a population is too large for a robust observer.
+    negligible_residual : float
+        Peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides.
+    prior_level, prior_power : float
+        Residual up to which the prior is quadratic, and the power beyond it, which flattens the residual's peak.
+    row_weight : float
+        Of a lifted function's one-step error against a state's free-run error, which it does not enter.
     margin : float
         Stable means a spectral radius below ``1 - margin``.
-    iterations : int
-        Most steps of Levenberg-Marquardt per horizon of the pooled model, and of the units at the strength chosen.
-    path_iterations : int
-        Most steps at each strength before one is chosen; each starts where the stronger prior ended.
+    guard : float
+        Spectral radii above one less this are penalised, so that the search slides along the edge of stability.
     bound : float
         A free run on training episodes may reach this times the range of the states.
+    search : GaussNewton
+        Of the pooled model at each horizon, and of the units at the strength chosen.
+    restarts : int
+        Searches in which units that have not converged continue.
+    path_iterations : int
+        Most steps at each strength before one is chosen; each starts where the stronger prior ended.
 
     Raises
     ------
@@ -60,31 +82,45 @@ class RefineOptions:
 
     horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
     segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
-    balance: float = 0.65
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
     pooled_segments: int = 120
+    compared: int = 64
+    seed: int = 0
+    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
+    balance: float = 0.65
+    least_error: float = 1e-6
+    trial_iterations: int = 4
+    shortenings: int = 20
+    penalties: int = 8
+    alpha_factor: float = 4.0
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
+    patience: int = 3
+    tolerance: float = 0.1
+    largest_residual: float = 0.5
+    negligible_residual: float = 0.1
+    prior_level: float = 0.3
+    prior_power: int = 2
+    row_weight: float = 0.1
     margin: float = 1e-5
-    iterations: int = 15
-    path_iterations: int = 8
+    guard: float = 2e-3
     bound: float = 10.0
+    search: GaussNewton = field(default_factory=GaussNewton)
+    restarts: int = 4
+    path_iterations: int = 8
 
     def __post_init__(self) -> None:
-        good = {
-            "horizons": len(self.horizons) > 0
-            and min(self.horizons, default=0) >= 1
-            and tuple(sorted(self.horizons)) == self.horizons,
+        """Refuse what is out of its range."""
+        usable = {
+            "horizons": min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
-            "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
-            "balance": 0 <= self.balance <= 1,
-            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "pooled_segments": self.pooled_segments >= 1,
+            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
+            "balance": 0 <= self.balance <= 1,
+            "strengths": min(self.strengths, default=0.0) > 0,
             "margin": 0 <= self.margin < 1,
-            "iterations": min(self.iterations, self.path_iterations) >= 1,
             "bound": self.bound >= 1,
+            "search": min(self.search.iterations, self.path_iterations) >= 1,
         }
-        for name, fine in good.items():
+        for name, fine in usable.items():
             if not fine:
-                raise ConfigError(
-                    f"Refinement: {name} = {getattr(self, name)} is out of its range; see RefineOptions for what it may be."
-                )
+                problem = f"{name} = {getattr(self, name)} is out of its range"
+                raise ConfigError(f"Refinement: {problem}; see RefineOptions for what it may be.")

@@ -12,6 +12,7 @@ from kros.core.errors import ConfigError
 from kros.lifting import Lifting
 from kros.lifting.formula import Formula
 from kros.lifting.intervals import bounds_of
+from kros.lifting.program import Program
 
 INF = np.inf
 
@@ -109,22 +110,20 @@ def test_no_sample_escapes(text, middle, half):
     """Where a function is not a real number there is nothing to hold."""
     try:
         formula = Formula(text, ("x", "y", "q"))
-        _ = formula.expression, formula.evaluator
+        Program.of([formula.expression])
     except ConfigError:
         return
     box = {name: (m - h, m + h) for name, m, h in zip("xyq", middle, half, strict=True)}
     rng = np.random.default_rng(0)
     values = {name: np.concatenate([rng.uniform(low, high, 300), [low, high]]) for name, (low, high) in box.items()}
     derivatives = [formula.derivative(name) for name in "xyq"]
-    from kros.lifting.evaluation import compile_expression
-
     for expression in [formula.expression, *derivatives]:
         try:
-            evaluator = compile_expression(expression)
+            program = Program.of([expression])
         except ConfigError:
             continue
         with np.errstate(all="ignore"):
-            found = np.asarray(evaluator(values), dtype=float)
+            found = np.asarray(program.run(values)[0], dtype=float)
         lower, upper = bounds_of([expression], box)
         found = found[~np.isnan(found)]
         slack = 1e-9 * np.maximum(

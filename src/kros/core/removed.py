@@ -146,6 +146,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.",
         "kros.identify.lifted_factor kros.identify.reduce_episode",
     ),
+    (
+        "Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).",
+        "kros.lifting.concatenate",
+    ),
 )
 
 

@@ -12,9 +12,9 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from ..data.population import Population, split_episodes
-from ..lifting import Lifting, concatenate
+from ..lifting import Lifting
+from ..lifting.families import family
 from ..lifting.formula import Formula
-from ..lifting.tables import family
 from .calibration import PhaseSpec
 from .settings import CalibrationSettings, LiftingSettings
 
@@ -40,7 +40,7 @@ def resolve_lifting(
             functions = ()
     else:
         sample = partial(_sample, population, test)
-        functions = concatenate(declared.functions or (), *(family(table, sample) for table in declared.families))
+        functions = sum((family(table, sample) for table in declared.families), declared.functions or ())
     parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
     _ = lifting.separation, lifting.input_separation  # refused before anything is written
@@ -67,7 +67,7 @@ def _sample(population: Population, test: Iterable[str] | None, names: tuple[str
         values = population.read(key)
         values = values[:: max(1, len(values) * len(keys) // _SAMPLES)]
         columns = {name: values[:, i] for i, name in enumerate(known)}
-        evaluated = [np.broadcast_to(Formula(name, known).evaluator(columns), len(values)) for name in names]
+        evaluated = [np.broadcast_to(Formula(name, known).evaluate(columns), len(values)) for name in names]
         rows.append(np.stack(evaluated, axis=-1))
     return np.concatenate(rows)
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from ..core.settings import Settings
-from ..lifting.tables import check_family
+from ..lifting.families import check_family
 
 
 class LiftingSettings(Settings):

@@ -24,10 +24,8 @@ _NEAR = 1e-12  # relative to the interval: what rounding may hide
 
 def slope_bounds_of(formulas: Sequence[Formula], names: Sequence[str], box: Box) -> tuple[Array, Array]:
     """Return lower and upper bounds of the slopes between any two points of a box, each of shape (len(formulas), len(names))."""
-    lower, upper = (
-        b.reshape(len(formulas), len(names))
-        for b in bounds_of([f.derivative(name) for f in formulas for name in names], box)
-    )
+    derivatives = [formula.derivative(name) for formula in formulas for name in names]
+    lower, upper = (bound.reshape(len(formulas), len(names)) for bound in bounds_of(derivatives, box))
     for i, formula in enumerate(formulas):
         read = [name in formula.used for name in names]
         if any(read) and break_of(formula.expression, box):
@@ -78,11 +76,8 @@ def _not_negative(low: Array, high: Array) -> Any:
 
 def _between_poles(low: Array, high: Array) -> Any:
     slack = _slack(low, high) + _NEAR
-    return (
-        np.isfinite(low)
-        & np.isfinite(high)
-        & (np.floor((low - slack) / np.pi + 0.5) == np.floor((high + slack) / np.pi + 0.5))
-    )
+    first, last = np.floor((low - slack) / np.pi + 0.5), np.floor((high + slack) / np.pi + 0.5)
+    return np.isfinite(low) & np.isfinite(high) & (first == last)
 
 
 _TESTS: Mapping[str, Any] = {"tan": _between_poles, "log": _positive, "sign": _not_zero}

@@ -1,7 +1,7 @@
 """Formulas of states and parameters, such as ``sin(100*position + phase)``, and of earlier values, such as ``position[-1]``.
 
 Text is read with `ast` against a whitelist and turned into SymPy nodes one by one; nothing is ever evaluated as Python.
-From the one SymPy tree come the vectorised evaluation, the derivative, the slope bounds and the C expression.
+From the one SymPy tree come the derivative, the slope bounds, and the program that NumPy, the compiled loops and C follow.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -19,8 +19,8 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
-from .evaluation import FUNCTIONS, Evaluator, compile_expression
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
+from .program import FUNCTIONS, Program
 
 _BINARY = {
     ast.Add: operator.add,
@@ -42,7 +42,7 @@ class Formula:
     names: tuple[str, ...]  # quantities that may appear
     delayed: tuple[
         str, ...
-    ] = ()  # quantities of which earlier values may appear: ``position[-2]`` is the value two samples before
+    ] = ()  # those of which earlier values may appear: ``position[-2]`` is that two samples before
     sizes: tuple[tuple[str, float], ...] = ()  # sizes of quantities whose values come divided by them
     size: float = 1.0  # what the value of the formula is divided by
 
@@ -58,9 +58,8 @@ class Formula:
 
         sizes = dict(self.sizes)
         known = {symbol: sizes.get(base_and_delay(symbol.name)[0], 1.0) for symbol in self.written.free_symbols}
-        tree = self.written.xreplace(
-            {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
-        )
+        larger = {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
+        tree = self.written.xreplace(larger)
         return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
 
     @cached_property
@@ -69,13 +68,16 @@ class Formula:
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
     @cached_property
-    def evaluator(self) -> Evaluator:
-        """Vectorised evaluation: a mapping from names to arrays gives an array."""
-        return compile_expression(self.expression)
+    def _program(self) -> Program:
+        return Program.of([self.expression])
 
     def __call__(self, **values: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Evaluate at arrays that broadcast against each other."""
-        return np.asarray(self.evaluator({k: np.asarray(v, dtype=float) for k, v in values.items()}))
+        return self.evaluate({name: np.asarray(value, dtype=float) for name, value in values.items()})
+
+    def evaluate(self, values: Mapping[str, npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
+        """Evaluate at arrays by name."""
+        return np.asarray(self._program.run(values)[0])
 
     def derivative(self, name: str) -> Any:
         """Return the SymPy tree of the partial derivative with respect to one name."""
@@ -195,27 +197,19 @@ class _Reader:
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp
 
+        written = f"{name}[{ast.unparse(index)}]"
         if name not in self.delayed:
-            known = (
-                f"only {', '.join(self.delayed)} have earlier values"
-                if self.delayed
-                else "nothing here has earlier values"
-            )
-            raise self._error(f"there is no {name}[{ast.unparse(index)}]; {known}.")
+            known = ", ".join(self.delayed) or "states and inputs"
+            raise self._error(f"there is no {written}; only {known} have earlier values.")
         negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
         amount = index.operand if isinstance(index, ast.UnaryOp) else index
         if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
-            raise self._error(
-                f"the delay in {name}[{ast.unparse(index)}] should be a whole number of samples, such as {name}[-1]."
-            )
+            raise self._error(f"the delay in {written} should be a whole number of samples, such as {name}[-1].")
         if not negative or amount.value == 0:
-            raise self._error(
-                f"{name}[{ast.unparse(index)}] is not an earlier value; write {name}[-1] for one sample before, {name} for the present."
-            )
+            example = f"write {name}[-1] for one sample before, {name} for the present"
+            raise self._error(f"{written} is not an earlier value; {example}.")
         if amount.value > MAX_DELAY:
-            raise self._error(
-                f"the delay in {name}[-{amount.value}] is too deep; at most {MAX_DELAY} samples are kept."
-            )
+            raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
         return sp.Symbol(delayed_name(name, amount.value), real=True)
 
     def _error(self, problem: str) -> ConfigError:

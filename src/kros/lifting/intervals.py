@@ -20,8 +20,8 @@ Array = npt.NDArray[np.float64]
 Interval = tuple[Array, Array]
 Box = Mapping[str, Any]
 
-_PIECES = 4096
-_EPSILON = float(np.finfo(float).eps)
+PIECES = 4096  # of a box: a limit of the work, the bounds hold for any number
+_EPSILON, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 _ULPS = 4.0  # within which elementary functions are computed
 _REALS = (-np.inf, np.inf)
 
@@ -31,16 +31,15 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
     for name, value in box.items():
         _range(name, value)
     with np.errstate(all="ignore"):
-        found = [pieces_of(expression, box) for expression in expressions]
-    return np.array([np.min(low) for low, _ in found]), np.array([np.max(high) for _, high in found])
+        pieces = [pieces_of(expression, box) for expression in expressions]
+    return np.array([np.min(low) for low, _ in pieces]), np.array([np.max(high) for _, high in pieces])
 
 
 def _range(name: str, value: Any) -> tuple[float, float]:
     low, high = (float(v) for v in (value if np.ndim(value) else (value, value)))
     if not low <= high:
-        raise ConfigError(
-            f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give a lower and an upper number in this order."
-        )
+        remedy = "give a lower and an upper number in this order"
+        raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; {remedy}.")
     return low, high
 
 
@@ -54,16 +53,12 @@ def pieces_of(expression: Any, box: Box) -> Interval:
 def _pieces(sides: Mapping[str, tuple[float, float]]) -> dict[str, Interval]:
     """Cut a box along its finite sides; entries of the result have the shape (pieces,)."""
     finite = [name for name, (low, high) in sides.items() if np.isfinite([low, high]).all() and low < high]
-    count = max(2, int(_PIECES ** (1 / len(finite)))) if 0 < len(finite) <= np.log2(_PIECES) else 1
-    grid = np.indices((count,) * len(finite)).reshape(len(finite), count ** len(finite))
+    count = max(2, int(PIECES ** (1 / len(finite)))) if 0 < len(finite) <= np.log2(PIECES) else 1
+    grid = dict(zip(finite, np.indices((count,) * len(finite)).reshape(len(finite), -1), strict=True))
     pieces: dict[str, Interval] = {}
     for name, (low, high) in sides.items():
-        if name in finite:
-            edges = np.linspace(low, high, count + 1)
-            cell = grid[finite.index(name)]
-            pieces[name] = edges[cell], edges[cell + 1]
-        else:
-            pieces[name] = np.full(1, low), np.full(1, high)
+        edges, cell = np.linspace(low, high, count + 1), grid.get(name)
+        pieces[name] = (np.full(1, low), np.full(1, high)) if cell is None else (edges[cell], edges[cell + 1])
     return pieces
 
 
@@ -85,9 +80,8 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
         return _power(_walk(expression.base, values), expression.exp)
     function = _FUNCTIONS.get(type(expression).__name__)
     if function is None:
-        raise ConfigError(
-            f"Bounds of {expression}: nothing is known about {type(expression).__name__}; use functions that formulas know."
-        )
+        kind, remedy = type(expression).__name__, "use functions that formulas know"
+        raise ConfigError(f"Bounds of {expression}: nothing is known about {kind}; {remedy}.")
     return function(*_walk(expression.args[0], values))
 
 
@@ -104,15 +98,13 @@ def _add(a: Interval, b: Interval) -> Interval:
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
-    products = [
-        np.where((x == 0) | (y == 0), 0.0, _away_from_zero(x * y, np.sign(x) * np.sign(y))) for x in a for y in b
-    ]
+    products = [_away_from_zero(x * y, np.sign(x) * np.sign(y)) for x in a for y in b]
     return _outward(np.minimum.reduce(products), np.maximum.reduce(products))
 
 
 def _away_from_zero(value: Array, sign: Array) -> Array:
-    """Replace what has underflowed by the smallest normal number of its sign."""
-    return np.where(np.abs(value) < np.finfo(float).tiny, sign * np.finfo(float).tiny, value)
+    """Replace what has underflowed by the smallest normal number of its sign; zero times anything is zero."""
+    return np.where(sign == 0, 0.0, np.where(np.abs(value) < _TINY, sign * _TINY, value))
 
 
 def _power(base: Interval, exponent: Any) -> Interval:
@@ -135,9 +127,7 @@ def _reciprocal(a: Interval) -> Interval:
     through = (low < 0) & (high > 0)
     lower = np.where(through | (high == 0), -np.inf, 1 / np.where(high == 0, 1.0, high))
     upper = np.where(through | (low == 0), np.inf, 1 / np.where(low == 0, 1.0, low))
-    return _outward(
-        np.where((low == 0) & (high == 0), -np.inf, lower), np.where((low == 0) & (high == 0), np.inf, upper)
-    )
+    return _outward(*_where_defined((low != 0) | (high != 0), lower, upper))
 
 
 def _or_reals(low: Array, high: Array) -> Interval:
@@ -151,16 +141,14 @@ def _where_defined(defined: npt.NDArray[np.bool_], low: Array, high: Array) -> I
 
 def _sine(low: Array, high: Array) -> Interval:
     def touches(phase: float) -> npt.NDArray[np.bool_]:
-        """Whether the interval holds phase + 2 pi k for some k; a hair wider than it is."""
-        slack = 1e-15 * (np.abs(low) + np.abs(high)) + 1e-15
+        """Whether the interval holds phase + 2 pi k for some k, by more than rounding."""
+        slack = _ULPS * _EPSILON * (np.abs(low) + np.abs(high) + 1)
         turns = np.floor((high + slack - phase) / (2 * np.pi))
         return ~(turns < np.ceil((low - slack - phase) / (2 * np.pi)))
 
     ends = np.sin(np.where(np.isfinite(low), low, 0.0)), np.sin(np.where(np.isfinite(high), high, 0.0))
     endless = ~(np.isfinite(low) & np.isfinite(high))
-    slack = (
-        _ULPS * _EPSILON * (1 + np.maximum(np.abs(low), np.abs(high)))
-    )  # of the argument too, which may have been shifted
+    slack = _ULPS * _EPSILON * (1 + np.maximum(np.abs(low), np.abs(high)))  # of the argument too, which may be shifted
     return (
         np.where(endless | touches(-np.pi / 2), -1.0, np.maximum(np.minimum(*ends) - slack, -1.0)),
         np.where(endless | touches(np.pi / 2), 1.0, np.minimum(np.maximum(*ends) + slack, 1.0)),
@@ -183,9 +171,8 @@ def _logarithm(low: Array, high: Array) -> Interval:
 
 
 def _magnitude(low: Array, high: Array) -> Interval:
-    return np.where((low <= 0) & (high >= 0), 0.0, np.minimum(np.abs(low), np.abs(high))), np.maximum(
-        np.abs(low), np.abs(high)
-    )
+    small, large = np.sort(np.abs([low, high]), axis=0)
+    return np.where((low <= 0) & (high >= 0), 0.0, small), large
 
 
 def _spike(low: Array, high: Array) -> Interval:

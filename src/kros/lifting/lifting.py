@@ -13,7 +13,7 @@ gamma     : input functions, formulas of inputs, states, earlier values and per-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -22,9 +22,9 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
 from .continuity import slope_bounds_of
-from .evaluation import ColumnEvaluator
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box
+from .program import Program
 from .separation import FormulaSeparation
 from .window import Window
 
@@ -70,12 +70,13 @@ class Lifting:
     sizes: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse what cannot be lifted."""
         everything = (*self.states, *self.parameters, *self.inputs)
         clash = {name for name in everything if everything.count(name) > 1}
         if clash:
             raise ConfigError(
-                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, parameters {self.parameters} and "
-                f"inputs {self.inputs}; rename {clash}."
+                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, "
+                f"parameters {self.parameters} and inputs {self.inputs}; rename {clash}."
             )
         _refuse_repeated(self.formulas, self.states)
         _refuse_repeated(self.input_formulas, self.inputs)
@@ -83,23 +84,24 @@ class Lifting:
             present = sorted(formula.used & set(self.inputs))
             if present:
                 raise ConfigError(
-                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted state would need from the future; "
-                    f"make it an input function, or read {present[0]}[-1]."
+                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted state would need "
+                    f"from the future; make it an input function, or read {present[0]}[-1]."
                 )
             if not formula.used - set(self.parameters):
+                known = ", ".join(self.states)
                 raise ConfigError(
-                    f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
+                    f"Lifting: {formula.text!r} depends on no state ({known}); a constant cannot be lifted, remove it."
                 )
         for formula in self.input_formulas:
             if not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
                 raise ConfigError(
-                    f"Lifting: the input function {formula.text!r} depends on no input ({', '.join(self.inputs) or 'none are named'}); "
-                    "a function of states alone belongs to the lifted functions."
+                    f"Lifting: the input function {formula.text!r} depends on no input "
+                    f"({', '.join(self.inputs) or 'none are named'}); a function of states alone belongs to the lifted functions."
                 )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Rebuild from the texts in a worker process: compiled formulas do not travel."""
-        return Lifting, (self.states, self.functions, self.parameters, self.inputs, self.input_functions, self.sizes)
+        """Rebuild from the texts in a worker process: programs do not travel."""
+        return Lifting, tuple(getattr(self, f.name) for f in fields(self))
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Lifting:
@@ -115,10 +117,8 @@ class Lifting:
 
     def extension(self) -> dict[str, Any]:
         """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        found: dict[str, Any] = (
-            {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
-        )
-        return found | ({"sizes": self.sizes} if self.sizes else {})
+        extra = {"lifting_inputs": self.inputs, "input_functions": self.input_functions, "sizes": self.sizes}
+        return {name: value for name, value in extra.items() if value}
 
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
         """Return the same lifting for states and inputs divided by sizes, with functions divided by theirs; formulas stay as they are written.
@@ -209,7 +209,7 @@ class Lifting:
 
         Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
         """
-        self._columns.fill(self._values(lifted, parameters, earlier), lifted)
+        self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
 
     def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs with the input functions behind them.
@@ -231,17 +231,12 @@ class Lifting:
         window = self._windows(window)
         out = np.empty((*u.shape[:-1], u.shape[-1] + len(self.input_functions)))
         out[..., : u.shape[-1]] = u
-        self._input_columns.fill(self._values(window, parameters, window[..., self.n_states :], u), out)
+        values = self._values(parameters, window, window[..., self.n_states :], u)
+        self._programs[1].fill(out, values, u.shape[-1])
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window), the first one at sample `history`.
-
-        Raises
-        ------
-        DataError
-            When the recording is shorter than the history.
-        """
+        """Return the windows of a recording, shape (..., n_samples - history, n_window), the first one at sample `history`."""
         self.window.require_inputs(u)
         return self.window.slide(x, u)
 
@@ -250,49 +245,44 @@ class Lifting:
         given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
+            remedy = "calibrate the unit first"
             raise DimensionError(
-                f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first."
+                f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; {remedy}."
             )
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
-    def retract(self, lifted: npt.ArrayLike) -> Array:
-        """Return the original states, a slice of the lifted ones."""
-        return np.asarray(lifted, dtype=float)[..., : self.n_states]
-
     def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the derivative of the lifted functions alone by every entry of the window, shape (..., p, n_window)."""
-        x = self._windows(x)
-        slopes = np.empty((*x.shape[:-1], len(self.functions) * x.shape[-1]))
-        self._derivatives.fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
-        return slopes.reshape(*x.shape[:-1], len(self.functions), x.shape[-1])
+        return self._slopes(self.window.names, x, parameters)
 
     def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
         """Return the derivative of the lifted functions alone by one of the parameters, shape (..., p); x as in `slopes`."""
-        x = self._windows(x)
-        slopes = np.empty((*x.shape[:-1], len(self.functions)))
-        self._parameter_derivatives[name].fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
-        return slopes
+        return self._slopes((name,), x, parameters)[..., 0]
 
     def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window).
-
-        Parameters
-        ----------
-        u : array_like, shape (..., m)
-        window : array_like, shape (..., n_window)
-        parameters : mapping of str to array_like
-        """
-        u, window = np.asarray(u, dtype=float), self._windows(window)
+        """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window)."""
+        u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
-        slopes = np.empty((*window.shape[:-1], len(self.input_functions) * window.shape[-1]))
-        self._input_derivatives.fill(self._values(window, parameters, window[..., self.n_states :], u), slopes)
-        return slopes.reshape(*window.shape[:-1], len(self.input_functions), window.shape[-1])
+        return self._slopes(self.window.names, window, parameters, u)
+
+    def _slopes(
+        self, names: tuple[str, ...], x: npt.ArrayLike, parameters: Parameters | None, u: Array | None = None
+    ) -> Array:
+        """Return derivatives of the lifted functions, or of the input functions where inputs are given, by some names."""
+        x, formulas = self._windows(x), self.formulas if u is None else self.input_formulas
+        slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
+        if (names, u is None) not in self._derivatives:
+            trees = [formula.derivative(name) for formula in formulas for name in names]
+            self._derivatives[names, u is None] = Program.of(trees)
+        values = self._values(parameters, x, x[..., self.n_states :], u)
+        self._derivatives[names, u is None].fill(slopes, values)
+        return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives: the bounds hold between any two points of the box, and are infinite where a slope is, or where
-        a function jumps or is not defined. Every operation rounds outwards.
+        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and are infinite where
+        a slope is, or where a function jumps or is not defined.
 
         Parameters
         ----------
@@ -310,8 +300,7 @@ class Lifting:
         >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
         array([[100.]])
         """
-        given = {**(box or {}), **(parameters or {})}
-        return slope_bounds_of(self.formulas, self.window.names, given)
+        return slope_bounds_of(self.formulas, self.window.names, {**(box or {}), **(parameters or {})})
 
     @cached_property
     def separation(self) -> FormulaSeparation:
@@ -324,33 +313,18 @@ class Lifting:
         return FormulaSeparation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
-    def _columns(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.expression for formula in self.formulas], first=self.n_states)
+    def _programs(self) -> tuple[Program, Program]:
+        """Programs of the lifted functions and of the input functions."""
+        functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
+        return Program.of(functions), Program.of(gamma)
 
     @cached_property
-    def _input_columns(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.expression for formula in self.input_formulas], first=len(self.inputs))
-
-    @cached_property
-    def _derivatives(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
-
-    @cached_property
-    def _parameter_derivatives(self) -> dict[str, ColumnEvaluator]:
-        return {
-            name: ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas])
-            for name in self.parameters
-        }
-
-    @cached_property
-    def _input_derivatives(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of(
-            [formula.derivative(name) for formula in self.input_formulas for name in self.window.names]
-        )
+    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Program]:
+        return {}
 
     @cached_property
     def _read_states(self) -> tuple[tuple[int, str], ...]:
-        """Places and names of the present states that functions read: an observer may have many of which they do not know."""
+        """Places and names of the present states that functions read: an observer may have many more."""
         used = {name for formula in self.formulas + self.input_formulas for name in formula.used}
         return tuple((i, name) for i, name in enumerate(self.states) if name in used)
 
@@ -358,14 +332,13 @@ class Lifting:
         x = np.asarray(x, dtype=float)
         names = self.window.names
         if x.shape[-1:] != (len(names),):
-            what = "states" if names == self.states else "entries of a window"
             raise DimensionError(
-                f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}."
+                f"Lifting: expected {len(names)} entries {names} on the last axis, found shape {x.shape}."
             )
         return x
 
     def _values(
-        self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None
+        self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
     ) -> dict[str, Array]:
         values = self.parameter_values(parameters)
         values.update({name: x[..., i] for i, name in self._read_states})
@@ -383,13 +356,14 @@ class Lifting:
 def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) -> None:
     import sympy as sp
 
-    known: dict[Any, str] = {}
+    names, known = {sp.Symbol(name, real=True): name for name in originals}, dict[Any, str]()
     for formula in formulas:
-        original = next((name for name in originals if formula.written == sp.Symbol(name, real=True)), None)
-        if original is not None:
+        if formula.written in names:
+            original = names[formula.written]
             raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
         if formula.written in known:
+            other = known[formula.written]
             raise ConfigError(
-                f"Lifting: functions repeat one of them, {formula.text!r} is {known[formula.written]!r}; every lifted function must be listed once."
+                f"Lifting: functions repeat one of them, {formula.text!r} is {other!r}; list every function once."
             )
         known[formula.written] = formula.text

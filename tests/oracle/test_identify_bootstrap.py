@@ -170,7 +170,7 @@ def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
     T, information = refinement.whitening, refinement.information
     counts = np.array([[2.0, 1, 2, 0, 0], [0, 3, 0, 1, 1], [1, 0, 2, 2, 0]])
     small = 1 + 0.03 * (counts - 1)
-    step = bootstrap_refined(models, T, information, normal, small[:, None]).samples
+    step = bootstrap_refined(models, T, information, normal, small[:, None], "abc").samples
     start = whitened(models, T)
     moved = whitened(KoopmanMatrices(step.A[:, 0], step.B[:, 0]), T) - start
     data, drawn = replace(problem, prior=None, edged=False), resampled(factors, problem, counts)

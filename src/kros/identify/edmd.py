@@ -120,9 +120,10 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
     pivots = relative_pivots(R11)
     if np.any(pivots < p * np.finfo(float).eps):
         *unit, column = (int(i) for i in np.argwhere(pivots < p * np.finfo(float).eps)[0])
+        where = f" of unit number {unit[0]}" if unit else ""
         raise IdentificationError(
-            f"EDMD: column {column} of the lifted data{f' of unit number {unit[0]}' if unit else ''} depends on the others (relative pivot "
-            f"{pivots.min():.1e}); remove the lifting function or input, excite it, or use alpha > 0."
+            f"EDMD: column {column} of the lifted data{where} depends on the others (relative pivot {pivots.min():.1e}); remove the "
+            "lifting function or input, excite it, or use alpha > 0."
         )
     U = np.swapaxes(np.linalg.solve(R11, R12), -1, -2)
     return KoopmanMatrices(U[..., :n_lifted], U[..., n_lifted:])
@@ -206,9 +207,8 @@ class _Ridge:
     def of(cls, R: Array, n_lifted: int) -> _Ridge:
         p = R.shape[-1] - n_lifted
         P, values, Q = np.linalg.svd(R[:, :p, :p])
-        return cls(
-            np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted]), values, np.swapaxes(P, 1, 2) @ R[:, :p, p:]
-        )
+        left = np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted])
+        return cls(left, values, np.swapaxes(P, 1, 2) @ R[:, :p, p:])
 
     def radius(self, alpha: float) -> Array:
         """Return the spectral radius of every unit's model."""

@@ -16,16 +16,11 @@ class LiftingSettings(Settings):
     `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
     """
 
-    functions: tuple[str, ...] | None = Field(
-        None,
-        description="lifted functions of the states, as formulas; without any and without families those that suit the plant that the reader names",
-    )
+    functions: tuple[str, ...] | None = Field(None, description="lifted functions of the states, as formulas")
     families: tuple[dict[str, Any], ...] = Field(
         (), description="tables with a kind each, whose formulas stand behind the functions"
     )
-    input_functions: tuple[str, ...] = Field(
-        (), description="further inputs of the model, as formulas of states and inputs"
-    )
+    input_functions: tuple[str, ...] = Field((), description="further inputs of the model, of states and inputs")
 
     @field_validator("families")
     @classmethod
@@ -38,11 +33,8 @@ class LiftingSettings(Settings):
 class CalibrationSettings(Settings):
     """Phase calibration; ``None`` takes what suits the plant that the reader names."""
 
-    angle: str | None = Field(
-        None,
-        description="state in the periodic function; by default that of the formula, such as position in sin(100*position + phase)",
-    )
-    ratio: float | None = Field(None, gt=0, description="periods a radian; by default that of the formula, here 100")
+    angle: str | None = Field(None, description="state in the periodic function; default: that of the formula")
+    ratio: float | None = Field(None, gt=0, description="periods a radian; default: that of the formula, such as 100")
     reference: str | None = Field(
         None, description="commanded speed, which is constant for a while in the segments that are used"
     )

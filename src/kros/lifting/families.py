@@ -289,7 +289,7 @@ def _require_count(kind: str, count: float) -> None:
         raise ConfigError(f"{kind}: these options make more than {MAX_FORMULAS} formulas; ask for fewer.")
 
 
-def _require_whole(kind: str, option: str, values: Sequence[int], least: int) -> None:
+def _require_whole(kind: str, option: str, values: Any, least: int) -> None:
     numbers = list(values) if isinstance(values, Iterable) and not isinstance(values, str) else []
     if not numbers or not all(_is_whole(v, least) for v in numbers) or len(set(numbers)) != len(numbers):
         needed = f"should be different whole numbers of at least {least}"

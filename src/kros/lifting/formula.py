@@ -22,14 +22,15 @@ from ..core.files import did_you_mean
 from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
 from .program import FUNCTIONS, Program
 
-_BINARY = {
+_OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
 }
-_UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 _SPELLINGS = {"abs": "Abs"}
 MAX_DELAY = 1000
 
@@ -102,17 +103,15 @@ def base_and_delay(name: str) -> tuple[str, int]:
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     """Read a formula into a SymPy tree. What may take long is refused before it does: see `limits`."""
     if len(require_text(text)) > MAX_LENGTH:
-        raise ConfigError(
-            f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions."
-        )
+        remedy = f"at most {MAX_LENGTH} are read; split it into several functions"
+        raise ConfigError(f"Formula of {len(text)} characters: {remedy}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Python warns of text such as 1if
             tree = ast.parse(text.strip(), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError, Warning) as error:
-        raise ConfigError(
-            f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'."
-        ) from error
+        remedy = "write it like 'sin(100*position + phase)'"
+        raise ConfigError(f"Formula {text!r}: not readable ({error}); {remedy}.") from error
     try:
         require_size(tree.body)
         return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
@@ -125,23 +124,15 @@ def _real_magnitude() -> tuple[Any, Any]:
     """Functions that differentiate as Abs and sign of real numbers do; SymPy's own ask first whether their argument is complex."""
     import sympy as sp
 
-    def slope_of_jump(self: Any, argindex: int = 1) -> Any:
-        return 2 * sp.DiracDelta(self.args[0])
-
-    jump = type("RealSign", (sp.Function,), {"fdiff": slope_of_jump})
-
-    def slope_of_magnitude(self: Any, argindex: int = 1) -> Any:
-        return jump(self.args[0])
-
-    return type("RealMagnitude", (sp.Function,), {"fdiff": slope_of_magnitude}), jump
+    jump = type("RealSign", (sp.Function,), {"fdiff": lambda self, argindex=1: 2 * sp.DiracDelta(self.args[0])})
+    return type("RealMagnitude", (sp.Function,), {"fdiff": lambda self, argindex=1: jump(self.args[0])}), jump
 
 
 def require_text(text: object) -> str:
     """Return what is a text, as a formula should be."""
     if not isinstance(text, str):
-        raise ConfigError(
-            f"Formula {text!r}: should be a text such as 'sin(100*position + phase)', found {type(text).__name__}."
-        )
+        needed = "should be a text such as 'sin(100*position + phase)'"
+        raise ConfigError(f"Formula {text!r}: {needed}, found {type(text).__name__}.")
     return text
 
 
@@ -167,21 +158,20 @@ class _Reader:
             return self._name(node.id)
         if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name):
             return self._earlier(node.value.id, node.slice)
-        if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
             left, right = self.read(node.left), self.read(node.right)
             if isinstance(node.op, ast.Pow) and not (right.is_number and abs(finite(right)) <= MAX_EXPONENT):
                 raise self._error(f"the exponent {right} should be a number of magnitude at most {MAX_EXPONENT}.")
-            return _BINARY[type(node.op)](left, right)
-        if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
-            return _UNARY[type(node.op)](self.read(node.operand))
+            return _OPERATORS[type(node.op)](left, right)
+        if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](self.read(node.operand))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1 and not node.keywords:
             function = _SPELLINGS.get(node.func.id, node.func.id)
             if function in FUNCTIONS:
                 return getattr(sp, function)(self.read(node.args[0]))
             raise self._error(f"unknown function {node.func.id!r}; known are {', '.join(sorted(FUNCTIONS))}.")
-        raise self._error(
-            f"{ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument."
-        )
+        remedy = "use numbers, names, + - * / ** and functions of one argument"
+        raise self._error(f"{ast.unparse(node)!r} is not allowed; {remedy}.")
 
     def _name(self, name: str) -> Any:
         import sympy as sp
@@ -190,9 +180,8 @@ class _Reader:
             return sp.Symbol(name, real=True)
         if name == "pi":
             return sp.pi
-        raise self._error(
-            f"unknown name {name!r}{did_you_mean(name, self.names) or ';'} known are {', '.join(self.names)} and pi."
-        )
+        near = did_you_mean(name, self.names) or ";"
+        raise self._error(f"unknown name {name!r}{near} known are {', '.join(self.names)} and pi.")
 
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp

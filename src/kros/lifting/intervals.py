@@ -54,7 +54,7 @@ def _pieces(sides: Mapping[str, tuple[float, float]]) -> dict[str, Interval]:
     """Cut a box along its finite sides; entries of the result have the shape (pieces,)."""
     finite = [name for name, (low, high) in sides.items() if np.isfinite([low, high]).all() and low < high]
     count = max(2, int(PIECES ** (1 / len(finite)))) if 0 < len(finite) <= np.log2(PIECES) else 1
-    grid = dict(zip(finite, np.indices((count,) * len(finite)).reshape(len(finite), -1), strict=True))
+    grid = dict(zip(finite, np.indices((count,) * len(finite)).reshape(len(finite), count ** len(finite)), strict=True))
     pieces: dict[str, Interval] = {}
     for name, (low, high) in sides.items():
         edges, cell = np.linspace(low, high, count + 1), grid.get(name)
@@ -94,7 +94,8 @@ def _outward(low: Array, high: Array, ulps: float = 1.0) -> Interval:
 
 
 def _add(a: Interval, b: Interval) -> Interval:
-    return _or_reals(*_outward(a[0] + b[0], a[1] + b[1]))
+    low, high = _outward(a[0] + b[0], a[1] + b[1])  # inf - inf has no bound
+    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
@@ -130,11 +131,6 @@ def _reciprocal(a: Interval) -> Interval:
     return _outward(*_where_defined((low != 0) | (high != 0), lower, upper))
 
 
-def _or_reals(low: Array, high: Array) -> Interval:
-    """Replace bounds that are not numbers, as of inf - inf, by no bound."""
-    return np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-
-
 def _where_defined(defined: npt.NDArray[np.bool_], low: Array, high: Array) -> Interval:
     return np.where(defined, low, -np.inf), np.where(defined, high, np.inf)
 
@@ -155,10 +151,6 @@ def _sine(low: Array, high: Array) -> Interval:
     )
 
 
-def _cosine(low: Array, high: Array) -> Interval:
-    return _sine(low + np.pi / 2, high + np.pi / 2)
-
-
 def _tangent(low: Array, high: Array) -> Interval:
     branch = np.floor(low / np.pi + 0.5), np.floor(high / np.pi + 0.5)
     inside = (branch[0] == branch[1]) & np.isfinite(low) & np.isfinite(high) & (np.tan(low) <= np.tan(high))
@@ -175,11 +167,6 @@ def _magnitude(low: Array, high: Array) -> Interval:
     return np.where((low <= 0) & (high >= 0), 0.0, small), large
 
 
-def _spike(low: Array, high: Array) -> Interval:
-    """Slope of a jump: zero away from it, unbounded at it."""
-    return np.zeros_like(low), np.where((low <= 0) & (high >= 0), np.inf, 0.0)
-
-
 def _rising(
     function: Callable[[Array], Array], least: float = -np.inf, most: float = np.inf
 ) -> Callable[[Array, Array], Interval]:
@@ -194,7 +181,7 @@ def _rising(
 
 _FUNCTIONS: dict[str, Callable[[Array, Array], Interval]] = {
     "sin": _sine,
-    "cos": _cosine,
+    "cos": lambda low, high: _sine(low + np.pi / 2, high + np.pi / 2),
     "tan": _tangent,
     "exp": _rising(np.exp, 0.0),
     "log": _logarithm,
@@ -202,5 +189,5 @@ _FUNCTIONS: dict[str, Callable[[Array, Array], Interval]] = {
     "atan": _rising(np.arctan),
     "sign": lambda low, high: (np.sign(low), np.sign(high)),
     "Abs": _magnitude,
-    "DiracDelta": _spike,
+    "DiracDelta": lambda low, high: (np.zeros_like(low), np.where((low <= 0) & (high >= 0), np.inf, 0.0)),
 }

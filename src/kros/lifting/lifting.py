@@ -88,10 +88,8 @@ class Lifting:
                     f"from the future; make it an input function, or read {present[0]}[-1]."
                 )
             if not formula.used - set(self.parameters):
-                known = ", ".join(self.states)
-                raise ConfigError(
-                    f"Lifting: {formula.text!r} depends on no state ({known}); a constant cannot be lifted, remove it."
-                )
+                problem = f"depends on no state ({', '.join(self.states)}); a constant cannot be lifted"
+                raise ConfigError(f"Lifting: {formula.text!r} {problem}, remove it.")
         for formula in self.input_formulas:
             if not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
                 raise ConfigError(
@@ -160,9 +158,8 @@ class Lifting:
     @cached_property
     def window(self) -> Window:
         """Which earlier values the formulas read."""
-        return Window.of(
-            self.states, self.inputs, [name for f in self.formulas + self.input_formulas for name in f.used]
-        )
+        used = [name for f in self.formulas + self.input_formulas for name in f.used]
+        return Window.of(self.states, self.inputs, used)
 
     @property
     def history(self) -> int:
@@ -185,18 +182,9 @@ class Lifting:
         return self.states + self.functions
 
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the lifted states.
+        """Return the lifted states (..., n + p) of windows (..., n_window), which are the states alone for a lifting without delays.
 
-        Parameters
-        ----------
-        x : array_like, shape (..., n_window)
-            Windows (see `windows`); states alone, shape (..., n), for a lifting without delays.
-        parameters : mapping of str to array_like
-            Values that broadcast against ``x[..., 0]``.
-
-        Returns
-        -------
-        ndarray, shape (..., n + p)
+        Values of parameters broadcast against ``x[..., 0]``.
         """
         x = self._windows(x)
         lifted = np.empty((*x.shape[:-1], self.n_lifted))
@@ -212,25 +200,13 @@ class Lifting:
         self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
 
     def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the inputs with the input functions behind them.
-
-        Parameters
-        ----------
-        u : array_like, shape (..., m)
-        window : array_like, shape (..., n_window)
-        parameters : mapping of str to array_like
-
-        Returns
-        -------
-        ndarray, shape (..., m + r)
-        """
+        """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
         u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
         if not self.input_functions:
             return u
         window = self._windows(window)
-        out = np.empty((*u.shape[:-1], u.shape[-1] + len(self.input_functions)))
-        out[..., : u.shape[-1]] = u
+        out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
         values = self._values(parameters, window, window[..., self.n_states :], u)
         self._programs[1].fill(out, values, u.shape[-1])
         return out
@@ -245,10 +221,8 @@ class Lifting:
         given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
-            remedy = "calibrate the unit first"
-            raise DimensionError(
-                f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; {remedy}."
-            )
+            problem = f"parameter values for {missing} are missing, found {sorted(given)}"
+            raise DimensionError(f"Lifting: {problem}; calibrate the unit first.")
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
     def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
@@ -323,33 +297,28 @@ class Lifting:
         return {}
 
     @cached_property
-    def _read_states(self) -> tuple[tuple[int, str], ...]:
-        """Places and names of the present states that functions read: an observer may have many more."""
-        used = {name for formula in self.formulas + self.input_formulas for name in formula.used}
-        return tuple((i, name) for i, name in enumerate(self.states) if name in used)
+    def _read(self) -> frozenset[str]:
+        return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
 
     def _windows(self, x: npt.ArrayLike) -> Array:
         x = np.asarray(x, dtype=float)
         names = self.window.names
         if x.shape[-1:] != (len(names),):
-            raise DimensionError(
-                f"Lifting: expected {len(names)} entries {names} on the last axis, found shape {x.shape}."
-            )
+            raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")
         return x
 
     def _values(
         self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
     ) -> dict[str, Array]:
+        """Return arrays by name; present states only where functions read them, since an observer may have many more."""
         values = self.parameter_values(parameters)
-        values.update({name: x[..., i] for i, name in self._read_states})
-        if earlier is not None:
-            values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
-        elif self.window.depths:
-            raise DimensionError(
-                f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows."
-            )
-        if u is not None:
-            values.update({name: u[..., i] for i, name in enumerate(self.inputs)})
+        values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
+        if earlier is None and self.window.depths:
+            problem = f"the earlier values {self.window.earlier} are missing"
+            raise DimensionError(f"Lifting: {problem}; pass them, or lift windows.")
+        for names, columns in ((self.window.earlier, earlier), (self.inputs, u)):
+            if columns is not None:
+                values |= {name: columns[..., i] for i, name in enumerate(names)}
         return values
 
 
@@ -363,7 +332,6 @@ def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) 
             raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
         if formula.written in known:
             other = known[formula.written]
-            raise ConfigError(
-                f"Lifting: functions repeat one of them, {formula.text!r} is {other!r}; list every function once."
-            )
+            problem = f"functions repeat one of them, {formula.text!r} is {other!r}"
+            raise ConfigError(f"Lifting: {problem}; list every function once.")
         known[formula.written] = formula.text

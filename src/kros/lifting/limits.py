@@ -15,9 +15,7 @@ from ..core.errors import ConfigError
 MAX_LENGTH = 2000
 MAX_EXPONENT = 64
 MAX_NODES = 300  # numbers, names, operators and functions
-MAX_DEPTH = (
-    20  # parentheses, functions and powers inside each other; sums and products are as deep as their deepest term
-)
+MAX_DEPTH = 20  # functions and powers inside each other; sums and products are as deep as their deepest term
 MAX_FACTORS = 40  # of one product, whose derivative has as many terms of as many factors
 MAX_TERMS = 2000  # of a formula with parameters, multiplied out
 _EXACT = 2**53
@@ -38,12 +36,12 @@ def require_size(tree: ast.AST) -> None:
             count += 1
             own = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
             depth += not (isinstance(node, ast.Name | ast.Constant) or (own is not None and own is chain))
-            if count > MAX_NODES:
-                raise TooCostlyError(
-                    f"has more than {MAX_NODES} numbers, names and operators; split it into several functions."
+            if count > MAX_NODES or depth > MAX_DEPTH:
+                many, deep = (
+                    f"has more than {MAX_NODES} numbers, names and operators",
+                    f"is nested more than {MAX_DEPTH} deep",
                 )
-            if depth > MAX_DEPTH:
-                raise TooCostlyError(f"is nested more than {MAX_DEPTH} deep; split it into several functions.")
+                raise TooCostlyError(f"{many if count > MAX_NODES else deep}; split it into several functions.")
             chain = own
         todo += [(child, depth, chain) for child in ast.iter_child_nodes(node)]
 
@@ -60,9 +58,8 @@ def settled(value: Any) -> Any:
         if part.is_number:
             finite(part)
         if isinstance(part, sp.Pow) and part.exp.is_number and abs(finite(part.exp)) > MAX_EXPONENT:
-            raise TooCostlyError(
-                f"holds a power of {finite(part.exp):g}; exponents are numbers of magnitude at most {MAX_EXPONENT}."
-            )
+            problem = f"holds a power of {finite(part.exp):g}"
+            raise TooCostlyError(f"{problem}; exponents are numbers of magnitude at most {MAX_EXPONENT}.")
     if isinstance(value, sp.Mul) and len(value.args) > MAX_FACTORS:
         raise TooCostlyError(f"holds a product of {len(value.args)} factors; at most {MAX_FACTORS} are read.")
     return value
@@ -75,9 +72,8 @@ def finite(number: Any) -> float:
     except (TypeError, ArithmeticError):
         value = math.nan
     if not math.isfinite(value):
-        raise TooCostlyError(
-            "holds a number that is not finite and real; check for a division by zero, a root of a negative number, and powers."
-        )
+        remedy = "check for a division by zero, a root of a negative number, and powers"
+        raise TooCostlyError(f"holds a number that is not finite and real; {remedy}.")
     return value
 
 

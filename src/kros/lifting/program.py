@@ -18,25 +18,9 @@ from ..core.errors import ConfigError
 
 Whole = npt.NDArray[np.int32]
 Tree = tuple[Any, ...]
-FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "sin": np.sin,
-    "cos": np.cos,
-    "tan": np.tan,
-    "exp": np.exp,
-    "log": np.log,
-    "sqrt": np.sqrt,
-    "tanh": np.tanh,
-    "Abs": np.abs,
-    "sign": np.sign,
-    "atan": np.arctan,
-}
-OPERATIONS: dict[str, Callable[..., Any]] = {
-    "add": np.add,
-    "multiply": np.multiply,
-    "divide": np.divide,
-    "power": np.power,
-} | FUNCTIONS  # in the order of loops.c
-_KINDS = tuple(OPERATIONS)
+_NUMPY = {"Abs": "abs", "atan": "arctan"}
+FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
+_KINDS = ("add", "multiply", "divide", "power", *FUNCTIONS)  # in the order of loops.c
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +56,8 @@ class Program:
     @cached_property
     def _steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...]]]:
         rows = [(_KINDS[kind], into, operands) for kind, into, *operands in self.code.tolist()]
-        return [(OPERATIONS[k], into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows]
+        steps = ((k, into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows)
+        return [(getattr(np, _NUMPY.get(k, k)), into, i) for k, into, i in steps]
 
 
 @dataclass
@@ -165,9 +150,8 @@ def _tree(expression: Any) -> Tree:
     if name == "DiracDelta":  # the slope of a sign is zero almost everywhere
         return "number", 0.0
     if name not in FUNCTIONS:
-        raise ConfigError(
-            f"Formula node {expression!r}: no numerical evaluation is known; write the formula with {', '.join(sorted(FUNCTIONS))}."
-        )
+        remedy = f"write the formula with {', '.join(sorted(FUNCTIONS))}"
+        raise ConfigError(f"Formula node {expression!r}: no numerical evaluation is known; {remedy}.")
     return name, _tree(expression.args[0])
 
 
@@ -183,6 +167,5 @@ def _real(number: Any) -> float:
     try:
         return float(number)
     except TypeError as error:
-        raise ConfigError(
-            f"Formula node {number!r}: is not a real number; keep roots and logarithms of positive quantities."
-        ) from error
+        remedy = "keep roots and logarithms of positive quantities"
+        raise ConfigError(f"Formula node {number!r}: is not a real number; {remedy}.") from error

@@ -90,8 +90,8 @@ class Window:
         if not self.depths:
             return x
         self.require(x.shape[-2])
-        columns = dict(zip(self.states, np.moveaxis(x, -1, 0), strict=True))
-        columns |= dict(zip(self.inputs, np.moveaxis(u, -1, 0), strict=True))
+        columns = {name: x[..., i] for i, name in enumerate(self.states)}
+        columns |= {name: u[..., i] for i, name in enumerate(self.inputs)}
         h, end = self.history, x.shape[-2]
         earlier = [columns[q][..., h - d : end - d] for q, d in self.delayed]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)

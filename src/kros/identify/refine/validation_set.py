@@ -19,7 +19,6 @@ from .spread import peak_residual_db
 
 Array = npt.NDArray[np.float64]
 _TOGETHER = 32  # episodes, as many as the compiled loop runs side by side
-_AT_ONCE, _LEAST = 1 << 17, 256  # numbers of recordings and samples in a block
 
 
 def free_run_errors(
@@ -47,25 +46,15 @@ def free_run_errors(
 def _errors(
     models: KoopmanMatrices, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
-    """Do the same for episodes of one length, in blocks of samples that stay in the cache: a run continues from its last states."""
-    n, h, length, recorded = lifting.n_states, lifting.history, len(episodes[0]), np.stack(episodes)
-    lifting.window.require(length)
-    squares, top, reached = (np.zeros((len(episodes), n)) for _ in range(3))
-    first = recorded[:, : h + 1, :n]
-    block = max(_LEAST, _AT_ONCE // (len(episodes) * recorded.shape[2]))
+    """Do the same for episodes of one length."""
+    n, h, recorded = lifting.n_states, lifting.history, np.stack(episodes)
+    x = recorded[..., :n]
+    run = free_run(models.A, models.B, lifting, parameters, x[:, : h + 1], recorded[..., n:])
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(0, length - h, block):  # samples k .. stop; the next block starts from the last h + 1
-            stop = min(k + block, length - h) + h
-            run = free_run(models.A, models.B, lifting, parameters, first, recorded[:, k : stop + 1, n:])
-            first = run[:, -(h + 1) :]
-            new = slice(h if k else 0, stop - k)  # what came before was counted with the block before
-            x, states = recorded[:, k:stop, :n][:, new], run[:, new]
-            squares += np.einsum("ski,ski->si", states - x, states - x)
-            reached = np.maximum(reached, np.abs(states).max(axis=1))
-            top = np.maximum(top, np.abs(x).max(axis=1))
-        rms = np.sqrt(squares / length)
-    rms, reached = (np.where(np.isfinite(values), values, np.inf) for values in (rms, reached))
-    return rms, top, reached
+        rms = np.sqrt(np.mean((run - x) ** 2, axis=1))
+        sizes = rms, np.abs(run).max(axis=1)
+    rms, reached = (np.where(np.isfinite(values), values, np.inf) for values in sizes)
+    return rms, np.abs(x).max(axis=1), reached
 
 
 def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:

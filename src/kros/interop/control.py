@@ -101,20 +101,14 @@ def to_control(
     >>> from_control(system).A
     array([[0.5]])
     """
-    if system.batch_shape:
-        return [
-            to_control(system[i], name=name, states=states, inputs=inputs, outputs=outputs)
-            for i in range(system.batch_shape[0])
-        ]
-    counts = {"states": system.n_states, "inputs": system.n_inputs, "outputs": system.n_outputs}
     signals = {"states": states, "inputs": inputs, "outputs": outputs}
+    if system.batch_shape:
+        return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
+    counts = {"states": system.n_states, "inputs": system.n_inputs, "outputs": system.n_outputs}
     for kind, names in signals.items():
-        if names is not None and (
-            isinstance(names, str) or len(names) != counts[kind] or len(set(names)) != counts[kind]
-        ):
-            raise DimensionError(
-                f"to_control: {counts[kind]} {kind} need as many different names, found {names!r}; correct the list."
-            )
+        if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == counts[kind]):
+            problem = f"{counts[kind]} {kind} need as many different names, found {names!r}"
+            raise DimensionError(f"to_control: {problem}; correct the list.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control changes matrices in place where it is asked to. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
@@ -148,13 +142,11 @@ def from_control(system: Any) -> StateSpace:
     [[0.5]]
     """
     if not is_system(system):
-        raise DimensionError(
-            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
-        )
+        needed = "a control.StateSpace or control.TransferFunction"
+        raise DimensionError(f"from_control: needs {needed}, found {type(system).__name__}.")
     if system.dt is None or system.dt is True:
-        raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, C, D, 0.001), or 0."
-        )
+        remedy = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
+        raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {remedy}.")
     if isinstance(system, control.TransferFunction):
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
@@ -176,9 +168,8 @@ def _realised(model: Any) -> StateSpace:
     for i, j in np.ndindex(p, m):
         numerator, denominator = np.trim_zeros(model.num[i][j], "f"), np.trim_zeros(model.den[i][j], "f")
         if len(numerator) > len(denominator):
-            raise DataError(
-                f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model."
-            )
+            problem = f"entry ({i}, {j}) of the transfer function is improper"
+            raise DataError(f"from_control: {problem}; give a causal model.")
         if len(denominator) == 1 and numerator.size:
             D[i, j] = numerator[0] / denominator[0]
         elif numerator.size:
@@ -223,15 +214,11 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     asked = models.unit_ids if units is None else tuple(units)
     unknown = [unit for unit in asked if unit not in models.unit_ids]
     if unknown or isinstance(units, str):
-        raise DimensionError(
-            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the list."
-        )
-    systems = models.systems(asked)
-    names = models.lifting.names
-    return {
-        unit: to_control(systems[i], name=unit, states=names, inputs=models.inputs, outputs=names)
-        for i, unit in enumerate(asked)
-    }
+        problem = f"asked for units {units!r}, the models are of {list(models.unit_ids)}"
+        raise DimensionError(f"models_to_control: {problem}; correct the list.")
+    systems, names = models.systems(asked), models.lifting.names
+    named = {"states": names, "inputs": models.inputs, "outputs": names}
+    return {unit: to_control(systems[i], name=unit, **named) for i, unit in enumerate(asked)}
 
 
 def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
@@ -248,15 +235,13 @@ def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
     >>> uncertainty_to_control(quantify_systems(units, "additive")).nominal.dt
     0.01
     """
-    nominal, scaled = (
-        to_control(model.nominal_system, name="nominal"),
-        to_control(model.scaled_nominal(), name="scaled_nominal"),
-    )
+    nominal = to_control(model.nominal_system, name="nominal")
+    scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
     certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
     if model.sample_period_s == 0:
         certificate = (
-            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, checked between the points of the "
-            "grid; from there on residuals count as constant"
+            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, checked between the "
+            "points of the grid; from there on residuals count as constant"
         )
     return with_weights(nominal, scaled, model, certificate)
 
@@ -265,17 +250,12 @@ def with_weights(
     nominal: Any, scaled: Any, model: UncertainModel | ResponseUncertainty, certificate: str
 ) -> UncertaintyForControl:
     """Put the weights of an uncertain model beside its nominal."""
-    extra = model.remainder
-    return UncertaintyForControl(
-        nominal=nominal,
-        scaled_nominal=scaled,
-        left=to_control(model.weight.left, name="weight_left"),
-        right=to_control(model.weight.right, name="weight_right"),
-        remainder_left=None if extra is None else to_control(extra.left, name="remainder_left"),
-        remainder_right=None if extra is None else to_control(extra.right, name="remainder_right"),
-        model=model,
-        certificate=certificate,
-    )
+    extra, weights = model.remainder, {"left": model.weight.left, "right": model.weight.right}
+    named = {side: to_control(system, name=f"weight_{side}") for side, system in weights.items()}
+    sides = {"left": extra and extra.left, "right": extra and extra.right}
+    for side, system in sides.items():
+        named[f"remainder_{side}"] = None if system is None else to_control(system, name=f"remainder_{side}")
+    return UncertaintyForControl(nominal, scaled, model=model, certificate=certificate, **named)
 
 
 def _label(name: str) -> str:

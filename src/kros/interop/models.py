@@ -28,10 +28,10 @@ def quantify_models(
 ) -> UncertaintyForControl:
     """Quantify how models of python-control differ from a nominal one.
 
-    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map makes of the imaginary axis and
-    mapped back, which approximates nothing; the bound is checked between the points of the grid too, and holds up to the end that the certificate names
-    and beyond it for residuals that do not grow there. Frequency responses are known on
-    their grid alone, and the certificate says so. (Bare arrays of responses: `kros.uncertainty.quantify_responses`.)
+    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map makes of the
+    imaginary axis and mapped back, which approximates nothing; the bound is checked between the points of the grid too, and holds up to
+    the end that the certificate names and beyond it for residuals that do not grow there. Frequency responses are known on their grid
+    alone, and the certificate says so. (Bare arrays of responses: `kros.uncertainty.quantify_responses`.)
 
     Parameters
     ----------
@@ -108,17 +108,14 @@ def _common_axis(data: list[Any]) -> tuple[Array, float]:
     first = data[0]
     for k, other in enumerate(data):
         if not isinstance(other, control.FRD):
-            raise DimensionError(
-                f"quantify_models: candidates beside response data should be response data, found {type(other).__name__}."
-            )
+            problem = f"candidates beside response data should be response data, found {type(other).__name__}"
+            raise DimensionError(f"quantify_models: {problem}.")
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
-            raise DimensionError(
-                f"quantify_models: response {k} has other frequencies than the first; interpolate or measure them on one grid."
-            )
+            problem = f"response {k} has other frequencies than the first"
+            raise DimensionError(f"quantify_models: {problem}; interpolate or measure them on one grid.")
         if other.dt != first.dt:
-            raise DimensionError(
-                f"quantify_models: response {k} has dt = {other.dt}, the first dt = {first.dt}; bring them to one."
-            )
+            problem = f"response {k} has dt = {other.dt}, the first dt = {first.dt}"
+            raise DimensionError(f"quantify_models: {problem}; bring them to one.")
     if first.dt is True:
         raise DimensionError(
             "quantify_models: the sampling period of the responses is not known (dt = True); give it in seconds."

@@ -250,12 +250,13 @@ def with_weights(
     nominal: Any, scaled: Any, model: UncertainModel | ResponseUncertainty, certificate: str
 ) -> UncertaintyForControl:
     """Put the weights of an uncertain model beside its nominal."""
-    extra, weights = model.remainder, {"left": model.weight.left, "right": model.weight.right}
-    named = {side: to_control(system, name=f"weight_{side}") for side, system in weights.items()}
-    sides = {"left": extra and extra.left, "right": extra and extra.right}
-    for side, system in sides.items():
-        named[f"remainder_{side}"] = None if system is None else to_control(system, name=f"remainder_{side}")
-    return UncertaintyForControl(nominal, scaled, model=model, certificate=certificate, **named)
+    sides = [("weight", model.weight), ("remainder", model.remainder)]
+    left, right, remainder_left, remainder_right = (
+        None if weight is None else to_control(getattr(weight, side), name=f"{kind}_{side}")
+        for kind, weight in sides
+        for side in ("left", "right")
+    )
+    return UncertaintyForControl(nominal, scaled, left, right, remainder_left, remainder_right, model, certificate)
 
 
 def _label(name: str) -> str:

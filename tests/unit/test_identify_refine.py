@@ -75,7 +75,7 @@ def test_unit_without_training_episodes_is_named() -> None:
 def test_factors_of_another_size_are_refused() -> None:
     made, keys = population([50, 50])
     wrong = Factor(np.zeros((1, 4, 4)), np.ones((1, 2)), np.array([98]))
-    with pytest.raises(DimensionError, match="lifted_factor"):
+    with pytest.raises(DimensionError, match="episode_factors"):
         refine_population(made, keys, Lifting(("x",)), {}, wrong)
 
 

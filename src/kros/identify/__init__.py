@@ -1,4 +1,4 @@
-"""Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify` of this package.
+"""Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify`.
 
 Python binds a package's name to the package, so the package itself is made callable.
 

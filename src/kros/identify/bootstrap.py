@@ -3,12 +3,14 @@
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
     per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
 
-Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn with replacement and
-each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the variance, too little with few episodes
-(Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat. Assoc. 83, 1988).
+Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn
+with replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of
+the variance, too little with few episodes (Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat.
+Assoc. 83, 1988).
 
-What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated parameters stay as they are,
-and so does a bias that all episodes share (regularisation, least squares on noisy or closed-loop recordings): no resampling sees it.
+What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated
+parameters stay as they are, and so does a bias that all episodes share (regularisation, least squares on noisy or
+closed-loop recordings): no resampling sees it.
 
 Symbols
 -------
@@ -46,8 +48,8 @@ class ModelSamples:
     samples : KoopmanMatrices
         A (unit, draw, n, n) and B (unit, draw, n, m).
     linear : bool
-        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a response or an
-        eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
+        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a
+        response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
 
     Examples
     --------
@@ -119,8 +121,8 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     counts = [int(e) for e in n_episodes]
     if not counts or min(counts) < 2 or draws < 2:
         raise DataError(
-            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of the units and "
-            f"{draws} draws; record more, or leave the unit out."
+            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "
+            f"the units and {draws} draws; record more, or leave the unit out."
         )
     weights = np.zeros((len(counts), draws, max(counts)))
     for row, E in enumerate(counts):
@@ -200,10 +202,11 @@ def one_step_deviations(normal: Array, information: Array, weights: Array) -> Ar
 def bootstrap_refined(
     units: KoopmanMatrices, whitening: Array, information: Array, normal: Array, weights: Array, unit_ids: Sequence[str]
 ) -> ModelSamples:
-    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones, `linear`; normal (unit, episode, P + 1, P + 1).
+    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones, `linear`.
 
-    The prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits of three simulated drives,
-    first-order bands were right to about 20 percent, bands of the steps' own responses 2.6 to 12 times too wide.
+    The prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
+    of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses 2.6
+    to 12 times too wide.
     """
     n, p = units.A.shape[-1], len(whitening)
     dW = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p) @ whitening.T
@@ -212,7 +215,7 @@ def bootstrap_refined(
 
 
 def _solve(H: Array, g: Array) -> Array:
-    """Symmetric least squares of scaled normal equations, batched; directions that rounding alone determines stay as they are."""
+    """Solve scaled normal equations, batched; directions that rounding alone determines do not move."""
     values, vectors = np.linalg.eigh((H + np.swapaxes(H, -1, -2)) / 2)
     known = values > 450 * np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
     along = np.einsum("...ji,...j->...i", vectors, g)

@@ -1,16 +1,18 @@
 """Phase calibration of a periodic disturbance that is fixed to an angle (Appendix B, (40)-(41)).
 
-A disturbance ``sin(r*theta + phi)`` reaches the tracking error through a loop with a lag ``eta`` that depends on speed. In steady
-motion the error's phase against the angle is ``phi + eta`` forward and ``phi - eta`` in reverse, so the mean over both directions
-that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is averaged by itself:
+A disturbance ``sin(r*theta + phi)`` reaches the tracking error through a loop with a lag ``eta`` that depends on speed.
+In steady motion the error's phase against the angle is ``phi + eta`` forward and ``phi - eta`` in reverse, so the mean
+over both directions that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is
+averaged by itself:
 
-    phi = (psi_forward + psi_reverse) / 2  (modulo pi),      eta = (psi_forward - psi_reverse) / 2  (modulo pi, the same branch)
+    phi = (psi_forward + psi_reverse) / 2  (modulo pi),      eta = (psi_forward - psi_reverse) / 2  (modulo pi, the same
+    branch)
 
 and the branch is chosen for the whole population at once, so that every unit's lag lies near the population's mean lag.
 
 Symbols
 -------
-e     : tracking error, reference - measured; where the reference is constant its periodic part is that of -measured, in any unit
+e     : tracking error, reference - measured; its periodic part at constant reference is that of -measured
 theta : angle, rad;  r : ratio of the disturbance to the angle
 psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
 """
@@ -37,27 +39,6 @@ Array = npt.NDArray[np.float64]
 class PhaseSpec:
     """What to calibrate: the disturbance ``sin(ratio * angle + parameter)`` seen in ``reference - measured``, and how.
 
-    Parameters
-    ----------
-    angle, reference, measured : str
-        Channels: the angle, the commanded speed, and the speed that follows it.
-    ratio : float
-        Periods a radian.
-    parameter : str
-        Name of the phase in formulas.
-    settle : float
-        Share of an episode that is left out at the start of a segment, in which the loop settles.
-    steady : float
-        A commanded speed is constant where it would take longer than one part in so many of the episode to reach its maximum.
-    least_speed : float
-        Of the largest commanded speed, below which friction hides the disturbance.
-    least_periods, least_samples : float
-        Of the disturbance in a segment, and samples in a period, that its phase needs.
-    speed_tolerance : float
-        Segments within this share of each other's speed have one lag.
-    least_concentration : float
-        Mean resultant length below which segments, or lags of units, disagree so much that the log says so.
-
     Examples
     --------
     >>> from kros.identify import PhaseSpec
@@ -66,17 +47,21 @@ class PhaseSpec:
     """
 
     angle: str = "position"
-    ratio: float = 100.0
-    reference: str = "target_velocity"
-    measured: str = "velocity"
-    parameter: str = "phase"
-    settle: float = 0.005
-    steady: float = 20.0
-    least_speed: float = 0.1
-    least_periods: float = 5.0
-    least_samples: float = 4.0
-    speed_tolerance: float = 0.02
-    least_concentration: float = 0.8
+    ratio: float = 100.0  # periods a radian
+    reference: str = "target_velocity"  # commanded speed
+    measured: str = "velocity"  # speed that follows it
+    parameter: str = "phase"  # its name in formulas
+    settle: float = 0.005  # share of an episode left out at the start of a segment, in which the loop settles
+    steady: float = (
+        20.0  # constant speed would take longer than one part in so many of the episode to reach its maximum
+    )
+    least_speed: float = 0.1  # of the largest commanded one, below which friction hides the disturbance
+    least_periods: float = 5.0  # of the disturbance in a segment
+    least_samples: float = 4.0  # in a period
+    speed_tolerance: float = 0.02  # share within which segments have one speed, and one lag
+    least_concentration: float = (
+        0.8  # mean resultant length below which the log warns of segments or lags that disagree
+    )
 
 
 @dataclass(frozen=True)
@@ -118,9 +103,10 @@ class PhaseCalibration:
     Examples
     --------
     >>> import kros
-    >>> drives = kros.plants.HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=8.0, seed=3, conditions=("noload",)).simulate()
-    >>> calibration = kros.identify(drives.population, refine=False).calibration
-    >>> sorted(calibration.units) == list(drives.population.unit_ids), -3.2 < calibration.lag_rad < 0
+    >>> plant = kros.plants.HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=8.0, seed=3)
+    >>> drives = plant.simulate().population
+    >>> calibration = kros.identify(drives, refine=False).calibration
+    >>> sorted(calibration.units) == list(drives.unit_ids), -3.2 < calibration.lag_rad < 0
     (True, True)
     """
 
@@ -153,7 +139,8 @@ def wrap(angle: float) -> float:
 def find_segments(angle: Array, reference: Array, measured: Array, dt: float, spec: PhaseSpec) -> list[Segment]:
     """Find the constant-velocity segments of an episode and the phase of the error in each.
 
-    Signals (n_samples,) are in any units of measure; the speed of a segment is that of the angle. NaN, a missing sample, ends a segment.
+    Signals (n_samples,) are in any units of measure; the speed of a segment is that of the angle. NaN, a missing
+    sample, ends a segment.
     """
     there = np.isfinite(angle) & np.isfinite(reference) & np.isfinite(measured)
     angle, reference, measured = (np.where(there, signal, 0.0) for signal in (angle, reference, measured))
@@ -175,7 +162,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
 
 
 def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
-    """Speed of the angle over the reference, which follows from their units of measure: one where these match; zero where nothing moves."""
+    """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
     wanted = reference[:-1][moving] / max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
     power = float(wanted @ wanted)
@@ -183,7 +170,7 @@ def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.
 
 
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
-    """Phase and amplitude of the error at the disturbance's frequency; drift and second harmonic are fitted beside it."""
+    """Phase and amplitude of the error at the disturbance's frequency, fitted with drift and second harmonic."""
     ramp = np.linspace(-1, 1, turn.size)
     columns = [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2]
     along_sin, along_cos = np.linalg.lstsq(np.stack(columns, axis=1), error, rcond=None)[0][:2]
@@ -191,7 +178,7 @@ def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
 
 
 def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitPhase:
-    """Combine a unit's segments, each direction by itself and each speed by itself; needs a speed that occurs in both directions."""
+    """Combine a unit's segments, each direction and speed by itself; needs a speed in both directions."""
     phases, lags, weights, concentrations = [], [], [], []
     remaining = sorted(segments, key=lambda s: -abs(s.speed))
     while remaining:
@@ -208,8 +195,8 @@ def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitP
     if not phases:
         directions = {"forward": sum(s.forward for s in segments), "reverse": sum(not s.forward for s in segments)}
         raise IdentificationError(
-            f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, found {directions}; "
-            "record such motion, or lift with sine and cosine and no phase parameter."
+            f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, "
+            f"found {directions}; record such motion, or lift with sine and cosine and no phase parameter."
         )
     best = int(np.argmax(weights))
     # Phases of other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
@@ -228,8 +215,9 @@ def _circular_mean(segments: Sequence[Segment]) -> tuple[float, float]:
 def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec: PhaseSpec) -> PhaseCalibration:
     """Choose the branch of the half sum for the whole population.
 
-    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to the branch
-    whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean lag in [-pi, 0).
+    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to
+    the branch whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean
+    lag in [-pi, 0).
     """
     doubled = np.mean([np.exp(2j * units[u].lag_rad) for u in pooled])
     lag = float(np.angle(doubled)) / 2

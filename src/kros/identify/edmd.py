@@ -2,7 +2,8 @@
 
     min_U ||Theta_plus - U Psi||_F^2 + alpha ||U||_F^2,      U = [A B]
 
-is solved by QR of ``[R; sqrt(alpha) I]``, with `alpha` added to the unnormalised Gram matrix as in the paper and in pykoop.
+is solved by QR of ``[R; sqrt(alpha) I]``, with `alpha` added to the unnormalised Gram matrix as in the paper and in
+pykoop.
 
 Symbols
 -------
@@ -29,27 +30,15 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class AlphaSearch:
-    """How one Tikhonov coefficient is searched for all models of a population.
+    """How one Tikhonov coefficient is searched for all models of a population."""
 
-    Parameters
-    ----------
-    per_decade : int
-        Values a decade, from where every model is stable downwards: the stabilising set need not be an interval.
-    decades : int
-        Below the largest squared singular value of the data, which double precision resolves.
-    bisections : int
-        Between the last two values; 30 leave 1e-10 of the coefficient.
-    doublings : int
-        Most doublings of ``alpha_factor``, until the models of the units are alike.
-    points : int
-        Frequencies at which the models of the units are compared.
-    """
-
-    per_decade: int = 10
-    decades: int = 14
-    bisections: int = 30
-    doublings: int = 12
-    points: int = 60
+    per_decade: int = (
+        10  # values, from where every model is stable downwards: the stabilising set need not be an interval
+    )
+    decades: int = 14  # below the largest squared singular value of the data, which double precision resolves
+    bisections: int = 30  # between the last two values, which leave 1e-10 of the coefficient
+    doublings: int = 12  # of alpha_factor, at most, until the models of the units are alike
+    points: int = 60  # frequencies at which the models of the units are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +111,15 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
         *unit, column = (int(i) for i in np.argwhere(pivots < p * np.finfo(float).eps)[0])
         where = f" of unit number {unit[0]}" if unit else ""
         raise IdentificationError(
-            f"EDMD: column {column} of the lifted data{where} depends on the others (relative pivot {pivots.min():.1e}); remove the "
-            "lifting function or input, excite it, or use alpha > 0."
+            f"EDMD: column {column} of the lifted data{where} depends on the others (relative pivot "
+            f"{pivots.min():.1e}); remove the lifting function or input, excite it, or use alpha > 0."
         )
     U = np.swapaxes(np.linalg.solve(R11, R12), -1, -2)
     return KoopmanMatrices(U[..., :n_lifted], U[..., n_lifted:])
 
 
 def relative_pivots(R: Array) -> Array:
-    """Return what is left of every column of a triangle beside those before it, relative to the column, shape (..., p)."""
+    """Return what is left of every column of a triangle beside those before it, relative to the column."""
     size = np.maximum(np.linalg.norm(R, axis=-2), np.finfo(float).tiny)
     return np.asarray(np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size)
 
@@ -148,8 +137,8 @@ def smallest_stabilising_alpha(
 ) -> float:
     """Find the infimum of the interval ``[alpha, inf)`` on which every model of every unit is stable.
 
-    The stabilising set need not be an interval, so the search comes down from above until a model is unstable, then bisects between
-    the last two values.
+    The stabilising set need not be an interval, so the search comes down from above until a model is unstable, then
+    bisects between the last two values.
 
     Parameters
     ----------
@@ -197,7 +186,7 @@ def smallest_stabilising_alpha(
 
 @dataclass(frozen=True, eq=False)
 class _Ridge:
-    """Regularised models as functions of alpha: with ``R11 = P diag(s) Q^T``, ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``."""
+    """Models as functions of alpha: with ``R11 = P diag(s) Q^T``, ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``."""
 
     left: Array  # (unit, n_lifted, p)
     values: Array  # (unit, p)

@@ -1,4 +1,4 @@
-"""What the recordings do not show: inputs that never move, and lifted functions that depend on others, named by unit and function."""
+"""What the recordings do not show: inputs that never move, and lifted functions that depend on others."""
 
 from __future__ import annotations
 
@@ -41,6 +41,6 @@ def require_independent(factor: Factor, names: Sequence[str], units: Sequence[st
     if dependent is not None:
         unit, column = dependent
         raise IdentificationError(
-            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs before it "
-            f"({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
+            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
+            f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
         )

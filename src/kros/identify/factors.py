@@ -1,9 +1,9 @@
 """Triangular factors: each episode is reduced once, all least squares after that is algebra on small matrices.
 
-The factor of an episode is R of the QR decomposition of ``[x g u v | x+ g+]``: states, parameter-free lifted functions, inputs and
-parameter-free input functions at k, states and functions at k + 1. With delays the first k is the lifting's history. Factors of several
-episodes combine by stacking and another QR (TSQR), so memory does not grow with the recording and the condition number is never
-squared, as it is in (32)-(33).
+The factor of an episode is R of the QR decomposition of ``[x g u v | x+ g+]``: states, parameter-free lifted functions,
+inputs and parameter-free input functions at k, states and functions at k + 1. With delays the first k is the lifting's
+history. Factors of several episodes combine by stacking and another QR (TSQR), so memory does not grow with the
+recording and the condition number is never squared, as it is in (32)-(33).
 
 Symbols
 -------
@@ -117,7 +117,7 @@ def episode_factors(
     lifting: Lifting,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Factor:
-    """Return factors of [Psi | Theta_plus] of every episode by itself, for leaving episodes out and for drawing them again.
+    """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
 
     Parameters
     ----------
@@ -151,7 +151,7 @@ def episode_factors(
     most = max((len(episodes) for episodes in keys.values()), default=0)
     if most == 0:
         raise DataError(
-            f"Factors by episode: {len(keys)} units without an episode among them; pass keys as population.keys(unit) gives them."
+            f"Factors by episode: {len(keys)} units without an episode; pass keys as population.keys(unit) gives them."
         )
     rows = [[reduce_episode(*population.read_parts(key), lifting) for key in episodes] for episodes in keys.values()]
     values = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
@@ -162,7 +162,7 @@ def episode_factors(
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
-    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's lifting: `lifting` itself, or the linear one."""
+    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's lifting, or the linear one."""
     n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
     m = factor.R.shape[-1] - 2 * (n + b) - r
     batch = factor.R.shape[:-2]

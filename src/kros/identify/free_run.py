@@ -38,7 +38,8 @@ def free_run(
     Returns
     -------
     ndarray, shape (batch, n_samples, n_states)
-        The state at sample k follows from inputs up to k - 1; the first ones are `x0`. A run that diverges holds infinities or NaN.
+        The state at sample k follows from inputs up to k - 1; the first ones are `x0`. A run that diverges holds
+        infinities or NaN.
 
     Raises
     ------
@@ -52,7 +53,8 @@ def free_run(
     >>> import numpy as np
     >>> from kros.identify import free_run
     >>> from kros.lifting import Lifting
-    >>> run = free_run(np.array([[0.5]]), np.array([[1.0]]), Lifting(("x",)), {}, np.array([[8.0]]), np.zeros((1, 4, 1)))
+    >>> A, B, u = np.array([[0.5]]), np.array([[1.0]]), np.zeros((1, 4, 1))
+    >>> run = free_run(A, B, Lifting(("x",)), {}, np.array([[8.0]]), u)
     >>> run.ravel().tolist()
     [8.0, 4.0, 2.0, 1.0]
     """
@@ -63,8 +65,8 @@ def free_run(
     if first.shape != (batch, h + 1, n) or A.shape[-1] != n_lifted or B.shape[-1] != width:
         past = f" with a history of {h} samples" if h else ""
         raise DimensionError(
-            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states "
-            f"to {n_lifted}{past} and {width} inputs."
+            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of "
+            f"{n} states to {n_lifted}{past} and {width} inputs."
         )
     lifting.window.require(n_samples)
     rows, window = np.concatenate([A, B], axis=-1)[..., :n, :], lifting.windows(first, u[:, : h + 1])[:, 0].copy()

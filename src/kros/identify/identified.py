@@ -1,4 +1,4 @@
-"""All models of a population: every kind in every condition, with the recordings and what was learned from them on the way."""
+"""All models of a population: every kind in every condition, with the recordings and what was learned from them."""
 
 from __future__ import annotations
 
@@ -130,8 +130,8 @@ class IdentifiedModels:
     refined: Mapping[str, Refinement] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        facts = self.facts
-        return f"<IdentifiedModels: {', '.join(self.kinds)} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
+        kinds, facts = ", ".join(self.kinds), self.facts
+        return f"<IdentifiedModels: {kinds} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
 
     @property
     def edmd_kinds(self) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ class IdentifiedModels:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Conditions that models were identified in, that of synthesis first; none where no unit of it can be modelled."""
+        """Conditions that models were identified in, that of synthesis first."""
         known = {k.condition for k in self.facts.train if k.unit in self.parameters}
         return tuple(sorted(known, key=lambda c: c != self.facts.identify_on))
 
@@ -157,7 +157,7 @@ class IdentifiedModels:
         return kind if condition in (None, self.facts.identify_on) else f"{kind}@{quote(str(condition), safe='')}"
 
     def models(self, kind: str | None = None, condition: str | None = None) -> ModelSet:
-        """Return the models of one kind, the first where none is named, in the condition that feeds synthesis or another."""
+        """Return the models of one kind, the first by default, in the condition that feeds synthesis or another."""
         place = self.place(kind or self.kinds[0], condition)
         if place not in self.sets:
             raise DataError(f"Models {place!r}: there are none, only {', '.join(self.sets)}; name one of them.")

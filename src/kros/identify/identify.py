@@ -1,8 +1,8 @@
 """The verb: from a population's recordings to models of every unit.
 
 recordings --survey--> training episodes --calibrate--> parameters of the lifting
-training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every condition
-in the condition that feeds synthesis --refined on free-run error--> koopman, linear
+training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every
+condition in the condition that feeds synthesis --refined on free-run error--> koopman, linear
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def identify(
     ----------
     population : Population
     lifting : sequence of str, mapping, Lifting or None
-        Lifted functions, such as ``["sin(100*position + phase)"]``, or a table as ``[lifting]`` of a study. Default: that of the plant
-        that the recordings name, else linear models alone.
+        Lifted functions, such as ``["sin(100*position + phase)"]``, or a table as ``[lifting]`` of a study. Default:
+        that of the plant that the recordings name, else linear models alone.
     identify_on : str, optional
         Condition that feeds synthesis; default ``noload``, else the first.
     test : iterable of str, optional
@@ -134,14 +134,14 @@ def _check_conditions(base: IdentifiedModels) -> None:
     facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
-            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; set data.identify_on "
-            "to another one."
+            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; "
+            "set data.identify_on to another one."
         )
     elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
     if elsewhere:
         log.warning(
-            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not compared with the "
-            "others. Where conditions stand for units, give all the same one.",
+            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not "
+            "compared with the others. Where conditions stand for units, give all the same one.",
             ", ".join(elsewhere),
             facts.identify_on,
         )
@@ -150,7 +150,7 @@ def _check_conditions(base: IdentifiedModels) -> None:
 def _begin(
     base: IdentifiedModels, condition: str, settings: IdentifySettings, work: Work
 ) -> tuple[EpisodeFactors, list[ModelSet], Callable[[], Result]]:
-    """Reduce the training episodes of one condition, identify every kind of model, and begin to refine those that feed synthesis."""
+    """Reduce and identify the training episodes of one condition, and begin to refine models that feed synthesis."""
     population, facts, values = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in values and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
@@ -171,7 +171,7 @@ def _nothing() -> Result:
 
 
 def _mark(facts: RecordingFacts, task: Task) -> str | None:
-    """Return what the factors of a task follow from: samples, what they are of, and the lifting but for its parameters' values."""
+    """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
     population, keys, lifting = task
     samples = facts.marks(keys)
     return None if samples is None else mark_of(samples, keys, population.channels, repr(lifting))
@@ -273,7 +273,7 @@ class _Reduced:
         return fitted(unfitted, factor)
 
     def begin_refinement(self, starts: list[ModelSet], work: Work) -> Callable[[], Result]:
-        """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it."""
+        """Begin to refine every kind of model on free-run error."""
         base, facts = self.base, self.base.facts
         keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
         factors = [self.lifted(start.lifting) for start in starts]
@@ -294,7 +294,7 @@ class _Reduced:
 
 
 def fitted(models: ModelSet, factor: Factor) -> ModelSet:
-    """Return a set of models fitted to factors of its units; a regularisation that was searched acts on channels divided by their ranges."""
+    """Return a set of models fitted to factors of its units, with its regularisation."""
     matrices = models.fit(factor.R)
     radius = models.ranges.normalise(matrices).spectral_radius()
     status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
@@ -311,7 +311,7 @@ def _with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, factor
 def alpha_factor(
     shared: list[tuple[Array, int]], edge: float, smallest: float, search: AlphaSearch | None = None
 ) -> float:
-    """Return how many times the smallest stabilising coefficient is taken: doubled until the models are alike, where that can be reached."""
+    """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
     search, limit = search or AlphaSearch(), 20 * np.log10(RefineOptions().largest_residual)
     for doubled in range(search.doublings if edge > 0 else 0):
         factor = smallest * 2.0**doubled
@@ -326,6 +326,6 @@ def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
     for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
         if counts and status != "ok":
             raise IdentificationError(
-                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the model is {status}; "
-                "set identify.alpha = 'auto', or raise it."
+                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the "
+                f"model is {status}; set identify.alpha = 'auto', or raise it."
             )

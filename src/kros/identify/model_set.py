@@ -48,11 +48,13 @@ class ModelSet:
     alpha : float or None
         Tikhonov coefficient, where there is one.
     alpha_in_ranges : bool
-        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings' units.
+        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings'
+        units.
     status : tuple of str
         Per unit ``ok``, or what is wrong.
     longest_s : float or None, s
-        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is not known.
+        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is
+        not known.
 
     Examples
     --------
@@ -112,7 +114,7 @@ class ModelSet:
         return self.ranges.sizes(self.lifting, self.recorded_inputs)
 
     def normalised(self) -> ModelSet:
-        """Return the models in channels divided by their ranges, which are all one then; the lifting is that of such channels."""
+        """Return the models in channels divided by their ranges, with the lifting of such channels."""
         matrices = self.ranges.normalise(KoopmanMatrices(self.A, self.B))
         x, u = self.output_scale, self.input_scale
         return replace(
@@ -127,12 +129,12 @@ class ModelSet:
         )
 
     def fit(self, R: Array) -> KoopmanMatrices:
-        """Return EDMD models of other recordings, from factors of ``[Psi | Theta_plus]``, with the regularisation of these."""
+        """Return EDMD models of other factors of ``[Psi | Theta_plus]``, with the regularisation of these."""
         alpha = self.alpha or 0.0
         return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
 
     def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
-        """Return frequency responses from inputs to lifted states in the recordings' units, shape (unit, frequency, n, m)."""
+        """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
         return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
 
     def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
@@ -147,7 +149,7 @@ class ModelSet:
         return StateSpace(A, B, np.broadcast_to(np.eye(n), A.shape), np.zeros((len(A), n, m)), self.sample_period_s)
 
     def frequencies(self, n_freqs: int = 1000, decades: float = 6.0) -> Array:
-        """Return logarithmic frequencies, Hz, from what the longest episode resolves (at most some decades below Nyquist) up to Nyquist."""
+        """Return logarithmic frequencies, Hz, from what the longest episode resolves up to Nyquist."""
         return log_grid(self.sample_period_s, n_freqs, decades, self.longest_s)
 
     def index(self, unit: str) -> int:

@@ -4,7 +4,8 @@ Symbols
 -------
 e_k   : residual of ``x_{k+1}`` regressed on the states and inputs of the last steps, each unit by itself
 q_k   : angle, rad
-P(r)  : ``2 |sum_k e_k exp(-i r q_k)|^2 / (N sum_k e_k^2)``, about the share of the residual that ``sin(r q)`` and ``cos(r q)`` explain. All r at once
+P(r)  : ``2 |sum_k e_k exp(-i r q_k)|^2 / (N sum_k e_k^2)``, about the share of the residual that ``sin(r q)`` and
+``cos(r q)`` explain. All r at once
         by a histogram of the residual over the angle and one FFT.
 """
 
@@ -35,47 +36,25 @@ class PeriodicTerm:
 
 @dataclass(frozen=True)
 class PeriodicTest:
-    """When a term counts as seen.
+    """When a term counts as seen."""
 
-    Parameters
-    ----------
-    largest_ratio : float
-        Beyond that of any gear.
-    lags : int
-        Steps whose states and inputs the residual is regressed on: more than the order of a drive.
-    units, episodes, samples : int
-        Recordings that are looked at, and samples of a unit.
-    above : float
-        Of a peak over the median around it; the largest of some thousand values of noise alone is about 8 times their median.
-    above_in_every_unit : float
-        Of the peak of each unit over its surroundings.
-    least_share : float
-        Of the residual that a term explains.
-    gravity, least_travel : float
-        The same for ``sin(angle)``, which other smooth terms resemble, and the travel that it needs, rad.
-    odd : float
-        Of what sine and cosine explain, that the sine alone explains where a term is odd.
-    whole : float
-        Of what the best ratio explains, that a whole number near it has to explain to be taken.
-    """
-
-    largest_ratio: float = 500.0
-    lags: int = 3
-    units: int = 6
-    episodes: int = 3
-    samples: int = 40_000
-    above: float = 15.0
-    above_in_every_unit: float = 3.0
-    least_share: float = 0.002
-    gravity: float = 0.01
-    least_travel: float = 0.5
-    odd: float = 0.9
-    whole: float = 0.8
+    largest_ratio: float = 500.0  # beyond that of any gear
+    lags: int = 3  # steps whose states and inputs the residual is regressed on: more than the order of a drive
+    units: int = 6  # that are looked at
+    episodes: int = 3  # of each
+    samples: int = 40_000  # of a unit
+    above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8 among some thousand values
+    above_in_every_unit: float = 3.0  # of the peak of each unit over its surroundings
+    least_share: float = 0.002  # of the residual that a term explains
+    gravity: float = 0.01  # the same for sin(angle), which other smooth terms resemble
+    least_travel: float = 0.5  # rad, that sin(angle) needs
+    odd: float = 0.9  # of what sine and cosine explain, that the sine alone explains where a term is odd
+    whole: float = 0.8  # of what the best ratio explains, that a whole number near it has to explain to be taken
 
 
 @dataclass(frozen=True, eq=False)
 class _Unit:
-    """Residuals of one step (n, n_states), the angle before it (n,) and an orthonormal basis of the regressors (n, p)."""
+    """Residuals of one step (n, n_states), the angle before it (n,), an orthonormal basis of the regressors (n, p)."""
 
     residuals: Array
     angle: Array
@@ -104,7 +83,7 @@ class _Unit:
         return float(np.ptp(self.angle))
 
     def share(self, ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)) -> float:
-        """Return the share of the residual that functions explain beside the regressors, the largest over the states."""
+        """Return the share of the residual that functions explain beside the regressors, the largest of the states."""
         columns = np.stack([f(r * self.angle) for r in ratios for f in functions], axis=1)
         columns -= self.basis @ (self.basis.T @ columns)
         u, s, _ = np.linalg.svd(columns, full_matrices=False)
@@ -186,7 +165,7 @@ def _peak(units: Sequence[_Unit], test: PeriodicTest) -> tuple[float, float] | N
 def _standing_out(
     spectra: Array, ratios: Array, ends: tuple[float, float], half: float, test: PeriodicTest
 ) -> Iterator[tuple[int, float]]:
-    """Yield the highest peaks that stand out in the mean and in every unit: place, and height over the median around it."""
+    """Yield peaks that stand out in the mean and in every unit, highest first: place, height over the median around."""
     total, inside = spectra.mean(axis=0), (ratios > ends[0]) & (ratios < ends[1])
     places = np.flatnonzero(inside)
     for i in places[np.argsort(total[places])[::-1][:50]]:
@@ -199,7 +178,7 @@ def _standing_out(
 
 
 def _refined(units: Sequence[_Unit], ratio: float, test: PeriodicTest) -> float:
-    """Return the ratio that explains most with its harmonics, or the whole number near it that explains nearly as much."""
+    """Return the ratio that explains most with its harmonics, or a whole number near it that nearly does."""
 
     def explained(r: float) -> float:
         return float(np.mean([unit.share([r, 2 * r, 3 * r]) for unit in units]))

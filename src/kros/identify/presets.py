@@ -1,4 +1,4 @@
-"""What follows from a plant and from formulas where nothing is declared, so that the shortest call and the smallest study work."""
+"""What follows from a plant and from formulas where nothing is declared."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def resolve_lifting(
     population: Population,
     test: Iterable[str] | None = None,
 ) -> Lifting:
-    """Return the lifting that is declared, or the plant's (35); `test` names held-out episodes, of which families see nothing."""
+    """Return the lifting that is declared, or the plant's (35); families see no episodes of `test`."""
     inputs, functions = declared.input_functions, declared.functions or ()
     if declared.functions is None and not declared.families and population.metadata.get("plant") == HARMONIC_DRIVE:
         functions = (f"sin({_declared_ratio(calibration, population):g}*position + {PHASE})",)
@@ -54,7 +54,7 @@ def lifting_settings(lifting: LiftingSettings | Mapping[str, object] | Sequence[
 
 
 def _sample(population: Population, test: Iterable[str] | None, names: tuple[str, ...]) -> Array:
-    """Return values of formulas on training episodes, one of every unit and condition, thinned, shape (n_samples, len(names))."""
+    """Return values of formulas on training episodes, one of every unit and condition, thinned."""
     keys = [split.train[0] for split in split_episodes(population, test).values()]
     keys = keys[:: max(1, -(-len(keys) // _EPISODES))]
     known = population.states + population.inputs
@@ -69,7 +69,7 @@ def _sample(population: Population, test: Iterable[str] | None, names: tuple[str
 
 
 def resolve_phase(declared: CalibrationSettings, population: Population, lifting: Lifting) -> PhaseSpec | None:
-    """Return what has to be calibrated for the lifting's parameters: nothing, or the phase of a disturbance that is fixed to an angle."""
+    """Return what has to be calibrated: nothing, or the phase of a disturbance that is fixed to an angle."""
     if not lifting.parameters:
         return None
     if lifting.parameters != (PHASE,):
@@ -92,7 +92,7 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
 
 
 def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) -> dict[str, Any]:
-    """Return angle and ratio where all functions of the phase have it beside one angle times one number, ``ratio*angle + phase``."""
+    """Return angle and ratio where every function of the phase reads ``ratio*angle + phase``."""
     import sympy as sp
 
     phase, pairs = sp.Symbol(PHASE, real=True), set()

@@ -13,7 +13,8 @@ from ..lifting.families import check_family
 class LiftingSettings(Settings):
     """Lifted functions of the Koopman model; where none are declared, those that suit the plant that the reader names.
 
-    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
+    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further
+    inputs of the model.
     """
 
     functions: tuple[str, ...] | None = Field(None, description="lifted functions of the states, as formulas")
@@ -44,15 +45,16 @@ class CalibrationSettings(Settings):
 class IdentifySettings(Settings):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
-    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite; the factor
-    is doubled until the peak residual around the best nominal unit is at most one half, where that can be reached.
-    `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
-    a prior that is never so weak that the peak residual exceeds one half.
+    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
+    population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
+    half, where that can be reached. `refine` adds models that are refined on their free-run error, the population
+    first, then each unit, held near the population's model by a prior that is never so weak that the peak residual
+    exceeds one half.
     """
 
     alpha: float | Literal["auto"] = Field(
         "auto",
-        description="regularisation, in channels divided by their ranges; a number is in the recordings' units of measure, as the paper's",
+        description="regularisation of channels divided by their ranges; a number: of recorded units, as in the paper",
     )
     alpha_factor: float = Field(
         4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model"

@@ -1,6 +1,6 @@
 """Systems to and from python-control, with the names of their signals.
 
-kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
+kros.core.StateSpace ── to_control ──► control.StateSpace ── from_control ──► kros.core.StateSpace
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ except ImportError as error:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyForControl:
-    """A nominal and weights as python-control systems: every model is in the set of the form with ``E = left Delta right``, ``||Delta|| <= 1``.
+    """A nominal and weights as python-control systems: ``E = left Delta right``, ``||Delta|| <= 1`` for every model.
 
     Parameters
     ----------
@@ -76,10 +76,12 @@ def to_control(
     Parameters
     ----------
     system : StateSpace
-        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its ``dt`` is zero.
+        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its
+        ``dt`` is zero.
     name : str, optional
     states, inputs, outputs : sequence of str, optional
-        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes ``0·5*x``.
+        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes
+        ``0·5*x``.
 
     Returns
     -------
@@ -95,7 +97,8 @@ def to_control(
     --------
     >>> from kros.core import StateSpace
     >>> from kros.interop import from_control, to_control
-    >>> system = to_control(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), states=["position"], inputs=["target"])
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> system = to_control(lag, states=["position"], inputs=["target"])
     >>> system.state_labels, system.input_labels, system.dt
     (['position'], ['target'], 0.01)
     >>> from_control(system).A
@@ -110,13 +113,13 @@ def to_control(
             problem = f"{counts[kind]} {kind} need as many different names, found {names!r}"
             raise DimensionError(f"to_control: {problem}; correct the list.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
-    # Copies: python-control changes matrices in place where it is asked to. States that do nothing stay, since they carry names.
+    # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
     return control.StateSpace(*matrices, system.dt, remove_useless_states=False, name=name and _label(name), **labels)
 
 
 def from_control(system: Any) -> StateSpace:
-    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero); names of signals are not kept.
+    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero), without names.
 
     Parameters
     ----------
@@ -240,8 +243,8 @@ def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
     certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
     if model.sample_period_s == 0:
         certificate = (
-            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, checked between the "
-            "points of the grid; from there on residuals count as constant"
+            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, "
+            "checked between the points of the grid; from there on residuals count as constant"
         )
     return with_weights(nominal, scaled, model, certificate)
 
@@ -260,5 +263,5 @@ def with_weights(
 
 
 def _label(name: str) -> str:
-    """Return a name without dots, which separate system and signal in python-control: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
+    """Return a name without dots, which python-control reserves: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
     return name.replace(".", "·")

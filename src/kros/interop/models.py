@@ -28,23 +28,25 @@ def quantify_models(
 ) -> UncertaintyForControl:
     """Quantify how models of python-control differ from a nominal one.
 
-    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map makes of the
-    imaginary axis and mapped back, which approximates nothing; the bound is checked between the points of the grid too, and holds up to
-    the end that the certificate names and beyond it for residuals that do not grow there. Frequency responses are known on their grid
-    alone, and the certificate says so. (Bare arrays of responses: `kros.uncertainty.quantify_responses`.)
+    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map
+    makes of the imaginary axis and mapped back, which approximates nothing; the bound is checked between the points of
+    the grid too, and holds up to the end that the certificate names and beyond it for residuals that do not grow there.
+    Frequency responses are known on their grid alone, and the certificate says so. (Bare arrays of responses:
+    `kros.uncertainty.quantify_responses`.)
 
     Parameters
     ----------
     models : sequence or mapping of control.StateSpace, control.TransferFunction or control.FRD
-        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or all response data.
+        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or
+        all response data.
     form : Form or str
     freqs_hz : array_like, shape (frequency,), Hz, optional
         Response data bring their own.
     nominal : int, str, system or response data, optional
         The best unit by default.
     **options
-        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``output_scale``, ``input_scale``, ``max_order``,
-        ``tolerance_db`` and others. Weights act on scaled signals.
+        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``output_scale``, ``input_scale``,
+        ``max_order``, ``tolerance_db`` and others. Weights act on scaled signals.
 
     Returns
     -------
@@ -92,7 +94,8 @@ def quantify_models(
     shapes = {response.shape for response in responses}
     if len(shapes) > 1:
         raise DimensionError(
-            f"quantify_models: responses differ in shape (frequency, outputs, inputs): {sorted(shapes)}; bring them to one."
+            f"quantify_models: responses differ in shape (frequency, outputs, inputs), {sorted(shapes)}; bring them to "
+            "one."
         )
     model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, **options)
     G = model.nominal_response

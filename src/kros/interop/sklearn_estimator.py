@@ -1,7 +1,7 @@
 """Identification of one Koopman model as a scikit-learn regressor, for pipelines, grid searches and cross-validation.
 
-One model is fitted to all rows, of whatever unit. A batch of units with a model each, and the uncertainty between them, is what
-`kros.data.Population` and the stages after it are for.
+One model is fitted to all rows, of whatever unit. A batch of units with a model each, and the uncertainty between them,
+is what `kros.data.Population` and the stages after it are for.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ try:
     from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 except ImportError as error:
     raise MissingDependencyError(
-        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or identify with kros.identify."
+        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or use "
+        "kros.identify."
     ) from error
 
 Array = npt.NDArray[np.float64]
@@ -34,8 +35,8 @@ EPISODE = "episode"
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Koopman (or linear) model from rows of states and inputs to the next states.
 
-    EDMD with Tikhonov regularisation (30)-(33): ``min ||theta(x+) - [A B][theta(x); u]||^2 + alpha ||[A B]||^2``, with ``theta(x)`` the
-    states followed by the lifted functions. There is no intercept.
+    EDMD with Tikhonov regularisation (30)-(33): ``min ||theta(x+) - [A B][theta(x); u]||^2 + alpha ||[A B]||^2``, with
+    ``theta(x)`` the states followed by the lifted functions. There is no intercept.
 
     ===========================  ==================================================================================
     ``X`` alone                  rows in order of time; each row is paired with the next one of its episode
@@ -47,23 +48,25 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     functions : sequence of str
-        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model, and no delays.
+        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model, and no
+        delays.
     states : sequence of str, optional
         Names of the states, which the formulas use. Default: the names of the DataFrame, else ``x0, x1, ...``.
     n_inputs : int, optional
-        How many of the last columns are inputs. Default: what `states` leave over, else what the columns of `y` leave over, else none.
+        How many of the last columns are inputs. Default: what `states` leave over, else what the columns of `y` leave
+        over, else none.
     alpha : float
         Tikhonov coefficient, added to the unnormalised Gram matrix; zero for plain least squares.
     episode_feature : bool
         Whether the first column of an array is the episode, a number.
     horizon : int or None
-        `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the free run of the
-        whole episode from its first state.
+        `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the
+        free run of the whole episode from its first state.
 
     Notes
     -----
-    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs); ``lifting_``, ``state_names_`` and
-    ``input_names_``; and ``n_pairs_``, the number of transitions.
+    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs); ``lifting_``,
+    ``state_names_`` and ``input_names_``; and ``n_pairs_``, the number of transitions.
 
     Examples
     --------
@@ -152,12 +155,12 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         far = self.horizon is None or self.horizon >= 1
         if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
             raise ConfigError(
-                "KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one or None, found "
-                f"{self.functions!r}, {self.alpha!r}, {self.horizon!r}."
+                "KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one "
+                f"or None, found {self.functions!r}, {self.alpha!r}, {self.horizon!r}."
             )
 
     def predict(self, X: Any) -> Array:
-        """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) where `fit` was given a `y` of one dimension.
+        """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) after such a `y`.
 
         Parameters
         ----------
@@ -170,18 +173,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return predicted[:, 0] if self._one_dimensional else predicted
 
     def predict_trajectory(self, X: Any) -> Array:
-        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states); row k belongs to row k of `X`.
+        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states).
 
         Parameters
         ----------
         X : array_like or DataFrame, shape (n_samples, n_columns)
-            Of the states only the first row of each episode is used; the state is retracted and lifted again at every step.
+            Of the states only the first row of each episode is used; the state is retracted and lifted again at every
+            step.
         """
         check_is_fitted(self)
         return self._free_run(*self._read(X, reset=False))
 
     def score(self, X: Any, y: Any = None) -> float:
-        """Return R2 of the prediction `horizon` samples ahead, the mean over the states; minus infinity where the prediction diverges.
+        """Return R2 of the prediction `horizon` samples ahead, the mean over the states; -inf where it diverges.
 
         Parameters
         ----------

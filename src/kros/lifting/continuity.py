@@ -1,8 +1,8 @@
-"""Slopes of formulas over a box, and where a formula has no bound of its slope because it jumps or is not defined there.
+"""Slopes of formulas over a box, and where a formula has none because it jumps or is not defined.
 
-A derivative says nothing about a jump: that of ``atan(tan(x))`` is one wherever it exists. Bounds of the derivative are bounds of the slope between any
-two points of the box where the formula is continuous on the box; that is decided here, by intervals, on the formula itself. What intervals cannot
-decide counts as a jump.
+A derivative says nothing about a jump: that of ``atan(tan(x))`` is one wherever it exists. Bounds of the derivative are
+bounds of the slope between any two points of the box where the formula is continuous on the box; that is decided here,
+by intervals, on the formula itself. What intervals cannot decide counts as a jump.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _NEAR = 1e-12  # relative to the interval: what rounding may hide
 
 
 def slope_bounds_of(formulas: Sequence[Formula], names: Sequence[str], box: Box) -> tuple[Array, Array]:
-    """Return lower and upper bounds of the slopes between any two points of a box, each of shape (len(formulas), len(names))."""
+    """Return bounds of the slopes between any two points of a box, each of shape (len(formulas), len(names))."""
     derivatives = [formula.derivative(name) for formula in formulas for name in names]
     lower, upper = (bound.reshape(len(formulas), len(names)) for bound in bounds_of(derivatives, box))
     for i, formula in enumerate(formulas):
@@ -34,7 +34,7 @@ def slope_bounds_of(formulas: Sequence[Formula], names: Sequence[str], box: Box)
 
 
 def break_of(expression: Any, box: Box) -> str:
-    """Return, in words, the first place where a tree may jump or be undefined on a box; empty where it is continuous."""
+    """Return in words where a tree may jump or be undefined on a box first; empty where it is continuous."""
     import sympy as sp
 
     for node in sp.preorder_traversal(expression):

@@ -1,8 +1,8 @@
 """Families of lifting functions: each returns formulas, and a formula's text is all there is to a lifted function.
 
-Wherever a family takes names, it takes formulas too (delays apart): the polynomials of ``("sin(position)", "velocity")`` are those of the
-values of these. Numbers are written so that reading them gives the same number again. In a study a family is a table,
-``[[lifting.families]]``: the kind chooses the function, the other keys are its arguments.
+Wherever a family takes names, it takes formulas too (delays apart): the polynomials of ``("sin(position)",
+"velocity")`` are those of the values of these. Numbers are written so that reading them gives the same number again. In
+a study a family is a table, ``[[lifting.families]]``: the kind chooses the function, the other keys are its arguments.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def radial(names: Sequence[str], centres: npt.ArrayLike, length: float | Sequenc
 
 
 def fourier_features(names: Sequence[str], n: int, length: float | Sequence[float], seed: int) -> Formulas:
-    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to the Gaussian kernel as n grows.
+    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to the Gaussian kernel.
 
     The kernel is ``exp(-s**2/2)`` with the scaled distance s, as in `radial`.
 
@@ -116,7 +116,8 @@ def fourier_features(names: Sequence[str], n: int, length: float | Sequence[floa
 
     References
     ----------
-    A. Rahimi and B. Recht, "Random features for large-scale kernel machines", Advances in Neural Information Processing Systems 20, 2007.
+    A. Rahimi and B. Recht, "Random features for large-scale kernel machines", Advances in Neural Information Processing
+    Systems 20, 2007.
 
     Examples
     --------
@@ -137,7 +138,7 @@ def fourier_features(names: Sequence[str], n: int, length: float | Sequence[floa
 
 
 def kmeans_centres(data: npt.ArrayLike, n: int, seed: int, starts: int = 8) -> Array:
-    """Return the means of n clusters of data, shape (n, d), the best of some starts; dimensions count in units of their standard deviation.
+    """Return the means of n clusters, shape (n, d), the best of some starts, in units of standard deviations.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
-"""Formulas of states and parameters, such as ``sin(100*position + phase)``, and of earlier values, such as ``position[-1]``.
+"""Formulas of states, parameters and earlier values, such as ``sin(100*position + phase)`` and ``position[-1]``.
 
 Text is read with `ast` against a whitelist and turned into SymPy nodes one by one; nothing is ever evaluated as Python.
-From the one SymPy tree come the derivative, the slope bounds, and the program that NumPy, the compiled loops and C follow.
+From the one SymPy tree come the derivative, the slope bounds, and the program that NumPy, the compiled loops and C
+follow.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
 
 @cache
 def _real_magnitude() -> tuple[Any, Any]:
-    """Functions that differentiate as Abs and sign of real numbers do; SymPy's own ask first whether their argument is complex."""
+    """Functions that differentiate as Abs and sign do for real numbers; SymPy's ask whether these are complex."""
     import sympy as sp
 
     jump = type("RealSign", (sp.Function,), {"fdiff": lambda self, argindex=1: 2 * sp.DiracDelta(self.args[0])})

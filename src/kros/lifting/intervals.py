@@ -1,8 +1,8 @@
 """Interval arithmetic on SymPy trees: bounds that hold everywhere in a box.
 
-Intervals are pairs of arrays, one entry a piece of the box: the box is cut along its finite sides, and the bounds of a tree are the union
-over the pieces, which makes them tight where a quantity appears several times. Every operation rounds outwards.
-A box that reaches beyond the domain of a root or a logarithm has no bounds.
+Intervals are pairs of arrays, one entry a piece of the box: the box is cut along its finite sides, and the bounds of a
+tree are the union over the pieces, which makes them tight where a quantity appears several times. Every operation
+rounds outwards. A box that reaches beyond the domain of a root or a logarithm has no bounds.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
 
 
 def _outward(low: Array, high: Array, ulps: float = 1.0) -> Interval:
-    """Widen bounds by what rounding may have changed; a sum, product or function that comes out as zero is exact, or is given apart."""
+    """Widen bounds by what rounding may have changed; a result of zero is exact, or is given apart."""
     slack = ulps * np.spacing(np.maximum(np.abs(low), 1e-300)), ulps * np.spacing(np.maximum(np.abs(high), 1e-300))
     below = np.where(np.isposinf(low), np.finfo(float).max, np.where(np.isfinite(low), low - slack[0], low))
     above = np.where(np.isneginf(high), -np.finfo(float).max, np.where(np.isfinite(high), high + slack[1], high))

@@ -1,4 +1,4 @@
-"""The lifting of a population: original states first, lifted functions after them; inputs may have functions of their own.
+"""The lifting of a population: original states, then lifted functions; inputs may have functions, too.
 
 Symbols
 -------
@@ -7,7 +7,7 @@ w         : window, the states and the earlier values that formulas name, (..., 
 theta(w)  : lifted states [x; sigma(w)], (..., n + p)           (25)
 sigma     : lifted functions, formulas of states, earlier values and per-unit parameters
 u         : recorded inputs, (..., m)
-gamma     : input functions, formulas of inputs, states, earlier values and per-unit parameters; lifted inputs [u; gamma(u, w)]
+gamma     : input functions, formulas of inputs and of what sigma reads; lifted inputs [u; gamma(u, w)]
 """
 
 from __future__ import annotations
@@ -40,11 +40,13 @@ class Lifting:
     ----------
     states : tuple of str
     functions : tuple of str
-        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters; empty for a linear model.
+        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters;
+        empty for a linear model.
     parameters : tuple of str
         Names of quantities that every unit has a value of its own for, such as ``phase``.
     inputs : tuple of str
-        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes through.
+        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes
+        through.
     input_functions : tuple of str
         Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``.
     sizes : tuple of (str, float)
@@ -84,17 +86,18 @@ class Lifting:
             present = sorted(formula.used & set(self.inputs))
             if present:
                 raise ConfigError(
-                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted state would need "
-                    f"from the future; make it an input function, or read {present[0]}[-1]."
+                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted "
+                    f"state would need from the future; make it an input function, or read {present[0]}[-1]."
                 )
             if not formula.used - set(self.parameters):
                 problem = f"depends on no state ({', '.join(self.states)}); a constant cannot be lifted"
                 raise ConfigError(f"Lifting: {formula.text!r} {problem}, remove it.")
         for formula in self.input_formulas:
             if not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
+                known = ", ".join(self.inputs) or "none are named"
                 raise ConfigError(
-                    f"Lifting: the input function {formula.text!r} depends on no input "
-                    f"({', '.join(self.inputs) or 'none are named'}); a function of states alone belongs to the lifted functions."
+                    f"Lifting: the input function {formula.text!r} depends on no input ({known}); "
+                    "a function of states alone belongs to the lifted functions."
                 )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -103,7 +106,7 @@ class Lifting:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Lifting:
-        """Rebuild a lifting from an artifact: ``states``, ``lifting``, ``parameters`` and, where there are any, those of `extension`."""
+        """Rebuild a lifting from ``states``, ``lifting``, ``parameters`` and what `extension` gave."""
         return cls(
             tuple(content["states"]),
             tuple(content["lifting"]),
@@ -119,12 +122,13 @@ class Lifting:
         return {name: value for name, value in extra.items() if value}
 
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
-        """Return the same lifting for states and inputs divided by sizes, with functions divided by theirs; formulas stay as they are written.
+        """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
 
         Parameters
         ----------
         sizes : mapping of str to float
-            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is the way back.
+            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is
+            the way back.
 
         Examples
         --------
@@ -182,7 +186,7 @@ class Lifting:
         return self.states + self.functions
 
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the lifted states (..., n + p) of windows (..., n_window), which are the states alone for a lifting without delays.
+        """Return the lifted states (..., n + p) of windows (..., n_window): of states alone where there are no delays.
 
         Values of parameters broadcast against ``x[..., 0]``.
         """
@@ -212,7 +216,7 @@ class Lifting:
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window), the first one at sample `history`."""
+        """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
         self.window.require_inputs(u)
         return self.window.slide(x, u)
 
@@ -226,15 +230,15 @@ class Lifting:
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
     def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted functions alone by every entry of the window, shape (..., p, n_window)."""
+        """Return the derivative of the lifted functions by every entry of the window, shape (..., p, n_window)."""
         return self._slopes(self.window.names, x, parameters)
 
     def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
-        """Return the derivative of the lifted functions alone by one of the parameters, shape (..., p); x as in `slopes`."""
+        """Return the derivative of the lifted functions by one of the parameters, shape (..., p)."""
         return self._slopes((name,), x, parameters)[..., 0]
 
     def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window)."""
+        """Return the derivative of the input functions by every entry of the window, shape (..., r, n_window)."""
         u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
         return self._slopes(self.window.names, window, parameters, u)
@@ -242,7 +246,7 @@ class Lifting:
     def _slopes(
         self, names: tuple[str, ...], x: npt.ArrayLike, parameters: Parameters | None, u: Array | None = None
     ) -> Array:
-        """Return derivatives of the lifted functions, or of the input functions where inputs are given, by some names."""
+        """Return derivatives by some names of the lifted functions, or with inputs of the input functions."""
         x, formulas = self._windows(x), self.formulas if u is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
         if (names, u is None) not in self._derivatives:
@@ -255,13 +259,14 @@ class Lifting:
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and are infinite where
-        a slope is, or where a function jumps or is not defined.
+        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and
+        are infinite where a slope is, or where a function jumps or is not defined.
 
         Parameters
         ----------
         box : mapping of str to (lower, upper) or number
-            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its quantity.
+            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its
+            quantity.
         parameters : mapping of str to number or (lower, upper)
             A parameter that is not named may be anything.
 
@@ -310,7 +315,7 @@ class Lifting:
     def _values(
         self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
     ) -> dict[str, Array]:
-        """Return arrays by name; present states only where functions read them, since an observer may have many more."""
+        """Return arrays by name, of states those that functions read: an observer may have many more."""
         values = self.parameter_values(parameters)
         values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
         if earlier is None and self.window.depths:

@@ -1,7 +1,8 @@
 """What a formula may cost: bounds that keep reading, differentiating and evaluating it short, whatever its text.
 
-SymPy computes numbers exactly: powers of powers of whole numbers, and exponentials of exponentials, take time and memory without a bound
-while they are read. Every operation is therefore settled at once: its numbers become those of double precision, and what has no finite value there is refused.
+SymPy computes numbers exactly: powers of powers of whole numbers, and exponentials of exponentials, take time and
+memory without a bound while they are read. Every operation is therefore settled at once: its numbers become those of
+double precision, and what has no finite value there is refused.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ class TooCostlyError(ConfigError):
 
 
 def require_size(tree: ast.AST) -> None:
-    """Refuse a tree with too many nodes, or too many inside each other; without recursion, for a tree may be deeper than Python's stack."""
+    """Refuse a tree with too many nodes, or too deep; without recursion, which it may be too deep for."""
     todo: list[tuple[ast.AST, int, Any]] = [(tree, 0, None)]
     count = 0
     while todo:
@@ -47,7 +48,7 @@ def require_size(tree: ast.AST) -> None:
 
 
 def settled(value: Any) -> Any:
-    """Return the result of one operation with numbers as doubles hold them; whole numbers and fractions that these hold exactly stay."""
+    """Return the result of one operation with numbers as doubles hold them; exact whole numbers and fractions stay."""
     import sympy as sp
 
     if value.is_number:

@@ -1,7 +1,7 @@
-"""Formulas as operations on numbered values: the one description that NumPy evaluates, the compiled loops run and C is written from.
+"""Formulas as operations on numbered values, which NumPy and the compiled loops run and C is written from.
 
-A program is data: no code is generated for a lifting, and what formulas have in common is computed once. The order of operations is that
-of the numbers they are written with, the same everywhere.
+A program is data: no code is generated for a lifting, and what formulas have in common is computed once. The order of
+operations is that of the numbers they are written with, the same everywhere.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class Program:
 
 @dataclass
 class Writer:
-    """Values are numbered as they come: quantities, then whatever is new; constants have negative numbers until all are known."""
+    """Values are numbered as they come: quantities, then what is new; constants have negative numbers."""
 
     names: list[str]
     constants: list[float] = field(default_factory=list)
@@ -134,7 +134,7 @@ class Writer:
 
 
 def _tree(expression: Any) -> Tree:
-    """Return kind and arguments of every node, those of sums and products in the order of their text without numbers."""
+    """Return kind and arguments of every node, those of sums and products ordered by their shape."""
     import sympy as sp
 
     if expression.is_Symbol:

@@ -1,4 +1,4 @@
-"""Formulas as parameter-dependent combinations of parameter-free ones, so that data are read once for all parameter values."""
+"""Formulas as combinations of parameter-free ones, so that data are read once for all parameter values."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class FormulaSeparation:
         return Program.of(self.basis)
 
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
-        """Return the parameter-free functions at windows (..., n_window), with the present inputs for input functions; shape (..., n_basis)."""
+        """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
         self._program.fill(out, self.window.values(window, u))
         return out
@@ -63,7 +63,7 @@ class FormulaSeparation:
 
 
 def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
-    """Pairs of a coefficient of parameters and a function without them; a formula without parameters is its own function."""
+    """Pairs of a coefficient of parameters and a function without them."""
     import sympy as sp
 
     if not formula.expression.free_symbols & parameters:
@@ -78,7 +78,8 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
         if function.free_symbols & parameters:
             names = tuple(sorted(p.name for p in parameters))
             raise ConfigError(
-                f"Lifting function {formula.text!r}: parameters {names} must enter as factors or as phases of sin and cos; rewrite it."
+                f"Lifting function {formula.text!r}: parameters {names} must enter as factors or as phases of sin and "
+                "cos."
             )
         pairs.append((coefficient, function))
     return pairs
@@ -88,8 +89,8 @@ def _require_short(formula: Formula, expression: Any) -> None:
     count = count_terms(expression)
     if count > MAX_TERMS:
         raise ConfigError(
-            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} terms, "
-            f"at most {MAX_TERMS} are kept; split it into several functions."
+            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} "
+            f"terms, at most {MAX_TERMS} are kept; split it into several functions."
         )
 
 

@@ -2,7 +2,8 @@
 
 A window is what a lifting is evaluated on: the present states, then the earlier values that its formulas name,
 
-    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its own depth d.
+    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its own depth
+    d.
 
 At the next sample each earlier value takes the place behind it; the shift is exact, no model is asked.
 """
@@ -77,7 +78,7 @@ class Window:
         return np.array([entries.index(q) for q, _ in self.delayed], dtype=np.intp)
 
     def advance(self, window: Array, u: Array) -> Array:
-        """Return the earlier values of the next sample, shape (..., n_earlier), from a window and the inputs of this one."""
+        """Return the earlier values of the next sample, shape (..., n_earlier), from a window and its inputs."""
         return np.concatenate([window, u], axis=-1)[..., self.shift]
 
     def hold(self, x: Array, u: Array) -> Array:

@@ -1,6 +1,7 @@
-"""What each episode says about a finished refined model: normal equations of its cost, for resampling episodes without refitting.
+"""Normal equations of every episode at finished refined models, for resampling episodes without refitting.
 
-    cost of a unit = sum over episodes of [ free runs of its segments + one-step error of the lifted functions ] + edge of stability + prior
+    cost of a unit = sum over episodes of [ free runs of its segments + one-step error of the lifted functions ] + edge
+    of stability + prior
 
 The sum over episodes is what the search minimised, without its last two terms.
 """
@@ -25,7 +26,7 @@ _AT_ONCE = 16_000_000  # numbers in memory
 def episode_normals(
     models: KoopmanMatrices, refinement: Refinement, data: TrainingData, options: RefineOptions
 ) -> Array:
-    """Return ``[J r]^T [J r]`` of every episode at the finished models, shape (unit, episode, P + 1, P + 1); factors (unit, episode)."""
+    """Return ``[J r]^T [J r]`` of every episode, shape (unit, episode, P + 1, P + 1), from factors (unit, episode)."""
     lifting, T, keys = data.lifting, refinement.whitening, data.keys
     n, units, most = lifting.n_states, len(keys), max(len(episodes) for episodes in keys.values())
     data.require_factors((units, most))
@@ -47,7 +48,7 @@ def episode_normals(
 
 
 def _free_runs(V: Array, problem: RefinementProblem) -> tuple[Array, Array]:
-    """Normal equations of every segment's free run (unit, segment, n p + 1, n p + 1), and a unit's number of residuals of a state."""
+    """Normal equations of every segment (unit, segment, n p + 1, n p + 1), and a unit's residuals of a state."""
     units, n, p = V.shape
     count, width = problem.segments.valid.shape[2], n * p + 1
     runs, counts = np.empty((units, count, width, width)), np.empty(units)
@@ -63,7 +64,7 @@ def _free_runs(V: Array, problem: RefinementProblem) -> tuple[Array, Array]:
 
 
 def _add_one_step(total: Array, V: Array, factors: Factor, problem: RefinementProblem, share: Array) -> None:
-    """Add what each episode contributes to the rows of the lifted functions, weighted as in `RefinementProblem.evaluate`."""
+    """Add what each episode contributes to the rows of lifted functions, as in `RefinementProblem.evaluate`."""
     n, nl, p = problem.lifting.n_states, problem.lifting.n_lifted, len(problem.T)
     white = np.concatenate([factors.R[..., :p] @ problem.T, factors.R[..., p + n : p + nl]], axis=-1)
     by_episode = np.swapaxes(white, -1, -2) @ white  # [psi sigma+]^T [psi sigma+], (unit, episode, p + f, p + f)

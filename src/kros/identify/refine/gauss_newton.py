@@ -36,22 +36,10 @@ class Solution:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Minimise sums of squared residuals r(V) by steps ``(D + mu I) d = D^-1/2 J^T r`` in parameters scaled to a unit diagonal of J^T J.
+    """Minimise sums of squares of r(V) by steps ``(H + mu I) d = J^T r``, ``H = J^T J`` scaled to a unit diagonal.
 
-    Every problem has damping, acceptance and constraint by itself: a step that raises the cost or leaves the constraint is not taken.
-
-    Parameters
-    ----------
-    iterations : int
-        Most steps.
-    least_gain : float
-        A problem has converged when an undamped step lowers its cost by a smaller share than this: far below what recordings determine.
-    damping : float
-        First damping, relative to the unit diagonal: small, since the searches start near their minimum.
-    least_damping, most_damping : float
-        Limits of the damping; a problem that does not improve at the largest one has converged, too.
-    factor : float
-        By which the damping falls after a step that was taken, and grows after another.
+    Every problem has damping, acceptance and constraint by itself: a step that raises the cost or leaves the constraint
+    is not taken.
 
     Examples
     --------
@@ -64,12 +52,12 @@ class GaussNewton:
     3.0
     """
 
-    iterations: int = 15
-    least_gain: float = 1e-3
-    damping: float = 1e-3
+    iterations: int = 15  # at most
+    least_gain: float = 1e-3  # converged: a step with the first damping lowers the cost by a smaller share
+    damping: float = 1e-3  # first, relative to the unit diagonal: small, since searches start near their minimum
     least_damping: float = 1e-9
-    most_damping: float = 1e8
-    factor: float = 10.0
+    most_damping: float = 1e8  # converged, too: no step with so much damping lowers the cost
+    factor: float = 10.0  # by which damping falls after a step that was taken, and grows after another
 
     def minimise(
         self,
@@ -83,12 +71,14 @@ class GaussNewton:
         Parameters
         ----------
         evaluate : callable
-            From V to ``[J r]^T [J r]``, shape (problem, P + 1, P + 1), with J the slopes of what is subtracted from the data.
+            From V to ``[J r]^T [J r]``, shape (problem, P + 1, P + 1), with J the slopes of what is subtracted from the
+            data.
         admissible : callable
             From V to the problems whose constraint holds, shape (problem,).
         V : ndarray, shape (problem, rows, columns)
         narrowed : callable, optional
-            From rows of the problems to `evaluate` of these alone, for which a search continues when others have converged.
+            From rows of the problems to `evaluate` of these alone, for which a search continues when others have
+            converged.
         """
         V, matrix = V.copy(), evaluate(V)
         damping, done = np.full(len(V), self.damping), np.zeros(len(V), dtype=bool)

@@ -1,6 +1,7 @@
 """Distance of a unit from the pooled model as the uncertainty of the population will count it: the prior.
 
-In channels divided by their ranges E is the residual of the inverse input multiplicative form, with the pooled model G0 as nominal:
+In channels divided by their ranges E is the residual of the inverse input multiplicative form, with the pooled model G0
+as nominal:
 
     E = G^+ (G - G0),      G = Phi B,  Phi = (zI - A)^-1,      dE = (G^+ Phi) dW Z (I - E),  Z = [G; I]
     cost = N strength level^2 mean over frequency of [(1 + e)^power - 1] / power,      e = (||E||_F / level)^2
@@ -60,7 +61,7 @@ class ResponsePrior:
         return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))
 
     def normal(self, V: Array) -> Array:
-        """Return ``[J r]^T [J r]`` with r = -E, weighted so that the gradient is that of the cost; shape (unit, P + 1, P + 1)."""
+        """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""
         E, a, Z = self.residual(V)
         size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
         slope = self.weight * (1 + size) ** (self.power - 1) / size.shape[1]

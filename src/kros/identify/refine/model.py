@@ -58,9 +58,10 @@ class TrainingData:
         wrong = [name for name in self.lifting.parameters if np.shape(self.parameters.get(name, 0.0)) != units]
         if self.factor.R.shape != shape or wrong or self.pooled.shape != units or not self.pooled.any():
             raise DimensionError(
-                f"Refinement: {len(self.keys)} units with {self.lifting.n_lifted} lifted states and {m} inputs need factors of "
-                f"shape {shape}, found {self.factor.R.shape}, parameters of one value a unit (wrong: {wrong}) and at least one pooled "
-                f"unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass factors from lifted_factor for the same units."
+                f"Refinement: {len(self.keys)} units with {self.lifting.n_lifted} lifted states and {m} inputs need "
+                f"factors of shape {shape}, found {self.factor.R.shape}, parameters of one value a unit (wrong: "
+                f"{wrong}) and a pooled unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass factors from "
+                "episode_factors."
             )
 
 
@@ -85,11 +86,13 @@ class Refinement:
     strength : float
         Of the prior, as chosen on held-out training episodes.
     trade_off : tuple of TradeOff
-        One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength infinite).
+        One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength
+        infinite).
     sigma : ndarray, shape (n_states,)
         Errors that count as one.
     converged : ndarray of bool, shape (unit,)
-        Whether the last step gained less than `GaussNewton.least_gain`; the others ran out of iterations, and are no less valid.
+        Whether the last step gained less than `GaussNewton.least_gain`; the others ran out of iterations, and are no
+        less valid.
     information : ndarray, shape (unit, P, P)
         Gauss-Newton matrix of every unit's cost, prior included, for parameters V with ``[A B] = V T^T``.
     whitening : ndarray, shape (p, p)
@@ -113,7 +116,7 @@ class Refinement:
     whitening: Array
 
     def divided_by(self, ranges: Ranges) -> Refinement:
-        """Return the same for lifted states and inputs divided by ranges; those of `Ranges.inverse` are the way back."""
+        """Return the same for channels divided by ranges; `Ranges.inverse` is the way back."""
         x, u = ranges.outputs, ranges.inputs
         row = np.repeat(x, len(self.whitening))  # of the parameters V, row after row
         return replace(

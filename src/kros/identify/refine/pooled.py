@@ -1,4 +1,4 @@
-"""The pooled model: EDMD on all units together, then free-run error at growing horizons, from several weighings of the states."""
+"""The pooled model: EDMD on all units together, then free-run error at growing horizons, from several starts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 def start_pooled(
     data: TrainingData, segments: Segments, options: RefineOptions
 ) -> tuple[Array, RefinementProblem, Array]:
-    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units without a prior, and errors of states."""
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
     lifting, rows = data.lifting, data.rows
     n, nl = lifting.n_states, lifting.n_lifted
     R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
@@ -61,8 +61,8 @@ def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Cal
             )
     if not ends:
         raise IdentificationError(
-            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge or the model is "
-            "unstable; leave out lifting functions that grow, or set identify.refine = false."
+            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
+            "or the model is unstable; leave out lifting functions that grow, or set identify.refine = false."
         )
     edged = replace(problem, sigma=sigma, edged=True)
     best = min(ends, key=lambda row: row[:2])[2]
@@ -70,7 +70,7 @@ def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Cal
 
 
 def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
-    """Minimise at growing horizons from the first one on, then bring the model inside; None where a free run diverges."""
+    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
     options = problem.options
     stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
     for stage in (*stages, problem):
@@ -82,7 +82,7 @@ def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) 
 
 
 def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
-    """Bring a model inside the edge of stability: by shorter rows, which free runs do not enter, else by a penalty that grows."""
+    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
     n, options = problem.lifting.n_states, problem.options
     shortened = []
     for share in np.linspace(1.0, 0.0, options.shortenings + 1):
@@ -109,7 +109,7 @@ def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
 
 
 def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
-    """Return the problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
+    """Return the problem with errors in units of those of a pooled model V, and with a soft edge of stability."""
     normal, least = problem.run(V), problem.options.least_error
     size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, least**2))
     return replace(problem, sigma=problem.sigma * size, edged=True)

@@ -1,10 +1,11 @@
 """Refinement of a population: one pooled model on free-run error, then every unit with a prior centred on it.
 
-    factors -> pooled EDMD -> pooled refined model (horizons 5 .. 1000) -> units at each strength of the prior -> strength -> units
+    factors -> pooled EDMD -> pooled refined model (horizons 5 .. 1000) -> units at each strength of the prior ->
+    strength -> units
 
-Models that predict alike may differ wildly in weakly excited directions, and what differs is uncertainty. The prior therefore measures
-the distance from the pooled model as the uncertainty does (`metric`), and the strength is chosen on held-out training episodes: the
-strongest one whose error is as good as the best.
+Models that predict alike may differ wildly in weakly excited directions, and what differs is uncertainty. The prior
+therefore measures the distance from the pooled model as the uncertainty does (`metric`), and the strength is chosen on
+held-out training episodes: the strongest one whose error is as good as the best.
 """
 
 from __future__ import annotations
@@ -65,7 +66,8 @@ def refine_population(
     Returns
     -------
     models : KoopmanMatrices
-        A (unit, n, n) and B (unit, n, m): stable linear models with a bounded re-lifted free run on every training episode.
+        A (unit, n, n) and B (unit, n, m): stable linear models with a bounded re-lifted free run on every training
+        episode.
     refinement : Refinement
 
     Raises
@@ -134,7 +136,7 @@ def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Ar
 
 
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], list[TradeOff]]:
-    """Fit all units at falling strengths, each from the one before, until weaker ones bring nothing or too much uncertainty."""
+    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty."""
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
@@ -177,7 +179,7 @@ def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
 
 
 def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
-    """Return the strongest prior whose held-out score is as good as the best, within the tolerance, or a weaker and better one that costs nothing.
+    """Return the strongest prior about as good as the best, or a weaker and better one that costs nothing.
 
     Uncertainty costs nothing while the peak residual is negligible. Only the last of the rows may be too uncertain.
     """
@@ -185,8 +187,8 @@ def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
     best = min(row.score for row in usable)
     if not np.isfinite(best):
         raise IdentificationError(
-            "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add strengths above "
-            f"{max(row.strength for row in rows):g}."
+            "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add "
+            f"strengths above {max(row.strength for row in rows):g}."
         )
     choice = next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
     negligible = 20 * np.log10(options.negligible_residual)

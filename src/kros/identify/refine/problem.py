@@ -1,15 +1,17 @@
-"""What is minimised: free-run error of the states, one-step error of the lifted functions, distance from the pooled model.
+"""What is minimised: free-run error of states, one-step error of lifted functions, distance from the pooled model.
 
     sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  edge of stability  +  prior
 
-The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one slides along it.
+The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one
+slides along it.
 
-    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2,      d|lambda| = Re[conj(lambda) / |lambda|  y^H dA x / (y^H x)]
+    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2,      d|lambda| = Re[conj(lambda) / |lambda|  y^H dA
+    x / (y^H x)]
 
 with right and left eigenvectors x, y of A, and ``dA = (dV T^T)`` without its columns of inputs.
 
-A free run retracts and re-lifts, so the rows of the lifted functions do not enter it; they enter only the linear model used in
-synthesis, and are fitted one step ahead, from the triangular factors.
+A free run retracts and re-lifts, so the rows of the lifted functions do not enter it; they enter only the linear model
+used in synthesis, and are fitted one step ahead, from the triangular factors.
 
 Symbols
 -------
@@ -121,7 +123,7 @@ class RefinementProblem:
         return replace(self.of_units(rows), pooled=True, counted=None)
 
     def with_prior(self, strength: float) -> RefinementProblem:
-        """Return the problem with a prior whose strength is in proportion to the residuals that a unit's free runs have."""
+        """Return the problem with a prior in proportion to the residuals that a unit's free runs have."""
         assert self.prior is not None
         return replace(self, prior=self.prior.scaled(strength * self.residuals))
 
@@ -168,7 +170,7 @@ def _add(total: Array, part: Array, place: slice) -> None:
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
-    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p)."""
+    """Return ``[J r]^T [J r]`` of the edge above, shape (problem, n p + 1, n p + 1)."""
     problems, n, p = V.shape
     values, right = np.linalg.eig((V @ T.T)[..., :n])
     size = np.abs(values)

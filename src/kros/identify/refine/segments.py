@@ -1,4 +1,4 @@
-"""Stretches of training episodes, the data of the refinement: drawn once, cut into shorter pieces for shorter horizons."""
+"""Stretches of training episodes: drawn once, cut into shorter pieces for shorter horizons."""
 
 from __future__ import annotations
 

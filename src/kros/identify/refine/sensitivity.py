@@ -1,18 +1,18 @@
-"""Free runs with analytic sensitivities: how the run's states move with the model, batched over units and their segments.
+"""Free runs with analytic sensitivities: how the states move with the model, batched over units and segments.
 
-A model is ``x+ = W psi``, with ``psi = [x; sigma(w); u; v(w, u)]`` on the window w, the states x and the earlier values of states and inputs
-that the lifting reads. Lifted states are re-lifted at every step, so that
+A model is ``x+ = W psi``, with ``psi = [x; sigma(w); u; v(w, u)]`` on the window w, the states x and the earlier values
+of states and inputs that the lifting reads. Lifted states are re-lifted at every step, so that
 
     dx+/dV = sum over d of F_d S_d + (dW/dV) psi,      F_d = W d psi/dx[-d],      W = V T^T
 
-where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d is 0 alone. Values
-that were recorded, all inputs and the states of the first window, do not move with the model.
+where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d
+is 0 alone. Values that were recorded, all inputs and the states of the first window, do not move with the model.
 
 Symbols
 -------
 V       : free parameters, (unit, n, p), with p = n_lifted + m, input functions counted;   T : whitening, (p, p)
-S_d     : sensitivities dx/dV of d samples ago, (n, n p, batch), the batch last so that every operation runs over contiguous memory
-F       : F_0, and behind it the columns of every F_d of the states that the lifting reads d samples ago, (n, n + q, batch)
+S_d     : sensitivities dx/dV of d samples ago, (n, n p, batch), the batch last for contiguous memory
+F       : F_0, and behind it the columns of every F_d that the lifting reads, (n, n + q, batch)
 normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the residuals r = (x_data - x) / sigma
 """
 
@@ -56,7 +56,7 @@ def normal_equations(
     sigma: Array,
     stride: int = 1,
 ) -> Normal:
-    """Run all segments with their unit's model and accumulate the normal equations, errors in units of sigma (n,), at every `stride`-th step."""
+    """Run all segments with their unit's model; add up normal equations over sigma (n,), every `stride` steps."""
     n, h = lifting.n_states, segments.history
     n_samples, m, units, per_unit = segments.inputs.shape
     batch, width = units * per_unit, n * V.shape[-1] + 1
@@ -77,7 +77,7 @@ def normal_equations(
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """Free runs of all segments: models W (n, p, batch), recordings x (n_samples, n, batch) and u (n_samples, m, batch)."""
+    """Free runs of all segments: models W (n, p, batch), recordings x (sample, n, batch) and u (sample, m, batch)."""
 
     W: Array
     T: Array
@@ -91,7 +91,7 @@ class _Run:
     units: int
 
     def rows(self, window: Array) -> Iterator[Array]:
-        """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from the first window on, which is moved on."""
+        """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from a window on."""
         n, p, batch = self.W.shape
         past = _moving_past(self.lifting)
         S = np.zeros(

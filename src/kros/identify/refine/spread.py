@@ -15,7 +15,7 @@ Array = npt.NDArray[Any]
 
 
 def peak_residual_db(A: Array, B: Array, points: int = 200) -> float:
-    """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, of channels divided by their ranges."""
+    """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, channels over ranges."""
     if len(A) < 2:
         return float("nan")
     z = unit_circle(points)

@@ -1,4 +1,4 @@
-"""Free runs over whole training episodes: the held-out error that chooses the prior's strength, and the check that runs stay bounded."""
+"""Free runs over whole training episodes: the held-out error, and the check that runs stay bounded."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def free_run_errors(
     population: Population,
     keys: Sequence[EpisodeKey],
 ) -> tuple[Array, Array, Array]:
-    """Return RMS errors of free runs, one model an episode, the largest recorded and the largest reached values, all (episode, n)."""
+    """Return RMS errors of free runs, and the largest recorded and reached values, all (episode, n)."""
     shape = len(keys), lifting.n_states
     rms, top, reached = np.full(shape, np.inf), np.zeros(shape), np.full(shape, np.inf)
     for start in range(0, len(keys), _TOGETHER):
@@ -67,13 +67,13 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     for which, state in np.argwhere(~(reached <= bound)):
         name, size = data.lifting.states[state], reached[which, state]
         raise IdentificationError(
-            f"Refinement: the free run over {keys[which]} reaches {size:.3g} times the range of {name!r}, beyond {bound:g} times; "
-            "use functions that stay bounded, leave the episode out, or set identify.refine = false."
+            f"Refinement: the free run over {keys[which]} reaches {size:.3g} times the range of {name!r}, beyond "
+            f"{bound:g}; use functions that stay bounded, leave the episode out, or set identify.refine = false."
         )
 
 
 def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:
-    """Return accuracy on the last training episode of every pooled unit, and uncertainty, of models (unit, n_lifted, p), or of one for all."""
+    """Return accuracy on held-out training episodes, and uncertainty, of models (unit, n_lifted, p) or one for all."""
     rows, count = data.rows, len(data.keys)
     models = matrices_of(np.broadcast_to(V, (count, *V.shape[-2:]))[rows], problem)
     last = [episodes[-1] for episodes in data.keys.values()]

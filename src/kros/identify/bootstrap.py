@@ -57,19 +57,14 @@ class ModelSamples:
     >>> from kros.identify import KoopmanMatrices, ModelSamples
     >>> estimate = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
     >>> draws = KoopmanMatrices(np.array([0.89, 0.9, 0.91]).reshape(1, 3, 1, 1), np.ones((1, 3, 1, 1)))
-    >>> ModelSamples(("a",), estimate, draws).n_draws
-    3
+    >>> ModelSamples(("a",), estimate, draws).standard_error().A.round(3).item()
+    0.01
     """
 
     unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices
     samples: KoopmanMatrices
     linear: bool = False
-
-    @property
-    def n_draws(self) -> int:
-        """Number of samples of every unit."""
-        return self.samples.A.shape[1]
 
     def standard_error(self) -> KoopmanMatrices:
         """Return the standard deviation of every entry of A and B over the samples."""

@@ -14,18 +14,20 @@ R    : upper triangular factor, (n_columns, n_columns)
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError
+from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
 from .edmd import relative_pivots
 
+log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 
@@ -193,7 +195,32 @@ def _peaks(M: Array, peak: Array) -> Array:
     return np.asarray(np.einsum("...ij,...j->...i", np.abs(M), peak))
 
 
-def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
-    """Return unit and column of the first of `n_columns` that depends on those before it, or None; R (unit, p, p)."""
-    dependent = np.argwhere(relative_pivots(R[..., :n_columns]) < n_columns * np.finfo(float).eps)
-    return (int(dependent[0, 0]), int(dependent[0, 1])) if len(dependent) else None
+def require_excitation(
+    factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0
+) -> None:
+    """Refuse inputs that are constant over all training episodes of a unit."""
+    if factor.input_range is None:
+        return
+    low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
+    still = high - low <= 450 * np.finfo(float).eps * np.maximum(np.abs(low), np.abs(high))
+    dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
+    for i, j in np.argwhere(still):
+        kind = "zero" if low[i, j] == 0 else "constant"
+        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {kind} ({low[i, j]:g}) over all training episodes"
+        if not alpha or inputs[j] in dead:
+            zero = "declare it as another role or drop the channel"
+            remedy = zero if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
+            raise IdentificationError(
+                f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
+            )
+        log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
+
+
+def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
+    """Refuse lifted data in which one column follows from those before it."""
+    pivots = relative_pivots(factor.R[..., : len(names)])
+    for unit, column in np.argwhere(pivots < len(names) * np.finfo(float).eps):
+        raise IdentificationError(
+            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
+            f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
+        )

@@ -27,15 +27,21 @@ from ..lifting import Lifting
 from .calibrate import calibrate
 from .calibration import PhaseCalibration
 from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
-from .excitation import require_excitation, require_independent
-from .factors import Factor, combine, lifted_factor, reduce_episode
+from .factors import (
+    Factor,
+    combine,
+    lifted_factor,
+    reduce_episode,
+    require_excitation,
+    require_independent,
+)
 from .identified import EpisodeFactors, IdentifiedModels
 from .kinds import kinds_for
 from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
 from .refine import Refinement, RefineOptions, refine_population
-from .refine.spread import peak_residual_db
+from .refine.metric import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 
 log = logging.getLogger(__name__)

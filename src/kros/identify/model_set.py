@@ -133,12 +133,8 @@ class ModelSet:
         alpha = self.alpha or 0.0
         return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
 
-    def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
-        """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
-        return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
-
     def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
-        """Return the same with every signal divided by its range."""
+        """Return frequency responses from inputs to lifted states over their ranges, shape (unit, frequency, n, m)."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
 
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:
@@ -159,11 +155,6 @@ class ModelSet:
     @cached_property
     def _rows(self) -> dict[str, int]:
         return {unit: row for row, unit in enumerate(self.unit_ids)}
-
-    def unit_parameters(self, units: Sequence[str]) -> dict[str, Array]:
-        """Return the lifting's parameters for some units, each of shape (len(units),)."""
-        rows = [self.index(u) for u in units]
-        return {name: values[rows] for name, values in self.parameters.items()}
 
     def spectral_radius(self) -> Array:
         """Return the spectral radius of every unit's model."""

@@ -1,4 +1,4 @@
-"""Distance of a unit from the pooled model as the uncertainty of the population will count it: the prior.
+"""Distance of models as the uncertainty of the population will count it: the prior, and the spread of a population.
 
 In channels divided by their ranges E is the residual of the inverse input multiplicative form, with the pooled model G0
 as nominal:
@@ -19,7 +19,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
-from ...core.small_matrices import entries_last, pseudo_inverse_first
+from ...core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max_first
+from .minimax import smallest_largest
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[Any]
@@ -77,3 +78,26 @@ class ResponsePrior:
         out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
         out[:, -1, -1] = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
         return out
+
+
+def peak_residual_db(A: Array, B: Array, points: int = 200) -> float:
+    """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, channels over ranges."""
+    if len(A) < 2:
+        return float("nan")
+    z = unit_circle(points)
+    G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
+    inverse, G, every = pseudo_inverse_first(G), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
+
+    def bound_of(row: int) -> tuple[Complex, Complex]:
+        sizes = sigma_max_first(multiply(inverse, G[:, :, row, None] - G))
+        return sizes.max(axis=0), sizes.argmax(axis=0)
+
+    def against(rows: Complex, witness: Complex) -> Complex:
+        farthest = G[:, :, None, witness, every]
+        return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - farthest))
+
+    if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
+        return -np.inf
+    _, _, peaks, exact = smallest_largest((len(A), points), 0, bound_of, against, lambda bound: bound.max(axis=-1))
+    with np.errstate(divide="ignore"):
+        return float(20 * np.log10(peaks[exact].min()))

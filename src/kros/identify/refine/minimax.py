@@ -42,11 +42,7 @@ def smallest_largest(
         lower[rows] = np.maximum(lower[rows], against(rows, witness))
         scores[rows] = np.maximum(scores[rows], score(lower[rows]))
         row = int(rows[np.argmin(scores[rows])])
-    index = first_best(np.where(evaluated, scores, np.inf))
+    exact = np.where(evaluated, scores, np.inf)
+    least = exact.min()
+    index = int(np.argmax(exact <= least + TIE * np.abs(least)))  # the first of those that rounding may have told apart
     return index, lower[index], scores, evaluated
-
-
-def first_best(scores: Array) -> int:
-    """Return the first of the lowest scores, which rounding may have told apart."""
-    least = scores.min()
-    return int(np.argmax(scores <= least + TIE * np.abs(least))) if np.isfinite(least) else int(np.argmin(scores))

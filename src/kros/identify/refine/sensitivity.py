@@ -131,16 +131,18 @@ class _Run:
 
     def _in_numpy(self, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
         (n, p, batch), lifting, nl, h = self.W.shape, self.lifting, self.lifting.n_lifted, self.lifting.history
-        psi, work, recent = np.empty((p, batch)), np.empty((n * p, batch)), list(S)
+        psi, recent = np.empty((p, batch)), list(S)
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
             u = self.u[k]
             lifting.lift_into(psi[:nl].T, self.parameters, window[n:].T)
             psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
-            _advance(recent, self._state_matrix(window, u, past), self.T.T @ psi, work, past)
+            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
+            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
+            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
             window[n:] = lifting.window.advance(window.T, u.T).T
             psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
-            recent = [recent[-1], *recent[:-1]]
+            recent = [following, *recent[:-1]]
             if (k + 1 - h) % self.stride == 0:
                 yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
 
@@ -176,15 +178,3 @@ def _moving_past(lifting: Lifting) -> list[Past]:
         for entry, (quantity, delay) in enumerate(window.quantities)
         if delay and window.names[entry] in read and quantity in states
     ]
-
-
-def _advance(S: Sequence[Array], F: Array, white: Array, work: Array, past: Sequence[Past]) -> None:
-    """S_next = sum over d of F_d S_d + (dV) white, with S_next in the place of the oldest."""
-    p = len(white)
-    terms = [*S[0], *(S[delay][state] for _, state, delay in past)]
-    for a, into in enumerate(S[-1]):
-        np.multiply(terms[0], F[a, 0], out=into)
-        for b in range(1, len(terms)):
-            np.multiply(terms[b], F[a, b], out=work)
-            np.add(into, work, out=into)
-        into[a * p : (a + 1) * p] += white

@@ -12,10 +12,10 @@ from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..free_run import free_run
+from .metric import peak_residual_db
 from .model import TradeOff, TrainingData
 from .pooled import matrices_of
 from .problem import RefinementProblem
-from .spread import peak_residual_db
 
 Array = npt.NDArray[np.float64]
 _TOGETHER = 32  # episodes, as many as the compiled loop runs side by side

@@ -36,7 +36,7 @@ from .factors import (
     require_independent,
 )
 from .identified import EpisodeFactors, IdentifiedModels
-from .kinds import kinds_for
+from .kinds import ModelKind, kinds_for
 from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
@@ -103,12 +103,8 @@ def identify(
     >>> kros.identify(drives, refine=False)
     <IdentifiedModels: linear_edmd of 2 units, identified on 'default'>
     """
-    require_kind(
-        population,
-        Population,
-        "Identify",
-        "read recordings with kros.read, or make a population of arrays with kros.from_arrays",
-    )
+    remedy = "read recordings with kros.read, or make a population of arrays with kros.from_arrays"
+    require_kind(population, Population, "Identify", remedy)
     chosen, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
@@ -122,9 +118,7 @@ def identify(
         known = calibrate(population, facts, spec, work)
     base = IdentifiedModels(population, facts, lifting, known)
     _check_conditions(base)
-    begun = {
-        c: _begin(base, c, chosen, work) for c in base.conditions
-    }  # the first is refined while others are identified
+    begun = {c: _begin(base, c, chosen, work) for c in base.conditions}  # refined while others are identified
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, Refinement]()
     for condition, (recorded, models, refining) in begun.items():
         better, refinements = refining()
@@ -221,47 +215,24 @@ class _Reduced:
 
     def identify(self, settings: IdentifySettings) -> list[ModelSet]:
         """Identify every kind of model with one common regularisation."""
-        kinds = kinds_for(self.base.lifting, refined=False)
-        liftings = [kind.lifting(self.base.lifting) for kind in kinds]
-        factors = [self.lifted(lifting) for lifting in liftings]
-        rows = self.pooled if self.pooled.any() else slice(None)
-        ranges = [Ranges.of(f, lifting.n_lifted, rows) for f, lifting in zip(factors, liftings, strict=True)]
-        if settings.alpha == "auto":
-            triangles = [r.triangles(f.R[rows]) for r, f in zip(ranges, factors, strict=True)]
-            shared = [(R, lifting.n_lifted) for R, lifting in zip(triangles, liftings, strict=True)]
-            alpha = self._search_alpha(shared, settings.alpha_factor)
-        else:
-            alpha = settings.alpha
-        self._check(factors, liftings, alpha)
-        made = zip(kinds, liftings, factors, ranges, strict=True)
-        models = [self._models(kind.name, lifting, f, r, settings, alpha) for kind, lifting, f, r in made]
+        sets = [self._unfitted(kind) for kind in kinds_for(self.base.lifting, refined=False)]
+        factors = [self.lifted(m.lifting) for m in sets]
+        alpha = self._search(sets, factors, settings) if settings.alpha == "auto" else float(settings.alpha)
+        require_excitation(self.factor, self.base.population.inputs, self.units, self.condition, alpha)
+        for m, factor in zip(sets, factors, strict=True) if alpha == 0 else ():
+            require_independent(factor, m.lifting.names + m.inputs, self.units, self.condition)
+        sets = [replace(m, alpha=alpha, alpha_in_ranges=settings.alpha == "auto") for m in sets]
+        models = [fitted(m, factor) for m, factor in zip(sets, factors, strict=True)]
         for m in models if self.feeds_synthesis else ():
             require_stable(m, self.pooled)
         return models
 
-    def _search_alpha(self, shared: list[tuple[Array, int]], factor: float) -> float:
-        edge = smallest_stabilising_alpha(shared)
-        times = alpha_factor(shared, edge, factor) if self.feeds_synthesis else factor
-        note = (
-            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
-        )
-        log.info(note, self.condition, times * edge, times)
-        return times * edge
-
-    def _check(self, factors: list[Factor], liftings: list[Lifting], alpha: float) -> None:
-        """Refuse what the recordings do not determine."""
-        inputs = self.base.population.inputs
-        require_excitation(self.factor, inputs, self.units, self.condition, alpha)
-        for factor, lifting in zip(factors, liftings, strict=True) if alpha == 0 else ():
-            names = lifting.names + inputs + lifting.input_functions
-            require_independent(factor, names, self.units, self.condition)
-
-    def _models(
-        self, name: str, lifting: Lifting, factor: Factor, ranges: Ranges, settings: IdentifySettings, alpha: float
-    ) -> ModelSet:
-        nothing, population = np.zeros((len(self.units), 0, 0)), self.base.population
-        unfitted = ModelSet(
-            name=name,
+    def _unfitted(self, kind: ModelKind) -> ModelSet:
+        lifting, population = kind.lifting(self.base.lifting), self.base.population
+        rows = self.pooled if self.pooled.any() else slice(None)
+        ranges, nothing = Ranges.of(self.lifted(lifting), lifting.n_lifted, rows), np.zeros((len(self.units), 0, 0))
+        return ModelSet(
+            name=kind.name,
             condition=self.condition,
             lifting=lifting,
             channels=population.channels,
@@ -273,15 +244,26 @@ class _Reduced:
             residual_covariance=nothing,
             output_scale=ranges.outputs,
             input_scale=ranges.inputs,
-            alpha=float(alpha),
-            alpha_in_ranges=settings.alpha == "auto",
         )
-        return fitted(unfitted, factor)
+
+    def _search(self, sets: list[ModelSet], factors: list[Factor], settings: IdentifySettings) -> float:
+        """Return the common regularisation of channels divided by their ranges."""
+        rows = self.pooled if self.pooled.any() else slice(None)
+        triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
+        shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
+        edge, times = smallest_stabilising_alpha(shared), settings.alpha_factor
+        times = alpha_factor(shared, edge, times) if self.feeds_synthesis else times
+        note = (
+            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        )
+        log.info(note, self.condition, times * edge, times)
+        return times * edge
 
     def begin_refinement(self, starts: list[ModelSet], work: Work) -> Callable[[], Result]:
         """Begin to refine every kind of model on free-run error."""
         base, facts = self.base, self.base.facts
         keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
+        starts = [replace(start, alpha=None, alpha_in_ranges=False) for start in starts]
         factors = [self.lifted(start.lifting) for start in starts]
         tasks = [
             partial(refine_population, base.population, keys, start.lifting, start.parameters, factor, self.pooled)
@@ -291,10 +273,9 @@ class _Reduced:
 
         def refining() -> Result:
             kinds, refined = kinds_for(base.lifting, refined=True), results()
-            plain = [replace(start, alpha=None, alpha_in_ranges=False) for start in starts]
-            of = zip(kinds, plain, refined, factors, strict=True)
-            models = [_with_matrices(start, kind.name, matrices, f) for kind, start, (matrices, _), f in of]
-            return models, {kind.name: found for kind, (_, found) in zip(kinds, refined, strict=True)}
+            of = zip(kinds, starts, refined, factors, strict=True)
+            models = [_with_matrices(start, kind.name, matrices, factor) for kind, start, (matrices, _), factor in of]
+            return models, {kind.name: facts for kind, (_, facts) in zip(kinds, refined, strict=True)}
 
         return refining
 

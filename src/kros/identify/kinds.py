@@ -31,10 +31,10 @@ KINDS = (
 
 def kind_of(name: str) -> ModelKind:
     """Return a kind by its name."""
-    for kind in KINDS:
-        if kind.name == name:
-            return kind
-    raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kind.name for kind in KINDS)}.")
+    kinds = {kind.name: kind for kind in KINDS}
+    if name not in kinds:
+        raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kinds)}.")
+    return kinds[name]
 
 
 def kinds_for(lifting: Lifting, *, refined: bool) -> tuple[ModelKind, ...]:

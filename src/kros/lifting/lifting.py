@@ -21,9 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .continuity import slope_bounds_of
 from .formula import Formula, base_and_delay, require_text
-from .intervals import Box
+from .intervals import Box, slope_bounds_of
 from .program import Program
 from .separation import FormulaSeparation
 from .window import Window

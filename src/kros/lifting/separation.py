@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .formula import Formula
-from .limits import MAX_TERMS, count_terms
+from .formula import MAX_TERMS, Formula, count_terms
 from .program import Program
 from .window import Window
 

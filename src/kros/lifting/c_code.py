@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from .program import Writer
+from .program import Writer, tree_of
 
 _SIGNS = {"add": "+", "multiply": "*", "divide": "/"}
 _NAMES = {"Abs": "fabs"}
@@ -34,7 +34,7 @@ class Precision:
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
     """Return a SymPy tree as a C expression."""
     writer = Writer(sorted(symbol.name for symbol in expression.free_symbols))
-    value = writer.write(expression)
+    value = writer.write(tree_of(expression))
     return _CText(writer, name, precision or Precision()).bare(value)
 
 

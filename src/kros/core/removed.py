@@ -147,6 +147,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "kros.identify.lifted_factor kros.identify.reduce_episode",
     ),
     (
+        "Refined models have no class apart from others; refine_population returns their matrices and a Refinement.",
+        "kros.identify.refine.RefinedModels",
+    ),
+    (
         "Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).",
         "kros.lifting.concatenate",
     ),

@@ -5,8 +5,7 @@ In steady motion the error's phase against the angle is ``phi + eta`` forward an
 over both directions that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is
 averaged by itself:
 
-    phi = (psi_forward + psi_reverse) / 2  (modulo pi),      eta = (psi_forward - psi_reverse) / 2  (modulo pi, the same
-    branch)
+    phi = (psi_forward + psi_reverse) / 2,      eta = (psi_forward - psi_reverse) / 2      (modulo pi, one branch)
 
 and the branch is chosen for the whole population at once, so that every unit's lag lies near the population's mean lag.
 
@@ -164,9 +163,10 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
 def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
     """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
-    wanted = reference[:-1][moving] / max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
-    power = float(wanted @ wanted)
-    return float(wanted @ np.diff(angle)[moving]) / (power * dt * float(np.max(np.abs(reference)))) if power else 0.0
+    top = max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
+    speed = reference[:-1][moving] / top
+    power = float(speed @ speed)
+    return float(speed @ np.diff(angle)[moving]) / (power * dt * top) if power else 0.0
 
 
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:

@@ -133,8 +133,12 @@ class ModelSet:
         alpha = self.alpha or 0.0
         return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
 
+    def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
+        """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
+        return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
+
     def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
-        """Return frequency responses from inputs to lifted states over their ranges, shape (unit, frequency, n, m)."""
+        """Return the same with every signal divided by its range."""
         return self.normalised().systems(units).frequency_response(freqs_hz)
 
     def systems(self, units: Sequence[str] | None = None) -> StateSpace:

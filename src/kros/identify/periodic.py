@@ -5,8 +5,7 @@ Symbols
 e_k   : residual of ``x_{k+1}`` regressed on the states and inputs of the last steps, each unit by itself
 q_k   : angle, rad
 P(r)  : ``2 |sum_k e_k exp(-i r q_k)|^2 / (N sum_k e_k^2)``, about the share of the residual that ``sin(r q)`` and
-``cos(r q)`` explain. All r at once
-        by a histogram of the residual over the angle and one FFT.
+        ``cos(r q)`` explain, for all r by a histogram of the residual over the angle and one FFT
 """
 
 from __future__ import annotations

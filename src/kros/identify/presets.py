@@ -91,7 +91,7 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     return spec
 
 
-def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) -> dict[str, Any]:
+def _written_ratio(lifting: Lifting, angles: Sequence[str], angle: str | None) -> dict[str, Any]:
     """Return angle and ratio where every function of the phase reads ``ratio*angle + phase``."""
     import sympy as sp
 
@@ -101,7 +101,7 @@ def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) 
         rest = sp.expand(argument / argument.coeff(phase)) - phase if argument.coeff(phase) != 0 else phase
         names = [symbol.name for symbol in rest.free_symbols]
         ratio = sp.diff(rest, sp.Symbol(names[0], real=True)) if len(names) == 1 else phase
-        if ratio.is_number and names[0] in angles and wanted in (None, names[0]):
+        if ratio.is_number and names[0] in angles and angle in (None, names[0]):
             pairs.add((names[0], float(ratio)))
     return dict(zip(("angle", "ratio"), pairs.pop(), strict=True)) if len(pairs) == 1 else {}
 

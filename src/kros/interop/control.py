@@ -214,14 +214,14 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     >>> len(systems), systems[motors.unit_ids[0]].input_labels
     (2, ['voltage'])
     """
-    asked = models.unit_ids if units is None else tuple(units)
-    unknown = [unit for unit in asked if unit not in models.unit_ids]
+    chosen = models.unit_ids if units is None else tuple(units)
+    unknown = [unit for unit in chosen if unit not in models.unit_ids]
     if unknown or isinstance(units, str):
         problem = f"asked for units {units!r}, the models are of {list(models.unit_ids)}"
         raise DimensionError(f"models_to_control: {problem}; correct the list.")
-    systems, names = models.systems(asked), models.lifting.names
+    systems, names = models.systems(chosen), models.lifting.names
     named = {"states": names, "inputs": models.inputs, "outputs": names}
-    return {unit: to_control(systems[i], name=unit, **named) for i, unit in enumerate(asked)}
+    return {unit: to_control(systems[i], name=unit, **named) for i, unit in enumerate(chosen)}
 
 
 def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:

@@ -3,8 +3,8 @@
 Text is read with `ast` against a whitelist and turned into SymPy nodes one by one; nothing is ever evaluated as Python.
 From the one SymPy tree come the derivative, the slope bounds, and the program that NumPy, the compiled loops and C
 follow. SymPy computes numbers exactly: powers of powers of whole numbers, and exponentials of exponentials, take time
-and memory without a bound while they are read. Every operation is therefore settled at once: its numbers become those of
-double precision, and what has no finite value there, or is too large, is refused.
+and memory without a bound while they are read. Every operation is therefore settled at once: its numbers become those
+of double precision, and what has no finite value there, or is too large, is refused.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class Formula:
 
     @cached_property
     def used(self) -> frozenset[str]:
-        """Names that the formula depends on; an earlier value has a name of its own."""
+        """Names that the formula depends on, those of earlier values among them."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
     @cached_property
@@ -226,15 +226,15 @@ def require_size(tree: ast.AST) -> None:
         node, depth, chain = todo.pop()
         if isinstance(node, ast.expr):
             count += 1
-            own = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
-            depth += not (isinstance(node, ast.Name | ast.Constant) or (own is not None and own is chain))
+            kind = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
+            depth += not (isinstance(node, ast.Name | ast.Constant) or (kind is not None and kind is chain))
             if count > MAX_NODES or depth > MAX_DEPTH:
                 many, deep = (
                     f"has more than {MAX_NODES} numbers, names and operators",
                     f"is nested more than {MAX_DEPTH} deep",
                 )
                 raise TooCostlyError(f"{many if count > MAX_NODES else deep}; split it into several functions.")
-            chain = own
+            chain = kind
         todo += [(child, depth, chain) for child in ast.iter_child_nodes(node)]
 
 

@@ -42,7 +42,7 @@ class Lifting:
         Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters;
         empty for a linear model.
     parameters : tuple of str
-        Names of quantities that every unit has a value of its own for, such as ``phase``.
+        Names of quantities whose value differs from unit to unit, such as ``phase``.
     inputs : tuple of str
         Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes
         through.
@@ -154,9 +154,9 @@ class Lifting:
         return self._parsed(self.input_functions)
 
     def _parsed(self, texts: tuple[str, ...]) -> tuple[Formula, ...]:
-        names, delayed, own = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
-        sizes = tuple((name, own[name]) for name in delayed if name in own)
-        return tuple(Formula(text, names, delayed, sizes, own.get(require_text(text), 1.0)) for text in texts)
+        names, delayed, known = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
+        sizes = tuple((name, known[name]) for name in delayed if name in known)
+        return tuple(Formula(text, names, delayed, sizes, known.get(require_text(text), 1.0)) for text in texts)
 
     @cached_property
     def window(self) -> Window:

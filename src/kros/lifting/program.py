@@ -1,7 +1,7 @@
 """Formulas as operations on numbered values, which NumPy and the compiled loops run and C is written from.
 
 A program is data: no code is generated for a lifting, and what formulas have in common is computed once. The order of
-operations is that of the numbers they are written with, the same everywhere.
+operations is the same everywhere, so that results agree to rounding.
 """
 
 from __future__ import annotations

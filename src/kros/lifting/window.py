@@ -2,8 +2,7 @@
 
 A window is what a lifting is evaluated on: the present states, then the earlier values that its formulas name,
 
-    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its own depth
-    d.
+    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its depth d
 
 At the next sample each earlier value takes the place behind it; the shift is exact, no model is asked.
 """

@@ -17,9 +17,9 @@ class Tape:
     """Operations of a lifting."""
 
     constants: npt.NDArray[np.float64]  # shape (constants,)
-    code: Whole  # shape (operations, 4); What is done, the register that it goes into, and those it is done with
-    lifted: Whole  # shape (n_lifted + inputs,); Registers of the lifted states, then of the inputs and their functions
-    slopes: Whole  # shape (slopes, 3); Column of a model, entry among those asked for, and register, of every derivative that is not zero
+    code: Whole  # shape (operations, 4): kind, register of the result, registers of the operands
+    lifted: Whole  # shape (n_lifted + inputs,): registers of the lifted states, then of the inputs and their functions
+    slopes: Whole  # shape (slopes, 3): column of a model, entry, and register of every derivative that is not zero
     registers: int
 
 

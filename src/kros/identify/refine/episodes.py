@@ -1,7 +1,7 @@
 """Normal equations of every episode at finished refined models, for resampling episodes without refitting.
 
-    cost of a unit = sum over episodes of [ free runs of its segments + one-step error of the lifted functions ] + edge
-    of stability + prior
+    cost of a unit = sum over episodes of [ free runs of its segments + one-step error of the lifted functions ]
+                     + edge of stability + prior
 
 The sum over episodes is what the search minimised, without its last two terms.
 """

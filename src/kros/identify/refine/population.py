@@ -1,7 +1,6 @@
 """Refinement of a population: one pooled model on free-run error, then every unit with a prior centred on it.
 
-    factors -> pooled EDMD -> pooled refined model (horizons 5 .. 1000) -> units at each strength of the prior ->
-    strength -> units
+    factors -> pooled EDMD -> pooled refined model -> units at each strength of the prior -> strength -> units
 
 Models that predict alike may differ wildly in weakly excited directions, and what differs is uncertainty. The prior
 therefore measures the distance from the pooled model as the uncertainty does (`metric`), and the strength is chosen on

@@ -5,8 +5,8 @@
 The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one
 slides along it.
 
-    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2,      d|lambda| = Re[conj(lambda) / |lambda|  y^H dA
-    x / (y^H x)]
+    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2
+    d|lambda| = Re[conj(lambda) / |lambda|  y^H dA x / (y^H x)]
 
 with right and left eigenvectors x, y of A, and ``dA = (dV T^T)`` without its columns of inputs.
 

@@ -163,11 +163,10 @@ def smallest_stabilising_alpha(
     0.02
     """
     search = search or AlphaSearch()
-    ridges = [_Ridge.of(R, n) for R, n in factors]
     largest = max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) for R, n in factors)
     top = 2 + np.ceil(np.log10(largest**2))
     grid = 10.0 ** np.arange(top, top - 2 - search.decades, -1 / search.per_decade)
-    first = next((i for i, alpha in enumerate(grid) if not _all_stable(ridges, alpha, margin)), None)
+    first = next((i for i, alpha in enumerate(grid) if not _all_stable(factors, alpha, margin)), None)
     if first is None:
         return 0.0 if _stable_without(factors, margin) else float(grid[-1])
     if first == 0:
@@ -177,43 +176,20 @@ def smallest_stabilising_alpha(
     low, high = np.log10(grid[first]), np.log10(grid[first - 1])
     for _ in range(search.bisections):
         middle = (low + high) / 2
-        if _all_stable(ridges, 10**middle, margin):
+        if _all_stable(factors, 10**middle, margin):
             high = middle
         else:
             low = middle
     return float(10**high)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ridge:
-    """Models as functions of alpha: with ``R11 = P diag(s) Q^T``, ``A^T = Q1 diag(s / (s^2 + alpha)) P^T R12``."""
-
-    left: Array  # (unit, n_lifted, p)
-    values: Array  # (unit, p)
-    right: Array  # (unit, p, n_lifted)
-
-    @classmethod
-    def of(cls, R: Array, n_lifted: int) -> _Ridge:
-        p = R.shape[-1] - n_lifted
-        P, values, Q = np.linalg.svd(R[:, :p, :p])
-        left = np.ascontiguousarray(np.swapaxes(Q, 1, 2)[:, :n_lifted])
-        return cls(left, values, np.swapaxes(P, 1, 2) @ R[:, :p, p:])
-
-    def radius(self, alpha: float) -> Array:
-        """Return the spectral radius of every unit's model."""
-        shrunk = self.values / np.maximum(self.values**2 + alpha, np.finfo(float).tiny)
-        return np.asarray(
-            np.abs(np.linalg.eigvals((self.left * shrunk[:, None]) @ self.right)).max(axis=-1, initial=0.0)
-        )
-
-
-def _all_stable(ridges: list[_Ridge], alpha: float, margin: float) -> bool:
-    return all(bool((ridge.radius(alpha) < 1 - margin).all()) for ridge in ridges)
+def _all_stable(factors: list[tuple[Array, int]], alpha: float, margin: float) -> bool:
+    return all(bool((edmd(R, n, alpha).spectral_radius() < 1 - margin).all()) for R, n in factors)
 
 
 def _stable_without(factors: list[tuple[Array, int]], margin: float) -> bool:
     try:
-        return all(bool(np.all(edmd(R, n).spectral_radius() < 1 - margin)) for R, n in factors)
+        return _all_stable(factors, 0.0, margin)
     except IdentificationError:  # a dependent column: some regularisation is needed, however small
         log.info("some lifted data are rank deficient, so alpha = 0 is not an option")
         return False

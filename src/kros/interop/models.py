@@ -78,32 +78,32 @@ def quantify_models(
         raise DataError("quantify_models: found no models; give at least two.")
     if all(is_system(model) for model in models):
         base = from_control(nominal) if is_system(nominal) else nominal
-        return uncertainty_to_control(
-            quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, **options)
-        )
+        systems = [from_control(model) for model in models]
+        return uncertainty_to_control(quantify_systems(systems, form, freqs_hz, nominal=base, **options))
     if not all(isinstance(model, control.FRD) for model in models):
-        kinds = sorted({type(model).__name__ for model in models})
-        raise DimensionError(
-            f"quantify_models: found {' and '.join(kinds)} in one list; give all as systems or all as control.FRD."
-        )
+        kinds = " and ".join(sorted({type(model).__name__ for model in models}))
+        raise DimensionError(f"quantify_models: found {kinds} in one list; give all as systems or all as control.FRD.")
     if freqs_hz is not None:
         raise ConfigError("quantify_models: response data bring their own frequencies; drop freqs_hz.")
+    return _quantify_data(list(models), form, nominal, options)
+
+
+def _quantify_data(models: list[Any], form: Form | str, nominal: Any, options: dict[str, Any]) -> UncertaintyForControl:
+    """Quantify response data, which are known on their grid alone."""
     freqs, period = _common_axis([*models, *([nominal] if isinstance(nominal, control.FRD) else [])])
     base = _response(nominal) if isinstance(nominal, control.FRD) else nominal
     responses = [_response(model) for model in models]
-    shapes = {response.shape for response in responses}
+    shapes = sorted({response.shape for response in responses})
     if len(shapes) > 1:
-        raise DimensionError(
-            f"quantify_models: responses differ in shape (frequency, outputs, inputs), {sorted(shapes)}; bring them to "
-            "one."
-        )
+        problem = f"responses differ in shape (frequency, outputs, inputs), {shapes}"
+        raise DimensionError(f"quantify_models: {problem}; bring them to one.")
     model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, **options)
     G = model.nominal_response
-    scaled = G / model.output_scale[:, None] * model.input_scale
-    data, scaled_data = (
-        control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0) for g in (G, scaled)
+    data, scaled = (
+        control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0)
+        for g in (G, G / model.output_scale[:, None] * model.input_scale)
     )
-    return with_weights(data, scaled_data, model, model.certificate)
+    return with_weights(data, scaled, model, model.certificate)
 
 
 def _common_axis(data: list[Any]) -> tuple[Array, float]:

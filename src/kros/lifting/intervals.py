@@ -228,8 +228,8 @@ def _breaks(node: Any) -> Any:
     import sympy as sp
 
     if isinstance(node, sp.Pow) and node.exp.is_number and not node.base.is_number:
-        whole = node.exp == int(node.exp)
-        return (_not_zero if whole else _positive) if node.exp.is_negative else (None if whole else _not_negative)
+        whole, negative = bool(node.exp == int(node.exp)), bool(node.exp.is_negative)
+        return {(True, True): _not_zero, (False, True): _positive, (False, False): _not_negative}.get((whole, negative))
     return _TESTS.get(type(node).__name__) if node.args and not node.is_number else None
 
 

@@ -71,6 +71,13 @@ def test_pieces_tighten_what_appears_twice():
     assert 0.25 <= high < 0.2505
 
 
+def test_what_underflows_is_not_bounded_away_from_zero():
+    assert bounds("-1/x**2", x=1.4e-254)[0] == -INF
+    low, high = bounds("x*y", x=1e-200, y=1e-200)
+    assert low == 0 < high
+    assert bounds("exp(x)", x=-1000.0)[1] > 0
+
+
 def test_jumps_and_roots_have_no_bound():
     lifting = Lifting(("x",), ("sign(x)", "sqrt(x)", "abs(x)", "1/x"))
     lower, upper = lifting.slope_bounds({"x": (-1, 1)})

@@ -104,13 +104,14 @@ def _add(a: Interval, b: Interval) -> Interval:
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
-    products = [_away_from_zero(x * y, np.sign(x) * np.sign(y)) for x in a for y in b]
-    return _outward(np.minimum.reduce(products), np.maximum.reduce(products))
+    products = [_ends(x * y, np.sign(x) * np.sign(y)) for x in a for y in b]
+    return _outward(np.minimum.reduce([low for low, _ in products]), np.maximum.reduce([high for _, high in products]))
 
 
-def _away_from_zero(value: Array, sign: Array) -> Array:
-    """Replace what has underflowed by the smallest normal number of its sign; zero times anything is zero."""
-    return np.where(sign == 0, 0.0, np.where(np.abs(value) < _TINY, sign * _TINY, value))
+def _ends(value: Array, sign: Array) -> Interval:
+    """Bounds of a product: what has underflowed lies between zero and the smallest normal number; zero times anything is zero."""
+    tiny, value = np.abs(value) < _TINY, np.where(sign == 0, 0.0, value)
+    return np.where(tiny, np.minimum(sign, 0.0) * _TINY, value), np.where(tiny, np.maximum(sign, 0.0) * _TINY, value)
 
 
 def _power(base: Interval, exponent: Any) -> Interval:
@@ -119,10 +120,10 @@ def _power(base: Interval, exponent: Any) -> Interval:
     low, high = base
     if exponent == int(exponent):
         n = int(exponent)
-        a, b = (_away_from_zero(side**n, np.sign(side) ** n) for side in base)
+        (low_a, high_a), (low_b, high_b) = (_ends(side**n, np.sign(side) ** n) for side in base)
         if n % 2:
-            return _outward(a, b, _ULPS)
-        lower, upper = _outward(np.minimum(a, b), np.maximum(a, b), _ULPS)
+            return _outward(low_a, high_b, _ULPS)
+        lower, upper = _outward(np.minimum(low_a, low_b), np.maximum(high_a, high_b), _ULPS)
         return np.where((low <= 0) & (high >= 0), 0.0, lower), upper
     p = float(exponent)
     return _where_defined(low >= 0, *_outward(np.maximum(low, 0.0) ** p, np.maximum(high, 0.0) ** p, _ULPS))
@@ -188,7 +189,7 @@ _FUNCTIONS: dict[str, Callable[[Array, Array], Interval]] = {
     "sin": _sine,
     "cos": lambda low, high: _sine(low + np.pi / 2, high + np.pi / 2),
     "tan": _tangent,
-    "exp": _rising(np.exp, 0.0),
+    "exp": lambda low, high: (_rising(np.exp, 0.0)(low, low)[0], np.maximum(_rising(np.exp)(high, high)[1], _TINY)),
     "log": _logarithm,
     "tanh": _rising(np.tanh, -1.0, 1.0),
     "atan": _rising(np.arctan),

@@ -13,7 +13,8 @@ import pytest
 from problems import DT, GEAR
 
 from kros.core.frequency import log_grid
-from kros.identify import edmd, free_run, reduce_episode
+from kros.identify import edmd, free_run
+from kros.identify.factors import reduce_episode
 from kros.identify.refine import refine_population
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf
@@ -36,7 +37,7 @@ def models(units: int, lifted: int) -> Work:
 
 def refinement(units: int) -> Work:
     """Simulated drives, three episodes of 5 s each, the linear model."""
-    from kros.identify import Factor, combine
+    from kros.identify import combine, episode_factors
     from kros.lifting import Lifting
     from kros.plants import HarmonicDrivePopulation
 
@@ -48,13 +49,7 @@ def refinement(units: int) -> Work:
     )
     keys = {unit: [key for key in population.episodes if key.unit == unit] for unit in population.unit_ids}
 
-    def stack(factors: list[Factor]) -> Factor:
-        return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
-
-    def reduced(unit: str) -> Factor:
-        return combine(stack([reduce_episode(v[:, :3], v[:, 3:], linear) for v in map(population.read, keys[unit])]))
-
-    factor = stack([reduced(unit) for unit in population.unit_ids])
+    factor = combine(episode_factors(population, keys, linear))
     return lambda: refine_population(population, keys, linear, {}, factor)
 
 

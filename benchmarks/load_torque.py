@@ -23,7 +23,8 @@ import numpy.typing as npt
 
 from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import error_spectrum
-from kros.identify import PhaseSpec, find_segments, resolve_branches, unit_phase
+from kros.identify import PhaseSpec
+from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_from_current, load_observer
 from kros.motor_drive.accuracy import load_accuracy
@@ -149,7 +150,7 @@ class Drives:
         for unit in self.population.unit_ids:
             values = [self.population.read(k) for k in keys if k.unit == unit]
             segments = [s for v in values for s in find_segments(v[:, 0], v[:, 4], v[:, 1], self.dt, PhaseSpec())]
-            units[unit] = unit_phase(segments, unit)
+            units[unit] = unit_phase(segments, unit, PhaseSpec())
         return {u: p.phase_rad for u, p in resolve_branches(units, list(units), PhaseSpec()).units.items()}
 
     def load(self, batch: EpisodeBatch) -> Array:

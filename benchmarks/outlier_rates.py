@@ -22,18 +22,10 @@ import numpy.typing as npt
 from kros.core.frequency import log_grid
 from kros.core.lti import StateSpace
 from kros.data.population import Population
-from kros.identify import (
-    Factor,
-    PhaseSpec,
-    combine,
-    edmd,
-    find_segments,
-    lifted_factor,
-    reduce_episode,
-    resolve_branches,
-    unit_phase,
-)
+from kros.identify import Factor, PhaseSpec, combine, edmd
+from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.identify.edmd import smallest_stabilising_alpha
+from kros.identify.factors import lifted_factor, reduce_episode
 from kros.lifting import Lifting
 from kros.plants import HarmonicDrivePopulation
 from kros.uncertainty import Form, OutlierModel, score_outliers
@@ -182,7 +174,7 @@ def simulate(seed: int, episodes: int, seconds: float) -> dict[str, Array]:
                 segments = [
                     s for v in data for s in find_segments(v[:, 0], v[:, 4], v[:, 1], population.sample_period_s, spec)
                 ]
-                p = unit_phase(segments, unit)
+                p = unit_phase(segments, unit, spec)
                 found["phases"].append((p.phase_rad, p.lag_rad, p.concentration, p.n_segments))
     return {name: np.array(value) for name, value in found.items()}
 

@@ -238,7 +238,7 @@ def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.
     for k in range(len(y)):
         found[k] = x
         named = values | {s: x[:, i] for i, s in enumerate(lifting.states)}
-        theta = np.concatenate([x, *(np.asarray(f.evaluator(named))[:, None] for f in lifting.formulas)], axis=1)
+        theta = np.concatenate([x, *(f.evaluate(named)[:, None] for f in lifting.formulas)], axis=1)
         nu = y[k].astype(real) - x[:, list(observer.measured)]
         corrected = (x_c @ linear[2].T + nu @ linear[3].T) @ into.T
         if observer.start_in_motion is not None and k < len(observer.start_in_motion):

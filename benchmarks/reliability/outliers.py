@@ -21,7 +21,8 @@ from scipy.linalg import expm
 from scipy.stats import binom
 
 from kros.data import Channel, Role
-from kros.identify import Factor, ModelSet, reduce_episode
+from kros.identify import Factor, ModelSet
+from kros.identify.factors import reduce_episode
 from kros.lifting import Lifting
 from kros.uncertainty import OutlierModel, score_outliers
 from kros.uncertainty.outliers.recorded import Evidence, Recorded

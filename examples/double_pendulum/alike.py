@@ -17,7 +17,8 @@ import numpy as np
 from kros.core import StateSpace
 from kros.core.frequency import log_grid
 from kros.data import read, split_episodes
-from kros.identify import Factor, combine, edmd, lifted_factor, reduce_episode, smallest_stabilising_alpha
+from kros.identify import Factor, combine, edmd, smallest_stabilising_alpha
+from kros.identify.factors import lifted_factor, reduce_episode
 from kros.lifting import Lifting
 from kros.study import load_config
 from kros.uncertainty import Form, residual, sigma_max

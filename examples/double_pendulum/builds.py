@@ -16,16 +16,7 @@ import numpy as np
 
 import kros
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import (
-    Factor,
-    KoopmanMatrices,
-    combine,
-    edmd,
-    free_run,
-    lifted_factor,
-    reduce_episode,
-    smallest_stabilising_alpha,
-)
+from kros.identify import KoopmanMatrices, combine, edmd, episode_factors, free_run, smallest_stabilising_alpha
 from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
 
@@ -78,16 +69,10 @@ def training(recordings: Recordings, design: tuple[str, ...]) -> Population:
 def fit(population: Population) -> dict[str, KoopmanMatrices]:
     """Fit the builds of one design: by least squares, and refined on free runs, all together first, then each with a prior."""
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
-    reduced = [stack([reduce_episode(*population.read_parts(key), LIFTING) for key in keys[unit]]) for unit in keys]
-    factor = lifted_factor(stack([combine(each) for each in reduced]), LIFTING, {}, LIFTING)
+    factor = combine(episode_factors(population, keys, LIFTING))
     alpha = 4 * smallest_stabilising_alpha([(factor.R, LIFTING.n_lifted)])
-    refined = refine_population(population, keys, LIFTING, {}, factor, options=OPTIONS)
-    return {"refined": refined.units, "EDMD": edmd(factor.R, LIFTING.n_lifted, alpha)}
-
-
-def stack(factors: list[Factor]) -> Factor:
-    """Return several factors as a batch."""
-    return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
+    refined, _ = refine_population(population, keys, LIFTING, {}, factor, options=OPTIONS)
+    return {"refined": refined, "EDMD": edmd(factor.R, LIFTING.n_lifted, alpha)}
 
 
 def windows(values: np.ndarray) -> np.ndarray:

@@ -9,16 +9,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kros.identify import Factor, ModelSamples, bootstrap_edmd, combine, episode_factors, episode_weights
+from kros.identify import (
+    Factor,
+    KoopmanMatrices,
+    ModelSamples,
+    bootstrap_edmd,
+    combine,
+    episode_factors,
+    episode_weights,
+)
 from kros.identify.bootstrap import bootstrap_refined, one_step_deviations
-from kros.identify.refine import RefinedModels, RefineOptions, refine_population
-from kros.identify.refine.episodes import episode_normals, segment_owners
-from kros.identify.refine.marquardt import minimise
+from kros.identify.ranges import Ranges
+from kros.identify.refine import GaussNewton, Refinement, RefineOptions, refine_population
+from kros.identify.refine.episodes import episode_normals
 from kros.identify.refine.metric import ResponsePrior
-from kros.identify.refine.options import GUARD
-from kros.identify.refine.pooled import ranges
+from kros.identify.refine.model import TrainingData
 from kros.identify.refine.problem import OneStep, RefinementProblem
-from kros.identify.refine.segments import Segments, read_segments
+from kros.identify.refine.segments import Segments, read_segments, segment_owners
 from kros.lifting import Lifting
 from kros.plants import HarmonicDrivePopulation
 
@@ -112,36 +119,34 @@ def test_one_gauss_newton_step_is_exact_where_the_cost_is_quadratic() -> None:
 
 STATES = ("position", "velocity", "current")
 KOOPMAN = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
-OPTIONS = RefineOptions(horizons=(5, 20, 80), segments=20, strengths=(10.0,), iterations=10)
+OPTIONS = RefineOptions(horizons=(5, 20, 80), segments=20, strengths=(10.0,), search=GaussNewton(iterations=10))
 EPISODES = 5
 
 
 @pytest.fixture(scope="module")
-def drives() -> tuple[RefinedModels, Factor, np.ndarray, RefinementProblem]:
-    """Refined models of three drives, their per-episode factors and normal equations, and the problem that they solve."""
+def drives() -> tuple[KoopmanMatrices, Refinement, Factor, np.ndarray, RefinementProblem]:
+    """Refined models of three drives, their per-episode factors and normal equations, and the problem that they solve, divided by ranges."""
     simulated = HarmonicDrivePopulation(n_units=3, n_episodes=EPISODES, seconds=4.0, conditions=("noload",)).simulate()
-    population = simulated.population
+    population, phase = simulated.population, {"phase": simulated.truth.phase_rad}
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
-    phase = {"phase": simulated.truth.phase_rad}
-    factors = episode_factors(population, keys, KOOPMAN, phase)
-    whole = combine(factors)
-    models = refine_population(population, keys, KOOPMAN, phase, whole, options=OPTIONS)
-    T, n_samples = models.whitening, whole.n_samples
-    segments = read_segments(population, keys, max(OPTIONS.horizons), OPTIONS.segments, 0)
-    one_step = OneStep.of(whole.R, T, 3, 4, n_samples, np.arange(3))
-    problem = RefinementProblem(KOOPMAN, phase, segments, T, models.sigma, one_step, OPTIONS.margin)
-    prior = ResponsePrior(models.pooled.A, models.pooled.B, T, *ranges(whole, np.arange(3), KOOPMAN))
-    problem = replace(problem, guard=GUARD, prior=prior.scaled(models.strength * problem.residuals))
+    recorded = episode_factors(population, keys, KOOPMAN, phase)
+    span = Ranges.of(combine(recorded), 4)
+    models, refinement = refine_population(population, keys, KOOPMAN, phase, combine(recorded), options=OPTIONS)
+    models, refinement = span.normalise(models), refinement.divided_by(span)
+    data = TrainingData(population, keys, KOOPMAN, phase, recorded, np.ones(3, bool)).divided_by(span)
+    T, lifting = refinement.whitening, data.lifting
+    segments = read_segments(data.population, keys, max(OPTIONS.horizons), OPTIONS.segments, OPTIONS.seed)
+    one_step = OneStep.of(combine(data.factor), T, 3, np.arange(3))
+    prior = ResponsePrior(refinement.pooled.A, refinement.pooled.B, T, OPTIONS.prior_level, OPTIONS.prior_power)
+    problem = RefinementProblem(lifting, phase, segments, T, refinement.sigma, one_step, OPTIONS, False, True, prior)
+    problem = problem.with_prior(refinement.strength)
     # Refits compare minima, so the models are first taken all the way to theirs.
-    V = settle(problem.evaluate, minimise(problem.evaluate, problem.admissible, whitened(models), 60, 1e-12).V)
+    search = GaussNewton(iterations=60, least_gain=1e-12)
+    V = settle(problem.evaluate, search.minimise(problem.evaluate, problem.admissible, whitened(models, T)).V)
     W = V @ T.T
-    models = replace(
-        models,
-        units=type(models.units)(W[..., :4], W[..., 4:]),
-        information=problem.evaluate(V)[:, :-1, :-1],
-    )
-    normal = episode_normals(models, population, keys, KOOPMAN, phase, factors, OPTIONS)
-    return models, factors, normal, problem
+    models = KoopmanMatrices(W[..., :4], W[..., 4:])
+    refinement = replace(refinement, information=problem.evaluate(V)[:, :-1, :-1])
+    return models, refinement, data.factor, episode_normals(models, refinement, data, OPTIONS), problem
 
 
 def settle(evaluate: Callable[[np.ndarray], np.ndarray], V: np.ndarray) -> np.ndarray:
@@ -154,27 +159,28 @@ def settle(evaluate: Callable[[np.ndarray], np.ndarray], V: np.ndarray) -> np.nd
     return V
 
 
-def whitened(models: RefinedModels) -> np.ndarray:
-    W = np.concatenate([models.units.A, models.units.B], axis=-1)
-    return np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
+def whitened(models: KoopmanMatrices, T: np.ndarray) -> np.ndarray:
+    W = np.concatenate([models.A, models.B], axis=-1)
+    return np.swapaxes(np.linalg.solve(T, np.swapaxes(W, -1, -2)), -1, -2)
 
 
 def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
     """Weights that differ from one by up to 0.06: models and refits agree but for what Gauss-Newton leaves out of the curvature."""
-    models, factors, normal, problem = drives
+    models, refinement, factors, normal, problem = drives
+    T, information = refinement.whitening, refinement.information
     counts = np.array([[2.0, 1, 2, 0, 0], [0, 3, 0, 1, 1], [1, 0, 2, 2, 0]])
     small = 1 + 0.03 * (counts - 1)
-    step = bootstrap_refined(models.units, models.whitening, models.information, normal, small[:, None])
-    start = whitened(models)
-    found = whitened(replace(models, units=type(models.units)(step.samples.A[:, 0], step.samples.B[:, 0]))) - start
-    data, drawn = replace(problem, prior=None, guard=None), resampled(factors, problem, counts)
+    step = bootstrap_refined(models, T, information, normal, small[:, None], "abc").samples
+    start = whitened(models, T)
+    moved = whitened(KoopmanMatrices(step.A[:, 0], step.B[:, 0]), T) - start
+    data, drawn = replace(problem, prior=None, edged=False), resampled(factors, problem, counts)
 
     def evaluate(V: np.ndarray) -> np.ndarray:
         return problem.evaluate(V) + 0.03 * (drawn.evaluate(V) - data.evaluate(V))
 
     expected = settle(evaluate, start) - start
-    root = np.linalg.cholesky(models.information)
-    a, b = (np.einsum("upq,up->uq", root, d.reshape(3, -1)) for d in (found, expected))
+    root = np.linalg.cholesky(information)
+    a, b = (np.einsum("upq,up->uq", root, d.reshape(3, -1)) for d in (moved, expected))
     assert (np.linalg.norm(a - b, axis=1) < 0.3 * np.linalg.norm(b, axis=1)).all()
     assert (np.sum(a * b, axis=1) > 0.95 * np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)).all()
 
@@ -189,6 +195,6 @@ def resampled(factors: Factor, problem: RefinementProblem, counts: np.ndarray) -
     whole = (problem.segments.states, problem.segments.inputs, problem.segments.valid)
     chosen = Segments(*(np.stack([a[..., i, pick] for i, pick in enumerate(picks)], axis=-2) for a in whole))
     R = (np.sqrt(counts)[..., None, None] * factors.R).reshape(3, -1, factors.R.shape[-1])
-    n_samples = (counts * factors.n_samples).sum(axis=1)
-    matrix = OneStep.of(np.linalg.qr(R, mode="r"), problem.T, 3, 4, n_samples, np.arange(3)).matrix
-    return replace(problem, segments=chosen, one_step=replace(problem.one_step, matrix=matrix), prior=None, guard=None)
+    drawn = Factor(np.linalg.qr(R, mode="r"), factors.peak, (counts * factors.n_samples).sum(axis=1))
+    matrix = OneStep.of(drawn, problem.T, 3, np.arange(3)).matrix
+    return replace(problem, segments=chosen, one_step=replace(problem.one_step, matrix=matrix), prior=None, edged=False)

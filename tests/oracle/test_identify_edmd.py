@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from kros.core.errors import IdentificationError
-from kros.identify import Factor, combine, edmd, lifted_factor, reduce_episode, smallest_stabilising_alpha
+from kros.identify import Factor, combine, edmd, smallest_stabilising_alpha
 from kros.identify.edmd import residual_covariance
+from kros.identify.factors import lifted_factor, reduce_episode
 from kros.lifting import Lifting
 
 LIFTING = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))

@@ -9,8 +9,9 @@ import pytest
 
 from kros.core import IdentificationError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import Factor, combine, free_run, lifted_factor, reduce_episode
-from kros.identify.refine import RefinedModels, RefineOptions, refine_population
+from kros.identify import Factor, KoopmanMatrices, combine, free_run
+from kros.identify.factors import lifted_factor, reduce_episode
+from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.metric import ResponsePrior
 from kros.identify.refine.problem import stability_barrier
 from kros.lifting import Lifting
@@ -55,15 +56,15 @@ def stack(factors: list[Factor]) -> Factor:
     return Factor(*(np.stack([getattr(f, name) for f in factors]) for name in ("R", "peak", "n_samples")))
 
 
-def rows(models: RefinedModels) -> np.ndarray:
-    return np.concatenate([models.units.A, models.units.B], axis=-1)[:, :2]
+def rows(models: KoopmanMatrices) -> np.ndarray:
+    return np.concatenate([models.A, models.B], axis=-1)[:, :2]
 
 
 @pytest.mark.parametrize("lifting", [KOOPMAN, LINEAR], ids=["koopman", "linear"])
 def test_known_matrices_are_recovered_through_measurement_noise(lifting: Lifting) -> None:
     """Noise on the states biases one-step least squares; the free-run error does not suffer from it."""
     population, keys, parameters, factor, W = simulated(lifting, 3, 0.2, seed=3)
-    models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
+    models, _ = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
     p = lifting.n_lifted + 1
     R = factor.R
     one_step = np.swapaxes(np.linalg.solve(R[:, :p, :p], R[:, :p, p : p + 2]), 1, 2)
@@ -74,7 +75,7 @@ def test_known_matrices_are_recovered_through_measurement_noise(lifting: Lifting
 @pytest.mark.parametrize("lifting", [KOOPMAN, LINEAR], ids=["koopman", "linear"])
 def test_exact_data_give_exact_models(lifting: Lifting) -> None:
     population, keys, parameters, factor, W = simulated(lifting, 2, 0.0, seed=5, spread=0.0)
-    models = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
+    models, _ = refine_population(population, keys, lifting, parameters, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
 
 
@@ -84,7 +85,7 @@ def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
     W = np.array([[[0.95, 0.2, 0.3], [-0.2, 0.93, 1.0]]]) + 0.01 * rng.normal(size=(1, 2, 3))
     V = np.linalg.solve(T, np.swapaxes(W, 1, 2)).swapaxes(1, 2)
     square = np.array([[[0.5, 0.1, 0.3, 0.2], [-0.2, 0.6, 0.1, 1.0]]])
-    prior = ResponsePrior(square[0, :, :2], square[0, :, 2:], np.eye(4), np.array([1.0, 2.0]), np.array([1.0, 3.0]))
+    prior = ResponsePrior(square[0, :, :2], square[0, :, 2:], np.eye(4), level=0.3, power=2)
     cases = [(lambda V: stability_barrier(V, T, 0.2, 3.0), V), (prior.normal, square * 1.03)]
     for evaluate, at in cases:
         numeric = np.zeros(at.size)
@@ -98,13 +99,13 @@ def test_gradient_of_barrier_and_prior_is_that_of_finite_differences() -> None:
 
 def test_stronger_priors_bring_units_closer_together() -> None:
     population, keys, parameters, factor, _ = simulated(KOOPMAN, 3, 0.02, seed=4)
-    models = refine_population(
+    _, refinement = refine_population(
         population, keys, KOOPMAN, parameters, factor, options=replace(OPTIONS, strengths=(1e5, 1.0))
     )
-    peaks = [row.peak_db for row in models.trade_off]
+    peaks = [row.peak_db for row in refinement.trade_off]
     assert peaks[0] == -np.inf
     assert peaks[1] < peaks[2] - 3
-    assert models.strength in (1e5, 1.0)
+    assert refinement.strength in (1e5, 1.0)
 
 
 def test_diverging_free_runs_name_unit_and_episode() -> None:

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import Factor, combine, episode_factors, free_run, lifted_factor, reduce_episode
-from kros.identify.refine import RefinedModels, RefineOptions, refine_population
+from kros.identify import Factor, KoopmanMatrices, combine, episode_factors, free_run
+from kros.identify.factors import lifted_factor, reduce_episode
+from kros.identify.refine import RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
+from kros.identify.refine.model import TrainingData
 from kros.identify.refine.segments import Segments, read_segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
@@ -99,13 +101,13 @@ def machines(n_units: int, noise: float, seed: int, spread: float = 0.02) -> tup
     return population, keys, lifted_factor(Factor.stack(reduced), BILINEAR, {}, BILINEAR), W
 
 
-def rows(models: RefinedModels) -> np.ndarray:
-    return np.concatenate([models.units.A, models.units.B], axis=-1)[:, :2]
+def rows(models: KoopmanMatrices) -> np.ndarray:
+    return np.concatenate([models.A, models.B], axis=-1)[:, :2]
 
 
 def test_a_bilinear_system_with_delays_is_recovered_through_measurement_noise() -> None:
     population, keys, factor, W = machines(3, 0.05, seed=3)
-    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    models, _ = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     one_step = np.swapaxes(np.linalg.solve(factor.R[:, :6, :6], factor.R[:, :6, 6:8]), 1, 2)
     found, biased = np.abs(rows(models) - W).max(), np.abs(one_step - W).max()
     assert found < 0.02
@@ -114,27 +116,28 @@ def test_a_bilinear_system_with_delays_is_recovered_through_measurement_noise() 
 
 def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     population, keys, factor, W = machines(2, 0.0, seed=5, spread=0.0)
-    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    models, _ = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
-    shift = np.concatenate([models.units.A, models.units.B], axis=-1)[:, 3]
+    shift = np.concatenate([models.A, models.B], axis=-1)[:, 3]
     np.testing.assert_allclose(
         shift, np.broadcast_to([0, 0, 0, 0, 1, 0], shift.shape), atol=1e-6
     )  # u[-1] of the next sample is u
     x = population.read(keys["u0"][0])
-    run = free_run(models.units.A[:1], models.units.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
+    run = free_run(models.A[:1], models.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
     np.testing.assert_allclose(run, x[:, :2], atol=1e-5)
 
 
 def test_normal_equations_by_episode_add_up_with_delays() -> None:
     population, keys, factor, _ = machines(2, 0.05, seed=8)
-    models = refine_population(population, keys, BILINEAR, {}, factor, options=replace(OPTIONS, strengths=(1.0,)))
-    by_episode = episode_normals(
-        models, population, keys, BILINEAR, {}, episode_factors(population, keys, BILINEAR), OPTIONS
-    )
+    options = replace(OPTIONS, strengths=(1.0,))
+    models, refinement = refine_population(population, keys, BILINEAR, {}, factor, options=options)
+    factors = episode_factors(population, keys, BILINEAR)
+    data = TrainingData(population, keys, BILINEAR, {}, factors, np.ones(2, bool))
+    by_episode = episode_normals(models, refinement, data, OPTIONS)
     segments = read_segments(population, keys, 80, OPTIONS.segments, 0, BILINEAR.history)
-    W = np.concatenate([models.units.A, models.units.B], axis=-1)
-    V = np.swapaxes(np.linalg.solve(models.whitening, np.swapaxes(W, -1, -2)), -1, -2)
-    whole = normal_equations(V[:, :2], models.whitening, BILINEAR, {}, segments, models.sigma)
+    W, T = np.concatenate([models.A, models.B], axis=-1), refinement.whitening
+    V = np.swapaxes(np.linalg.solve(T, np.swapaxes(W, -1, -2)), -1, -2)
+    whole = normal_equations(V[:, :2], T, BILINEAR, {}, segments, refinement.sigma)
     place = np.r_[0:12]
     np.testing.assert_allclose(
         by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9

@@ -6,8 +6,8 @@ pykoop solves normal equations, so models are compared to 1e-8 on data of one sc
 import numpy as np
 import pytest
 
-from kros.identify import combine, edmd, lifted_factor, reduce_episode
-from kros.identify.factors import Factor
+from kros.identify import combine, edmd
+from kros.identify.factors import Factor, lifted_factor, reduce_episode
 from kros.lifting import Lifting, delays, polynomials, radial
 
 pykoop = pytest.importorskip("pykoop")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kros.lifting import concatenate, delays, fourier_features, harmonics, polynomials, radial
+from kros.lifting import delays, fourier_features, harmonics, polynomials, radial
 
 STATES, INPUTS = ("position", "velocity"), ("voltage",)
 CENTRES = np.random.default_rng(0).uniform(-2, 2, (5, 2))
@@ -22,5 +22,5 @@ FAMILIES = {
     ),
     "of functions": polynomials(["sin(3*position)", "velocity[-1]"], 3),
 }
-FAMILIES["all"] = concatenate(*FAMILIES.values())
+FAMILIES["all"] = tuple(text for functions in FAMILIES.values() for text in functions)
 INPUT_FUNCTIONS = ("position*voltage", "(velocity[-1])*voltage")

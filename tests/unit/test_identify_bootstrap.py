@@ -10,8 +10,7 @@ import pytest
 from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import KoopmanMatrices, ModelSamples, bootstrap, bootstrap_edmd, edmd, episode_weights
-from kros.identify.refine.episodes import segment_owners
-from kros.identify.refine.segments import read_segments
+from kros.identify.refine.segments import read_segments, segment_owners
 
 
 def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:

@@ -8,8 +8,7 @@ import pytest
 from kros.core import ConfigError, DataError, DimensionError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import Factor
-from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.marquardt import minimise
+from kros.identify.refine import GaussNewton, RefineOptions, refine_population
 from kros.identify.refine.segments import Segments, held_segments, read_segments
 from kros.lifting import Lifting
 
@@ -76,7 +75,7 @@ def test_unit_without_training_episodes_is_named() -> None:
 def test_factors_of_another_size_are_refused() -> None:
     made, keys = population([50, 50])
     wrong = Factor(np.zeros((1, 4, 4)), np.ones((1, 2)), np.array([98]))
-    with pytest.raises(DimensionError, match="lifted_factor"):
+    with pytest.raises(DimensionError, match="episode_factors"):
         refine_population(made, keys, Lifting(("x",)), {}, wrong)
 
 
@@ -89,6 +88,7 @@ def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:
         J = np.stack([np.ones(2), rest], axis=1)
         return J[:, :, None] * J[:, None, :]
 
-    solution = minimise(evaluate, lambda V: V[:, 0, 0] <= 2.0, np.zeros((2, 1, 1)), 60, 1e-12)
+    search = GaussNewton(iterations=60, least_gain=1e-12)
+    solution = search.minimise(evaluate, lambda V: V[:, 0, 0] <= 2.0, np.zeros((2, 1, 1)))
     assert solution.V[0, 0, 0] == pytest.approx(1.0, abs=1e-6)
     assert 1.5 < solution.V[1, 0, 0] <= 2.0

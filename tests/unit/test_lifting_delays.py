@@ -6,9 +6,8 @@ import pytest
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
 from kros.core.lti import StateSpace
 from kros.data import Channel, EpisodeBatch, Role, from_arrays
-from kros.identify import combine, edmd, free_run, lifted_factor, reduce_episode
-from kros.identify.excitation import require_excitation, require_independent
-from kros.identify.factors import Factor
+from kros.identify import combine, edmd, free_run
+from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation, require_independent
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
 from kros.synthesis import Injection

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError
-from kros.lifting import Lifting, concatenate, delays, fourier_features, harmonics, kmeans_centres, polynomials, radial
-from kros.lifting.families import number
-from kros.lifting.tables import family
+from kros.lifting import Lifting, delays, fourier_features, harmonics, kmeans_centres, polynomials, radial
+from kros.lifting.families import family, number
 
 STATES = ("position", "velocity", "current")
 RNG = np.random.default_rng(0)
@@ -119,7 +118,7 @@ def test_delays():
         (lambda: delays(["a"], 1001), "too deep"),
         (lambda: delays(["sin(a)"], 1), "only states and inputs have earlier values"),
         (lambda: kmeans_centres(np.zeros((50, 2)), 2, 0), "different samples, found 1"),
-        (lambda: concatenate(polynomials(["a"], 2), ("a**2",)), r"'a\*\*2' appears more than once"),
+        (lambda: Lifting(("a",), (*polynomials(["a"], 2), "a**2")), "functions repeat one of them"),
         (lambda: family({"kind": "wavelets"}), "known are harmonics"),
         (lambda: family({"kind": "delays", "names": ["a"], "depths": 2}), "unknown key 'depths', 'depth' is missing"),
         (

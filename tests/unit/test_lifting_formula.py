@@ -92,5 +92,5 @@ def test_bad_liftings_are_refused():
         Lifting(("position",), ("position**2", "position**2"))
     with pytest.raises(DimensionError, match="parameter values for"):
         Lifting(("position",), ("sin(position + phase)",), ("phase",)).lift(np.zeros((2, 1)))
-    with pytest.raises(DimensionError, match="expected 1 states"):
+    with pytest.raises(DimensionError, match="expected 1 entries"):
         Lifting(("position",)).lift(np.zeros((2, 3)))

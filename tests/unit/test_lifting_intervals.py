@@ -12,6 +12,7 @@ from kros.core.errors import ConfigError
 from kros.lifting import Lifting
 from kros.lifting.formula import Formula
 from kros.lifting.intervals import bounds_of
+from kros.lifting.program import Program
 
 INF = np.inf
 
@@ -70,6 +71,13 @@ def test_pieces_tighten_what_appears_twice():
     assert 0.25 <= high < 0.2505
 
 
+def test_what_underflows_is_not_bounded_away_from_zero():
+    assert bounds("-1/x**2", x=1.4e-254)[0] == -INF
+    low, high = bounds("x*y", x=1e-200, y=1e-200)
+    assert low == 0 < high
+    assert bounds("exp(x)", x=-1000.0)[1] > 0
+
+
 def test_jumps_and_roots_have_no_bound():
     lifting = Lifting(("x",), ("sign(x)", "sqrt(x)", "abs(x)", "1/x"))
     lower, upper = lifting.slope_bounds({"x": (-1, 1)})
@@ -109,22 +117,20 @@ def test_no_sample_escapes(text, middle, half):
     """Where a function is not a real number there is nothing to hold."""
     try:
         formula = Formula(text, ("x", "y", "q"))
-        _ = formula.expression, formula.evaluator
+        Program.of([formula.expression])
     except ConfigError:
         return
     box = {name: (m - h, m + h) for name, m, h in zip("xyq", middle, half, strict=True)}
     rng = np.random.default_rng(0)
     values = {name: np.concatenate([rng.uniform(low, high, 300), [low, high]]) for name, (low, high) in box.items()}
     derivatives = [formula.derivative(name) for name in "xyq"]
-    from kros.lifting.evaluation import compile_expression
-
     for expression in [formula.expression, *derivatives]:
         try:
-            evaluator = compile_expression(expression)
+            program = Program.of([expression])
         except ConfigError:
             continue
         with np.errstate(all="ignore"):
-            found = np.asarray(evaluator(values), dtype=float)
+            found = np.asarray(program.run(values)[0], dtype=float)
         lower, upper = bounds_of([expression], box)
         found = found[~np.isnan(found)]
         slack = 1e-9 * np.maximum(

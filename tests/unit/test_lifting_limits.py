@@ -6,8 +6,8 @@ import pytest
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
 from kros.lifting import Lifting, fourier_features, polynomials
+from kros.lifting.families import check_family
 from kros.lifting.formula import Formula
-from kros.lifting.tables import check_family
 from kros.observer import Observer, ReliftStatus, relift_certificate
 from kros.synthesis import Injection
 

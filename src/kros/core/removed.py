@@ -142,6 +142,22 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "key injection.",
         "synthesis.injection",
     ),
+    (
+        "Parts of the phase calibration are no longer public; kros.identify calibrates, and its result has the calibration.",
+        "kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase",
+    ),
+    (
+        "Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.",
+        "kros.identify.lifted_factor kros.identify.reduce_episode",
+    ),
+    (
+        "Refined models have no class apart from others; refine_population returns their matrices and a Refinement.",
+        "kros.identify.refine.RefinedModels",
+    ),
+    (
+        "Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).",
+        "kros.lifting.concatenate",
+    ),
 )
 
 

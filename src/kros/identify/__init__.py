@@ -1,4 +1,4 @@
-"""Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify` of this package.
+"""Identification: from recordings to models of every unit. ``kros.identify(population)`` calls the verb `identify`.
 
 Python binds a package's name to the package, so the package itself is made callable.
 
@@ -15,9 +15,9 @@ from types import ModuleType
 
 from ..core.removed import refusing
 from .bootstrap import ModelSamples, bootstrap_edmd, episode_weights
-from .calibration import PhaseCalibration, PhaseSpec, find_segments, resolve_branches, unit_phase
+from .calibration import PhaseCalibration, PhaseSpec
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
-from .factors import Factor, combine, episode_factors, lifted_factor, reduce_episode
+from .factors import Factor, combine, episode_factors
 from .free_run import free_run
 from .identified import IdentifiedModels
 from .identify import identify
@@ -36,14 +36,9 @@ __all__ = [
     "edmd",
     "episode_factors",
     "episode_weights",
-    "find_segments",
     "free_run",
     "identify",
-    "lifted_factor",
-    "reduce_episode",
-    "resolve_branches",
     "smallest_stabilising_alpha",
-    "unit_phase",
 ]
 
 

@@ -3,12 +3,14 @@
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
     per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
 
-Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn with replacement and
-each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the variance, too little with few episodes
-(Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat. Assoc. 83, 1988).
+Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn
+with replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of
+the variance, too little with few episodes (Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat.
+Assoc. 83, 1988).
 
-What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated parameters stay as they are,
-and so does a bias that all episodes share (regularisation, least squares on noisy or closed-loop recordings): no resampling sees it.
+What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated
+parameters stay as they are, and so does a bias that all episodes share (regularisation, least squares on noisy or
+closed-loop recordings): no resampling sees it.
 
 Symbols
 -------
@@ -32,7 +34,6 @@ from .edmd import KoopmanMatrices, edmd
 
 Array = npt.NDArray[np.float64]
 _AT_ONCE = 16_000_000  # numbers in memory
-_LEAST_INFORMATION = 1e-13  # relative eigenvalue of scaled normal equations below which a direction is unknown
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,8 +48,8 @@ class ModelSamples:
     samples : KoopmanMatrices
         A (unit, draw, n, n) and B (unit, draw, n, m).
     linear : bool
-        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a response or an
-        eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
+        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a
+        response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
 
     Examples
     --------
@@ -56,19 +57,14 @@ class ModelSamples:
     >>> from kros.identify import KoopmanMatrices, ModelSamples
     >>> estimate = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
     >>> draws = KoopmanMatrices(np.array([0.89, 0.9, 0.91]).reshape(1, 3, 1, 1), np.ones((1, 3, 1, 1)))
-    >>> ModelSamples(("a",), estimate, draws).n_draws
-    3
+    >>> ModelSamples(("a",), estimate, draws).standard_error().A.round(3).item()
+    0.01
     """
 
     unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices
     samples: KoopmanMatrices
     linear: bool = False
-
-    @property
-    def n_draws(self) -> int:
-        """Number of samples of every unit."""
-        return self.samples.A.shape[1]
 
     def standard_error(self) -> KoopmanMatrices:
         """Return the standard deviation of every entry of A and B over the samples."""
@@ -120,8 +116,8 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     counts = [int(e) for e in n_episodes]
     if not counts or min(counts) < 2 or draws < 2:
         raise DataError(
-            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {min(counts, default=0)} episodes of unit "
-            f"number {int(np.argmin(counts)) if counts else 0} and {draws} draws; record more, or leave the unit out."
+            f"Resampling episodes: needs at least two episodes of every unit and two draws, found {counts} episodes of "
+            f"the units and {draws} draws; record more, or leave the unit out."
         )
     weights = np.zeros((len(counts), draws, max(counts)))
     for row, E in enumerate(counts):
@@ -170,10 +166,7 @@ def bootstrap_edmd(
     (2, 20, 3, 3)
     """
     units, episodes, width, _ = R.shape
-    if weights.shape[0] != units or weights.shape[2] != episodes:
-        raise DimensionError(
-            f"Bootstrap: factors {R.shape} need weights of shape ({units}, draws, {episodes}), found {weights.shape}."
-        )
+    _require_shape("weights", weights, (units, weights.shape[1], episodes))
     p, draws = width - n_lifted, weights.shape[1]
     W = np.empty((units, draws, n_lifted, p))
     for row in range(units):
@@ -182,22 +175,19 @@ def bootstrap_edmd(
             model = edmd(qr_triangle(stacked), n_lifted, alpha)
             W[row, part] = np.concatenate([model.A, model.B], axis=-1)
     whole = edmd(qr_triangle(R.reshape(units, episodes * width, width)), n_lifted, alpha)
-    return ModelSamples(_named(unit_ids, units), whole, KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:]))
+    ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
+    return ModelSamples(ids, whole, KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:]))
 
 
 def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
     """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P)."""
     units, episodes, P = normal.shape[0], normal.shape[1], normal.shape[-1] - 1
-    if information.shape != (units, P, P) or weights.shape[0] != units or weights.shape[2] != episodes:
-        raise DimensionError(
-            f"One-step bootstrap: normal equations {normal.shape} need information of shape ({units}, {P}, {P}) and weights of shape "
-            f"({units}, draws, {episodes}), found {information.shape} and {weights.shape}."
-        )
-    draws = weights.shape[1]
-    deviations = np.empty((units, draws, P))
+    _require_shape("information", information, (units, P, P))
+    _require_shape("weights", weights, (units, weights.shape[1], episodes))
+    deviations = np.empty((units, weights.shape[1], P))
     for row in range(units):
         size = np.sqrt(np.maximum(np.diagonal(information[row]), np.finfo(float).tiny))
-        for part in _parts(draws, 4 * P * P):
+        for part in _parts(weights.shape[1], 4 * P * P):
             change = np.tensordot(weights[row, part] - 1, normal[row, :, :-1], axes=1)  # (draw, P, P + 1)
             H = (information[row] + change[..., :-1]) / (size[:, None] * size)
             deviations[row, part] = _solve(H, change[..., -1] / size) / size
@@ -205,29 +195,24 @@ def one_step_deviations(normal: Array, information: Array, weights: Array) -> Ar
 
 
 def bootstrap_refined(
-    units: KoopmanMatrices,
-    whitening: Array,
-    information: Array,
-    normal: Array,
-    weights: Array,
-    unit_ids: Sequence[str] | None = None,
+    units: KoopmanMatrices, whitening: Array, information: Array, normal: Array, weights: Array, unit_ids: Sequence[str]
 ) -> ModelSamples:
-    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones, `linear`; normal (unit, episode, P + 1, P + 1).
+    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones, `linear`.
 
-    The prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits of three simulated drives,
-    first-order bands were right to about 20 percent, bands of the steps' own responses 2.6 to 12 times too wide.
+    The prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
+    of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses 2.6
+    to 12 times too wide.
     """
     n, p = units.A.shape[-1], len(whitening)
-    dV = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p)
-    dW = dV @ whitening.T
+    dW = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p) @ whitening.T
     samples = KoopmanMatrices(units.A[:, None] + dW[..., :n], units.B[:, None] + dW[..., n:])
-    return ModelSamples(_named(unit_ids, len(units.A)), units, samples, linear=True)
+    return ModelSamples(tuple(unit_ids), units, samples, linear=True)
 
 
 def _solve(H: Array, g: Array) -> Array:
-    """Symmetric least squares of scaled normal equations, batched."""
+    """Solve scaled normal equations, batched; directions that rounding alone determines do not move."""
     values, vectors = np.linalg.eigh((H + np.swapaxes(H, -1, -2)) / 2)
-    known = values > _LEAST_INFORMATION * np.maximum(values[..., -1:], np.finfo(float).tiny)
+    known = values > 450 * np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
     along = np.einsum("...ji,...j->...i", vectors, g)
     along = np.divide(along, values, out=np.zeros_like(along), where=known)
     return np.asarray(np.einsum("...ij,...j->...i", vectors, along))
@@ -239,8 +224,8 @@ def _parts(count: int, size: int) -> Iterator[slice]:
     return (slice(start, start + step) for start in range(0, count, step))
 
 
-def _named(unit_ids: Sequence[str] | None, units: int) -> tuple[str, ...]:
-    ids = tuple(str(row) for row in range(units)) if unit_ids is None else tuple(unit_ids)
-    if len(ids) != units:
-        raise DimensionError(f"Bootstrap: {units} units need as many names, found {len(ids)}.")
-    return ids
+def _require_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
+    if values.shape != shape:
+        raise DimensionError(
+            f"Bootstrap: needs {name} of shape {shape}, found {values.shape}; pass those of the same units."
+        )

@@ -20,26 +20,30 @@ Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 def calibrate(
     population: Population, facts: RecordingFacts, spec: PhaseSpec, work: Work | None = None
 ) -> PhaseCalibration:
-    """Calibrate all units on training episodes; a unit that cannot be calibrated is left out, with its reason in the log."""
+    """Calibrate all units on training episodes; one that cannot be calibrated is left out, its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
+    recalled = (work or Work()).recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], (Segment,))
     units: dict[str, UnitPhase] = {}
-    marks = [
-        None if (known := facts.marks(keys)) is None else mark_of(own.columns, own.sample_period_s, spec, keys, known)
-        for own, keys, _ in tasks
-    ]
-    found = (work or Work()).recall("calibrate", segments_of, tasks, marks, (Segment,))
-    for unit, segments in zip(facts.groups, found, strict=True):
+    for unit, segments in zip(facts.groups, recalled, strict=True):
         try:
-            units[unit] = unit_phase(segments, unit)
+            units[unit] = unit_phase(segments, unit, spec)
         except IdentificationError as error:
             log.warning("%s", error)
     pooled = [u for u in facts.pooled if u in units]
     if len(pooled) < (2 if len(facts.pooled) > 1 else 1):
         raise IdentificationError(
-            f"Calibration: {len(pooled)} of {len(facts.pooled)} units could be calibrated, too few for a population; check [calibrate] against the recordings "
-            f"(angle {spec.angle!r}, ratio {spec.ratio:g}, error {spec.reference!r} - {spec.measured!r})."
+            f"Calibration: {len(pooled)} of {len(facts.pooled)} units could be calibrated, too few for a population; "
+            f"check [calibrate] against the recordings (angle {spec.angle!r}, ratio {spec.ratio:g}, error "
+            f"{spec.reference!r} - {spec.measured!r})."
         )
     return resolve_branches(units, pooled, spec)
+
+
+def _mark(facts: RecordingFacts, task: Task) -> str | None:
+    """Return what the segments of a task follow from."""
+    population, keys, spec = task
+    samples = facts.marks(keys)
+    return None if samples is None else mark_of(population.columns, population.sample_period_s, spec, keys, samples)
 
 
 def segments_of(task: Task) -> list[Segment]:
@@ -56,6 +60,6 @@ def segments_of(task: Task) -> list[Segment]:
 
 
 def calibration_keys(facts: RecordingFacts, unit: str) -> tuple[EpisodeKey, ...]:
-    """Return the training episodes that a unit is calibrated on: those of `identify_on`, or of the first condition it has."""
-    own = facts.keys("train", unit)
-    return facts.keys("train", unit, facts.identify_on) or tuple(k for k in own if k.condition == own[0].condition)
+    """Return the episodes that a unit is calibrated on: those of `identify_on`, or of the first condition it has."""
+    every = facts.keys("train", unit)
+    return facts.keys("train", unit, facts.identify_on) or tuple(k for k in every if k.condition == every[0].condition)

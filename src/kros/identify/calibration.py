@@ -1,16 +1,17 @@
 """Phase calibration of a periodic disturbance that is fixed to an angle (Appendix B, (40)-(41)).
 
-A disturbance ``sin(r*theta + phi)`` reaches the tracking error through a loop with a lag ``eta`` that depends on speed. In steady
-motion the error's phase against the angle is ``phi + eta`` forward and ``phi - eta`` in reverse, so the mean over both directions
-that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is averaged by itself:
+A disturbance ``sin(r*theta + phi)`` reaches the tracking error through a loop with a lag ``eta`` that depends on speed.
+In steady motion the error's phase against the angle is ``phi + eta`` forward and ``phi - eta`` in reverse, so the mean
+over both directions that the paper takes cancels to noise where ``eta`` is near 90 degrees. Here each direction is
+averaged by itself:
 
-    phi = (psi_forward + psi_reverse) / 2  (modulo pi),      eta = (psi_forward - psi_reverse) / 2  (modulo pi, the same branch)
+    phi = (psi_forward + psi_reverse) / 2,      eta = (psi_forward - psi_reverse) / 2      (modulo pi, one branch)
 
 and the branch is chosen for the whole population at once, so that every unit's lag lies near the population's mean lag.
 
 Symbols
 -------
-e     : tracking error, reference - measured; where the reference is constant its periodic part is that of -measured, in any unit
+e     : tracking error, reference - measured; its periodic part at constant reference is that of -measured
 theta : angle, rad;  r : ratio of the disturbance to the angle
 psi_i : phase of the error in segment i, ``atan2(<e, cos r theta>, <e, sin r theta>)``, the closed form of (40)
 """
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +33,10 @@ from ..core.loading import loader
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 
-_STEADY = 20.0  # a reference velocity that would take longer than one part in so many of the episode to reach its maximum is constant
-_SPEED_TOLERANCE = 0.02  # segments within 2 % of each other's speed share a lag
-_LOW_CONCENTRATION = 0.8
-
 
 @dataclass(frozen=True)
 class PhaseSpec:
-    """What to calibrate: the disturbance ``sin(ratio * angle + parameter)`` seen in ``reference - measured``.
+    """What to calibrate: the disturbance ``sin(ratio * angle + parameter)`` seen in ``reference - measured``, and how.
 
     Examples
     --------
@@ -49,11 +46,21 @@ class PhaseSpec:
     """
 
     angle: str = "position"
-    ratio: float = 100.0
-    reference: str = "target_velocity"
-    measured: str = "velocity"
-    parameter: str = "phase"
-    settle: float = 0.005  # share of an episode that is left out at the start of a segment
+    ratio: float = 100.0  # periods a radian
+    reference: str = "target_velocity"  # commanded speed
+    measured: str = "velocity"  # speed that follows it
+    parameter: str = "phase"  # its name in formulas
+    settle: float = 0.005  # share of an episode left out at the start of a segment, in which the loop settles
+    steady: float = (
+        20.0  # constant speed would take longer than one part in so many of the episode to reach its maximum
+    )
+    least_speed: float = 0.1  # of the largest commanded one, below which friction hides the disturbance
+    least_periods: float = 5.0  # of the disturbance in a segment
+    least_samples: float = 4.0  # in a period
+    speed_tolerance: float = 0.02  # share within which segments have one speed, and one lag
+    least_concentration: float = (
+        0.8  # mean resultant length below which the log warns of segments or lags that disagree
+    )
 
 
 @dataclass(frozen=True)
@@ -82,10 +89,8 @@ class UnitPhase:
 
     def on_branch_of(self, lag_rad: float) -> UnitPhase:
         """Return the same calibration with the lag within 90 degrees of `lag_rad`."""
-        turns = np.round((self.lag_rad - lag_rad) / np.pi)
-        return UnitPhase(
-            wrap(self.phase_rad - turns * np.pi), self.lag_rad - turns * np.pi, self.concentration, self.n_segments
-        )
+        turn = np.pi * np.round((self.lag_rad - lag_rad) / np.pi)
+        return replace(self, phase_rad=wrap(self.phase_rad - turn), lag_rad=self.lag_rad - turn)
 
 
 @dataclass(frozen=True)
@@ -97,9 +102,10 @@ class PhaseCalibration:
     Examples
     --------
     >>> import kros
-    >>> drives = kros.plants.HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=8.0, seed=3, conditions=("noload",)).simulate()
-    >>> calibration = kros.identify(drives.population, refine=False).calibration
-    >>> sorted(calibration.units) == list(drives.population.unit_ids), -3.2 < calibration.lag_rad < 0
+    >>> plant = kros.plants.HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=8.0, seed=3)
+    >>> drives = plant.simulate().population
+    >>> calibration = kros.identify(drives, refine=False).calibration
+    >>> sorted(calibration.units) == list(drives.unit_ids), -3.2 < calibration.lag_rad < 0
     (True, True)
     """
 
@@ -116,13 +122,12 @@ class PhaseCalibration:
     def load(cls, folder: Path) -> PhaseCalibration:
         """Read what `save` wrote."""
         content, _ = load_artifact(folder, "calibration")
-        return cls(
-            PhaseSpec(**content["spec"]), content["lag_rad"], {k: UnitPhase(**v) for k, v in content["units"].items()}
-        )
+        units = {unit: UnitPhase(**phase) for unit, phase in content["units"].items()}
+        return cls(PhaseSpec(**content["spec"]), content["lag_rad"], units)
 
     def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
         """Calibrate a new unit on the population's branch."""
-        return unit_phase(segments, unit).on_branch_of(self.lag_rad)
+        return unit_phase(segments, unit, self.spec).on_branch_of(self.lag_rad)
 
 
 def wrap(angle: float) -> float:
@@ -133,91 +138,52 @@ def wrap(angle: float) -> float:
 def find_segments(angle: Array, reference: Array, measured: Array, dt: float, spec: PhaseSpec) -> list[Segment]:
     """Find the constant-velocity segments of an episode and the phase of the error in each.
 
-    Parameters
-    ----------
-    angle, reference, measured : ndarray, shape (n_samples,)
-        In any units of measure; the speed of a segment is that of the angle. NaN where a sample is missing, which ends a segment.
-    dt : float, s
-    spec : PhaseSpec
-
-    Returns
-    -------
-    list of Segment
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import PhaseSpec, find_segments
-    >>> angle = 0.5 * 0.001 * np.arange(4000)  # rad, at 0.5 rad/s
-    >>> error = np.sin(100 * angle + 1.2)
-    >>> (segment,) = find_segments(angle, np.full(4000, 0.5), 0.5 - error, 0.001, PhaseSpec(reference="target", measured="velocity"))
-    >>> segment.speed, round(segment.phase, 2)
-    (0.5, 1.2)
+    Signals (n_samples,) are in any units of measure; the speed of a segment is that of the angle. NaN, a missing
+    sample, ends a segment.
     """
     there = np.isfinite(angle) & np.isfinite(reference) & np.isfinite(measured)
     angle, reference, measured = (np.where(there, signal, 0.0) for signal in (angle, reference, measured))
     top = np.max(np.abs(reference))
     if top == 0:
         return []
-    steady = (np.abs(np.diff(reference, prepend=reference[:1])) < _STEADY * top / len(reference)) & (
-        np.abs(reference) > 0.1 * top
-    )
+    constant = np.abs(np.diff(reference, prepend=reference[:1])) < spec.steady * top / len(reference)
+    steady = constant & (np.abs(reference) > spec.least_speed * top)
     per_reference = _speed_per_reference(angle, reference, steady, dt)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], steady, [False]]).astype(np.int8)))
     segments = []
     for start, stop in zip(edges[::2] + round(spec.settle * len(reference)), edges[1::2], strict=True):
         speed = per_reference * float(np.mean(reference[start:stop])) if stop > start else 0.0
         period = 2 * np.pi / (spec.ratio * abs(speed) * dt) if speed else np.inf
-        if stop - start >= 5 * period and period > 4:
+        if stop - start >= spec.least_periods * period and period > spec.least_samples:
             phase, amplitude = _error_phase(spec.ratio * angle[start:stop], -measured[start:stop])
             segments.append(Segment(speed, phase, amplitude, int(stop - start)))
     return segments
 
 
 def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
-    """Speed of the angle over the reference, which follows from their units of measure: one where these match; zero where nothing moves."""
+    """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
-    wanted = reference[:-1][moving] / max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
-    power = float(wanted @ wanted)
-    return float(wanted @ np.diff(angle)[moving]) / (power * dt * float(np.max(np.abs(reference)))) if power else 0.0
+    top = max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
+    speed = reference[:-1][moving] / top
+    power = float(speed @ speed)
+    return float(speed @ np.diff(angle)[moving]) / (power * dt * top) if power else 0.0
 
 
 def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
-    """Phase and amplitude of the error at the disturbance's frequency; drift and second harmonic are fitted beside it."""
+    """Phase and amplitude of the error at the disturbance's frequency, fitted with drift and second harmonic."""
     ramp = np.linspace(-1, 1, turn.size)
-    columns = np.stack(
-        [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2], axis=1
-    )
-    along_sin, along_cos = np.linalg.lstsq(columns, error, rcond=None)[0][:2]
+    columns = [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2]
+    along_sin, along_cos = np.linalg.lstsq(np.stack(columns, axis=1), error, rcond=None)[0][:2]
     return float(np.arctan2(along_cos, along_sin)), float(np.hypot(along_cos, along_sin))
 
 
-def unit_phase(segments: Sequence[Segment], unit: str) -> UnitPhase:
-    """Combine a unit's segments, each direction by itself and each speed by itself.
-
-    Raises
-    ------
-    IdentificationError
-        When no speed occurs in both directions.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import PhaseSpec, find_segments, unit_phase
-    >>> segments = []
-    >>> for speed in (0.5, -0.5):  # a lag of -0.4 rad shows with the direction's sign
-    ...     angle = speed * 0.001 * np.arange(4000)
-    ...     error = np.sin(100 * angle + 1.2 - 0.4 * np.sign(speed))
-    ...     segments += find_segments(angle, np.full(4000, speed), speed - error, 0.001, PhaseSpec())
-    >>> found = unit_phase(segments, "a")
-    >>> round(found.phase_rad, 2), round(found.lag_rad, 2)
-    (1.2, -0.4)
-    """
+def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitPhase:
+    """Combine a unit's segments, each direction and speed by itself; needs a speed in both directions."""
     phases, lags, weights, concentrations = [], [], [], []
     remaining = sorted(segments, key=lambda s: -abs(s.speed))
     while remaining:
         speed = abs(remaining[0].speed)
-        group = [s for s in remaining if abs(s.speed) > (1 - _SPEED_TOLERANCE) * speed]
+        group = [s for s in remaining if abs(s.speed) > (1 - spec.speed_tolerance) * speed]
         remaining = remaining[len(group) :]
         forward, reverse = ([s for s in group if s.forward is ahead] for ahead in (True, False))
         if forward and reverse:
@@ -229,14 +195,14 @@ def unit_phase(segments: Sequence[Segment], unit: str) -> UnitPhase:
     if not phases:
         directions = {"forward": sum(s.forward for s in segments), "reverse": sum(not s.forward for s in segments)}
         raise IdentificationError(
-            f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, found {directions}; "
-            "record such motion, or lift with sine and cosine and no phase parameter."
+            f"Phase calibration of unit {unit}: needs constant-velocity segments of equal speed in both directions, "
+            f"found {directions}; record such motion, or lift with sine and cosine and no phase parameter."
         )
     best = int(np.argmax(weights))
-    # Phases of the other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
+    # Phases of other speeds are put on the best speed's branch before averaging; their lags differ and are not mixed.
     aligned = [p + np.pi * np.round((phases[best] - p) / np.pi) for p in phases]
     concentration = float(np.average(concentrations, weights=weights))
-    if concentration < _LOW_CONCENTRATION:
+    if concentration < spec.least_concentration:
         log.warning("phase calibration of unit %s: its segments agree poorly, concentration %.2f", unit, concentration)
     return UnitPhase(wrap(float(np.average(aligned, weights=weights))), float(lags[best]), concentration, len(segments))
 
@@ -249,31 +215,16 @@ def _circular_mean(segments: Sequence[Segment]) -> tuple[float, float]:
 def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec: PhaseSpec) -> PhaseCalibration:
     """Choose the branch of the half sum for the whole population.
 
-    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to the branch
-    whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean lag in [-pi, 0).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import PhaseSpec, find_segments, resolve_branches, unit_phase
-    >>> units = {}
-    >>> for unit, phase in (("a", 1.2), ("b", -0.3)):
-    ...     segments = []
-    ...     for speed in (0.5, -0.5):
-    ...         angle = speed * 0.001 * np.arange(4000)
-    ...         error = np.sin(100 * angle + phase - 0.4 * np.sign(speed))
-    ...         segments += find_segments(angle, np.full(4000, speed), speed - error, 0.001, PhaseSpec())
-    ...     units[unit] = unit_phase(segments, unit)
-    >>> calibration = resolve_branches(units, ["a", "b"], PhaseSpec())
-    >>> {unit: round(found.phase_rad, 2) for unit, found in calibration.units.items()}
-    {'a': 1.2, 'b': 5.98}
+    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to
+    the branch whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean
+    lag in [-pi, 0).
     """
     doubled = np.mean([np.exp(2j * units[u].lag_rad) for u in pooled])
     lag = float(np.angle(doubled)) / 2
     lag = lag - np.pi if lag >= 0 else lag
-    if np.abs(doubled) < _LOW_CONCENTRATION:
-        log.warning(
-            "phase calibration: lags differ so much between units (resultant %.2f) that some may be on the wrong branch",
-            np.abs(doubled),
+    if np.abs(doubled) < spec.least_concentration:
+        problem = (
+            f"lags differ so much between units (resultant {np.abs(doubled):.2f}) that some may be on the wrong branch"
         )
+        log.warning("phase calibration: %s", problem)
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})

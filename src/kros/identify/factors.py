@@ -1,9 +1,9 @@
 """Triangular factors: each episode is reduced once, all least squares after that is algebra on small matrices.
 
-The factor of an episode is R of the QR decomposition of ``[x g u v | x+ g+]``: states, parameter-free lifted functions, inputs and
-parameter-free input functions at k, states and functions at k + 1. With delays the first k is the lifting's history. Factors of several
-episodes combine by stacking and another QR (TSQR), so memory does not grow with the recording and the condition number is never
-squared, as it is in (32)-(33).
+The factor of an episode is R of the QR decomposition of ``[x g u v | x+ g+]``: states, parameter-free lifted functions,
+inputs and parameter-free input functions at k, states and functions at k + 1. With delays the first k is the lifting's
+history. Factors of several episodes combine by stacking and another QR (TSQR), so memory does not grow with the
+recording and the condition number is never squared, as it is in (32)-(33).
 
 Symbols
 -------
@@ -14,17 +14,20 @@ R    : upper triangular factor, (n_columns, n_columns)
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError
+from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
+from .edmd import relative_pivots
 
+log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 
@@ -45,12 +48,11 @@ class Factor:
     Examples
     --------
     >>> import numpy as np
-    >>> from kros.identify import reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
-    >>> factor = reduce_episode(x, u, Lifting(("x",)))
-    >>> factor.R.shape, int(factor.n_samples)
-    ((3, 3), 49)
+    >>> from kros.identify import Factor, combine
+    >>> rows = np.random.default_rng(0).normal(size=(3, 49, 2))  # three episodes of [x, u]
+    >>> parts = Factor(np.linalg.qr(rows, mode="r"), np.abs(rows).max(axis=1), np.full(3, 49))
+    >>> combine(parts).R.shape, int(combine(parts).n_samples)
+    ((2, 2), 147)
     """
 
     R: Array
@@ -67,34 +69,7 @@ class Factor:
 
 
 def reduce_episode(x: Array, u: Array, lifting: Lifting) -> Factor:
-    """Reduce one episode to its factor.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n_samples, n)
-    u : ndarray, shape (n_samples, m)
-    lifting : Lifting
-
-    Returns
-    -------
-    Factor
-
-    Raises
-    ------
-    DataError
-        When the episode is too short for the lifting's history and one step.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import edmd, reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> u, x = np.random.default_rng(0).normal(size=(50, 1)), np.zeros((50, 1))
-    >>> for k in range(49):
-    ...     x[k + 1] = 0.9 * x[k] + 0.1 * u[k]
-    >>> edmd(reduce_episode(x, u, Lifting(("x",))).R, n_lifted=1).A.round(6).tolist()
-    [[0.9]]
-    """
+    """Reduce one episode to its factor: states x (n_samples, n) and inputs u (n_samples, m)."""
     lifting.window.require(len(x), beyond=1)
     window = lifting.windows(x, u)
     x, u = x[lifting.history :], u[lifting.history :]
@@ -123,13 +98,13 @@ def combine(factors: Factor) -> Factor:
 
     Examples
     --------
-    >>> import numpy as np
-    >>> from kros.identify import Factor, combine, reduce_episode
+    >>> import kros
+    >>> from kros.identify import combine, episode_factors
     >>> from kros.lifting import Lifting
-    >>> rng = np.random.default_rng(0)
-    >>> parts = [reduce_episode(rng.normal(size=(50, 1)), rng.normal(size=(50, 1)), Lifting(("x",))) for _ in range(3)]
-    >>> int(combine(Factor.stack(parts)).n_samples)
-    147
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
+    >>> combine(episode_factors(motors, keys, Lifting(motors.states))).R.shape[0]
+    2
     """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
@@ -144,7 +119,7 @@ def episode_factors(
     lifting: Lifting,
     parameters: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Factor:
-    """Return factors of [Psi | Theta_plus] of every episode by itself, for leaving episodes out and for drawing them again.
+    """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
 
     Parameters
     ----------
@@ -178,42 +153,18 @@ def episode_factors(
     most = max((len(episodes) for episodes in keys.values()), default=0)
     if most == 0:
         raise DataError(
-            f"Factors by episode: {len(keys)} units without an episode among them; pass keys as population.keys(unit) gives them."
+            f"Factors by episode: {len(keys)} units without an episode; pass keys as population.keys(unit) gives them."
         )
     rows = [[reduce_episode(*population.read_parts(key), lifting) for key in episodes] for episodes in keys.values()]
+    values = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
     first = next(f for row in rows for f in row)
     none = Factor(np.zeros_like(first.R), np.zeros_like(first.peak), np.zeros_like(first.n_samples))
-    own = {name: np.asarray((parameters or {})[name], dtype=float)[:, None] for name in lifting.parameters}
-    stacked = Factor.stack(
-        [Factor.stack([replace(f, input_range=None) for f in row] + [none] * (most - len(row))) for row in rows]
-    )
-    return lifted_factor(stacked, lifting, own, lifting)
+    padded = [[replace(f, input_range=None) for f in row] + [none] * (most - len(row)) for row in rows]
+    return lifted_factor(Factor.stack([Factor.stack(row) for row in padded]), lifting, values, lifting)
 
 
 def lifted_factor(factor: Factor, lifting: Lifting, parameters: dict[str, Array], model: Lifting) -> Factor:
-    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's own lifting.
-
-    Parameters
-    ----------
-    factor : Factor
-        Batch over units.
-    lifting : Lifting
-        The lifting that the factors were reduced with.
-    parameters : dict of ndarray, shape (unit,)
-    model : Lifting
-        The model's lifting: that lifting itself, or the linear one with the same states.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import Factor, lifted_factor, reduce_episode
-    >>> from kros.lifting import Lifting
-    >>> gearbox = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
-    >>> x, u = np.random.default_rng(0).normal(size=(50, 1)), np.ones((50, 1))
-    >>> factor = Factor.stack([reduce_episode(x, u, gearbox)])  # holds sine and cosine, so that any phase is a linear map of it
-    >>> lifted_factor(factor, gearbox, {"phase": np.array([0.3])}, gearbox).R.shape
-    (1, 5, 5)
-    """
+    """Turn parameter-free factors into factors of ``[Psi | Theta_plus]`` for a model's lifting, or the linear one."""
     n, b, r = lifting.n_states, len(lifting.separation.basis), len(lifting.input_separation.basis)
     m = factor.R.shape[-1] - 2 * (n + b) - r
     batch = factor.R.shape[:-2]
@@ -244,11 +195,32 @@ def _peaks(M: Array, peak: Array) -> Array:
     return np.asarray(np.einsum("...ij,...j->...i", np.abs(M), peak))
 
 
-def dependent_column(R: Array, n_columns: int) -> tuple[int, int] | None:
-    """Return unit and column of the first of `n_columns` that depends on those before it, or None; R (unit, p, p)."""
-    part = R[..., :n_columns]
-    pivots = np.abs(np.diagonal(part, axis1=-2, axis2=-1)) / np.maximum(
-        np.linalg.norm(part, axis=-2), np.finfo(float).tiny
-    )
-    found = np.argwhere(pivots < n_columns * np.finfo(float).eps)
-    return (int(found[0, 0]), int(found[0, 1])) if len(found) else None
+def require_excitation(
+    factor: Factor, inputs: Sequence[str], units: Sequence[str], where: str, alpha: float = 0.0
+) -> None:
+    """Refuse inputs that are constant over all training episodes of a unit."""
+    if factor.input_range is None:
+        return
+    low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
+    still = high - low <= 450 * np.finfo(float).eps * np.maximum(np.abs(low), np.abs(high))
+    dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
+    for i, j in np.argwhere(still):
+        kind = "zero" if low[i, j] == 0 else "constant"
+        problem = f"unit {units[i]} ({where}): input {inputs[j]!r} is {kind} ({low[i, j]:g}) over all training episodes"
+        if not alpha or inputs[j] in dead:
+            zero = "declare it as another role or drop the channel"
+            remedy = zero if inputs[j] in dead else "excite it, drop the channel, or use alpha > 0"
+            raise IdentificationError(
+                f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
+            )
+        log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
+
+
+def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
+    """Refuse lifted data in which one column follows from those before it."""
+    pivots = relative_pivots(factor.R[..., : len(names)])
+    for unit, column in np.argwhere(pivots < len(names) * np.finfo(float).eps):
+        raise IdentificationError(
+            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
+            f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
+        )

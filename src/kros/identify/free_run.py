@@ -6,6 +6,7 @@ The definition is the *local error* of the paper's section III: the lifted state
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -37,7 +38,8 @@ def free_run(
     Returns
     -------
     ndarray, shape (batch, n_samples, n_states)
-        The state at sample k follows from inputs up to k - 1; the first ones are `x0`. A run that diverges holds infinities or NaN.
+        The state at sample k follows from inputs up to k - 1; the first ones are `x0`. A run that diverges holds
+        infinities or NaN.
 
     Raises
     ------
@@ -51,7 +53,8 @@ def free_run(
     >>> import numpy as np
     >>> from kros.identify import free_run
     >>> from kros.lifting import Lifting
-    >>> run = free_run(np.array([[0.5]]), np.array([[1.0]]), Lifting(("x",)), {}, np.array([[8.0]]), np.zeros((1, 4, 1)))
+    >>> A, B, u = np.array([[0.5]]), np.array([[1.0]]), np.zeros((1, 4, 1))
+    >>> run = free_run(A, B, Lifting(("x",)), {}, np.array([[8.0]]), u)
     >>> run.ravel().tolist()
     [8.0, 4.0, 2.0, 1.0]
     """
@@ -62,57 +65,47 @@ def free_run(
     if first.shape != (batch, h + 1, n) or A.shape[-1] != n_lifted or B.shape[-1] != width:
         past = f" with a history of {h} samples" if h else ""
         raise DimensionError(
-            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of {n} states to {n_lifted}"
-            f"{past} and {width} inputs."
+            f"Free run: inputs {u.shape}, first states {x0.shape}, A {A.shape} and B {B.shape} do not fit a lifting of "
+            f"{n} states to {n_lifted}{past} and {width} inputs."
         )
     lifting.window.require(n_samples)
-    if (loops := library()) is not None:
-        return _compiled(loops, A, B, lifting, parameters, first, u)
-    step = np.ascontiguousarray(
-        np.swapaxes(np.concatenate([A, B], axis=-1)[..., :n, :], -1, -2)
-    )  # (.., n_lifted + m, n)
-    psi = np.empty((batch, n_lifted + width))
-    states = np.empty((n_samples, batch, n))
-    states[: h + 1] = np.swapaxes(first, 0, 1)
-    inputs = np.ascontiguousarray(np.swapaxes(u, 0, 1))
-    psi[:, :n] = first[:, h]
-    lifted = psi[:, :n_lifted]
-    advance = _multiply_all if step.ndim == 2 else _multiply_each
+    rows, window = np.concatenate([A, B], axis=-1)[..., :n, :], lifting.windows(first, u[:, : h + 1])[:, 0].copy()
+    loops = library()
+    run = partial(_compiled, loops) if loops is not None else _in_numpy
+    return run(rows, window, lifting, parameters, first[:, :h], u)
+
+
+def _in_numpy(
+    rows: Array, window: Array, lifting: Lifting, parameters: Mapping[str, npt.ArrayLike], before: Array, u: Array
+) -> Array:
+    """The reference: ``x+ = [A B] psi(w)`` for the states alone, sample by sample."""
+    n, h = lifting.n_states, lifting.history
+    states = np.empty((*u.shape[:2], n))
+    states[:, :h] = before
     with np.errstate(over="ignore", invalid="ignore"):
-        if not (h or lifting.input_functions):
-            for k in range(n_samples):
-                states[k] = psi[:, :n]
-                lifting.lift_into(lifted, parameters)
-                psi[:, n_lifted:] = inputs[k]
-                psi[:, :n] = advance(psi, step)
-            return np.swapaxes(states, 0, 1)
-        earlier = lifting.windows(first, u[:, : h + 1])[:, 0, n:]
-        for k in range(h, n_samples):
-            states[k] = psi[:, :n]
-            window = np.concatenate([psi[:, :n], earlier], axis=-1)
-            lifting.lift_into(lifted, parameters, earlier)
-            psi[:, n_lifted:] = lifting.lift_inputs(inputs[k], window, parameters)
-            earlier = lifting.window.advance(window, inputs[k])
-            psi[:, :n] = advance(psi, step)
-    return np.swapaxes(states, 0, 1)
+        for k in range(h, u.shape[1]):
+            states[:, k] = window[:, :n]
+            lifted, inputs = lifting.lift(window, parameters), lifting.lift_inputs(u[:, k], window, parameters)
+            window[:, n:] = lifting.window.advance(window, u[:, k])
+            window[:, :n] = (rows @ np.concatenate([lifted, inputs], axis=1)[..., None])[..., 0]
+    return states
 
 
 def _compiled(
     loops: Library,
-    A: Array,
-    B: Array,
+    rows: Array,
+    window: Array,
     lifting: Lifting,
     parameters: Mapping[str, npt.ArrayLike],
-    first: Array,
+    before: Array,
     u: Array,
 ) -> Array:
     batch, n_samples, m = u.shape
-    n, h, rows = lifting.n_states, lifting.history, np.concatenate([A, B], axis=-1)[..., : lifting.n_states, :]
-    window = lifting.windows(first, u[:, : h + 1])[:, 0]
+    n, h = lifting.n_states, lifting.history
     column = np.zeros((rows.shape[-1], batch))
     column[:n] = window[:, :n].T
     states = np.empty((n_samples, n, batch))
-    states[:h] = first[:, :h].transpose(1, 2, 0)
+    states[:h] = before.transpose(1, 2, 0)
     job = {
         "observers": 1,
         "samples": n_samples - h,
@@ -126,11 +119,3 @@ def _compiled(
     }
     loops.call("kros_relift", formulas(lifting, tape_of(lifting, m), parameters, m, batch), ("relift_job", job))
     return states.transpose(2, 0, 1)
-
-
-def _multiply_all(psi: Array, step: Array) -> Array:
-    return psi @ step
-
-
-def _multiply_each(psi: Array, step: Array) -> Array:
-    return np.asarray((psi[:, None, :] @ step)[:, 0, :])

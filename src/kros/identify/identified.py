@@ -1,4 +1,4 @@
-"""All models of a population: every kind in every condition, with the recordings and what was learned from them on the way."""
+"""All models of a population: every kind in every condition, with the recordings and what was learned from them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .calibration import PhaseCalibration
 from .factors import Factor
 from .kinds import KINDS, kinds_for
 from .model_set import ModelSet
-from .refine.model import RefinedModels
+from .refine.model import Refinement
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -64,21 +64,16 @@ class EpisodeFactors:
 
     @cached_property
     def _places(self) -> dict[str, list[int]]:
-        found: dict[str, list[int]] = {}
+        places: dict[str, list[int]] = {}
         for row, (unit, _) in enumerate(self.rows):
-            found.setdefault(unit, []).append(row)
-        return found
+            places.setdefault(unit, []).append(row)
+        return places
 
     def save(self, folder: Path, lifting: Lifting, inputs: tuple[str, ...]) -> None:
         """Write them with the names of what they are of."""
-        arrays = {name: getattr(self.factor, name) for name in ("R", "peak", "n_samples")}
-        content: dict[str, Any] = {
-            "condition": self.condition,
-            "states": lifting.states,
-            "functions": lifting.functions,
-        }
-        content |= {"inputs": inputs, "input_functions": lifting.input_functions, "rows": self.rows}
-        save_artifact(folder, "factors", content, arrays)
+        content = {"condition": self.condition, "rows": self.rows, "states": lifting.states, "inputs": inputs}
+        content |= {"functions": lifting.functions, "input_functions": lifting.input_functions}
+        save_artifact(folder, "factors", content, {name: getattr(self.factor, name) for name in _ARRAYS})
 
     @classmethod
     @loader
@@ -86,7 +81,10 @@ class EpisodeFactors:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "factors")
         rows = tuple((str(unit), str(episode)) for unit, episode in content["rows"])
-        return cls(content["condition"], rows, Factor(arrays["R"], arrays["peak"], arrays["n_samples"]))
+        return cls(content["condition"], rows, Factor(*(arrays[name] for name in _ARRAYS)))
+
+
+_ARRAYS = ("R", "peak", "n_samples")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -109,8 +107,8 @@ class IdentifiedModels:
         By `place`: kind, and condition where it is not that of synthesis.
     factors : mapping of str to EpisodeFactors
         By condition.
-    refined : mapping of str to RefinedModels
-        What the refinement found out, by kind.
+    refined : mapping of str to Refinement
+        What the refinement brought beside the models, by kind.
 
     Examples
     --------
@@ -129,11 +127,11 @@ class IdentifiedModels:
     kinds: tuple[str, ...] = ()
     sets: Mapping[str, ModelSet] = field(default_factory=dict)
     factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)
-    refined: Mapping[str, RefinedModels] = field(default_factory=dict)
+    refined: Mapping[str, Refinement] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        facts = self.facts
-        return f"<IdentifiedModels: {', '.join(self.kinds)} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
+        kinds, facts = ", ".join(self.kinds), self.facts
+        return f"<IdentifiedModels: {kinds} of {len(facts.pooled)} units, identified on {facts.identify_on!r}>"
 
     @property
     def edmd_kinds(self) -> tuple[str, ...]:
@@ -142,14 +140,11 @@ class IdentifiedModels:
 
     @property
     def conditions(self) -> tuple[str, ...]:
-        """Conditions that models were identified in, that of synthesis first; none where no unit of it can be modelled."""
-        own = self.parameters
-        found = sorted(
-            {k.condition for k in self.facts.train if k.unit in own}, key=lambda c: c != self.facts.identify_on
-        )
-        return tuple(found)
+        """Conditions that models were identified in, that of synthesis first."""
+        known = {k.condition for k in self.facts.train if k.unit in self.parameters}
+        return tuple(sorted(known, key=lambda c: c != self.facts.identify_on))
 
-    @property
+    @cached_property
     def parameters(self) -> dict[str, dict[str, float]]:
         """Values of the lifting's parameters of every unit that can be modelled, by name."""
         if self.calibration is None:
@@ -162,7 +157,7 @@ class IdentifiedModels:
         return kind if condition in (None, self.facts.identify_on) else f"{kind}@{quote(str(condition), safe='')}"
 
     def models(self, kind: str | None = None, condition: str | None = None) -> ModelSet:
-        """Return the models of one kind, the first where none is named, in the condition that feeds synthesis or another."""
+        """Return the models of one kind, the first by default, in the condition that feeds synthesis or another."""
         place = self.place(kind or self.kinds[0], condition)
         if place not in self.sets:
             raise DataError(f"Models {place!r}: there are none, only {', '.join(self.sets)}; name one of them.")
@@ -174,13 +169,8 @@ class IdentifiedModels:
         states, inputs = self.population.states, self.population.inputs
         peak = np.concatenate([self.factors[c].factor.peak for c in sorted(self.conditions)]).max(axis=0)
         behind = len(states) + len(self.lifting.separation.basis)
-        return dict(
-            zip(
-                states + inputs,
-                [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()],
-                strict=True,
-            )
-        )
+        sizes = [*peak[: len(states)].tolist(), *peak[behind : behind + len(inputs)].tolist()]
+        return dict(zip(states + inputs, sizes, strict=True))
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with the recordings, in the layout of a run folder."""
@@ -201,13 +191,8 @@ class IdentifiedModels:
             factors.save(folder / "factors" / quote(condition, safe=""), self.lifting, self.population.inputs)
         for kind, refined in self.refined.items():
             refined.save(folder / "refinement" / kind)
-        content = {
-            "kinds": self.kinds,
-            "sets": list(self.sets),
-            "conditions": list(self.factors),
-            "refined": list(self.refined),
-        }
-        save_artifact(folder / "models", _KIND, content)
+        content = {"kinds": self.kinds, "sets": list(self.sets), "conditions": list(self.factors)}
+        save_artifact(folder / "models", _KIND, content | {"refined": list(self.refined)})
 
     @classmethod
     @loader
@@ -222,10 +207,9 @@ class IdentifiedModels:
         """Read what `save_models` wrote, of recordings that are open already."""
         content, _ = load_artifact(folder / "models", _KIND)
         sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
-        factors = Stored(
-            EpisodeFactors.load, {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
-        )
-        refined = Stored(RefinedModels.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
+        places = {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
+        factors = Stored(EpisodeFactors.load, places)
+        refined = Stored(Refinement.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
         lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
         return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)

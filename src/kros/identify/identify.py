@@ -1,15 +1,15 @@
 """The verb: from a population's recordings to models of every unit.
 
 recordings --survey--> training episodes --calibrate--> parameters of the lifting
-training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every condition
-in the condition that feeds synthesis --refined on free-run error--> koopman, linear
+training episodes --one pass--> factors --EDMD, one regularisation for all--> koopman_edmd, linear_edmd in every
+condition in the condition that feeds synthesis --refined on free-run error--> koopman, linear
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -26,25 +26,28 @@ from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate
 from .calibration import PhaseCalibration
-from .edmd import KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
-from .excitation import require_excitation, require_independent
-from .factors import Factor, combine, lifted_factor, reduce_episode
+from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .factors import (
+    Factor,
+    combine,
+    lifted_factor,
+    reduce_episode,
+    require_excitation,
+    require_independent,
+)
 from .identified import EpisodeFactors, IdentifiedModels
-from .kinds import kinds_for
+from .kinds import ModelKind, kinds_for
 from .model_set import ModelSet
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
-from .refine import RefinedModels, refine_population
-from .refine.options import LARGEST_RESIDUAL
-from .refine.spread import peak_residual_db
+from .refine import Refinement, RefineOptions, refine_population
+from .refine.metric import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 
 log = logging.getLogger(__name__)
-_DOUBLINGS = 12
-_POINTS = 60  # frequencies at which the models of units are compared
 Array = npt.NDArray[np.float64]
 Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
-Refining = Callable[[], tuple[list[ModelSet], dict[str, RefinedModels]]]
+Result = tuple[list[ModelSet], dict[str, Refinement]]
 
 
 def identify(
@@ -65,8 +68,8 @@ def identify(
     ----------
     population : Population
     lifting : sequence of str, mapping, Lifting or None
-        Lifted functions, such as ``["sin(100*position + phase)"]``, or a table as ``[lifting]`` of a study. Default: that of the plant
-        that the recordings name, else linear models alone.
+        Lifted functions, such as ``["sin(100*position + phase)"]``, or a table as ``[lifting]`` of a study. Default:
+        that of the plant that the recordings name, else linear models alone.
     identify_on : str, optional
         Condition that feeds synthesis; default ``noload``, else the first.
     test : iterable of str, optional
@@ -100,85 +103,78 @@ def identify(
     >>> kros.identify(drives, refine=False)
     <IdentifiedModels: linear_edmd of 2 units, identified on 'default'>
     """
-    require_kind(
-        population,
-        Population,
-        "Identify",
-        "read recordings with kros.read, or make a population of arrays with kros.from_arrays",
-    )
-    asked, work = IdentifySettings.of(settings, "Identify"), work or Work()
+    remedy = "read recordings with kros.read, or make a population of arrays with kros.from_arrays"
+    require_kind(population, Population, "Identify", remedy)
+    chosen, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
         population, facts = survey(population, test, identify_on, on_nan, work=work)
-    known = isinstance(calibration, PhaseCalibration)
-    declared = CalibrationSettings() if known else CalibrationSettings.of(calibration or {}, "Calibrate")
-    found = (
-        lifting
-        if isinstance(lifting, Lifting)
-        else resolve_lifting(lifting_settings(lifting), declared, population, test)
-    )
-    if not known:
-        spec = resolve_phase(declared, population, found)
-        calibration = None if spec is None else calibrate(population, facts, spec, work)
-    base = IdentifiedModels(
-        population, facts, found, calibration if isinstance(calibration, PhaseCalibration) else None
-    )
+    known = calibration if isinstance(calibration, PhaseCalibration) else None
+    declared = CalibrationSettings.of({} if known is not None else calibration or {}, "Calibrate")
+    if not isinstance(lifting, Lifting):
+        lifting = resolve_lifting(lifting_settings(lifting), declared, population, test)
+    spec = resolve_phase(declared, population, lifting) if known is None else None
+    if spec is not None:
+        known = calibrate(population, facts, spec, work)
+    base = IdentifiedModels(population, facts, lifting, known)
+    _check_conditions(base)
+    begun = {c: _begin(base, c, chosen, work) for c in base.conditions}  # refined while others are identified
+    sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, Refinement]()
+    for condition, (recorded, models, refining) in begun.items():
+        better, refinements = refining()
+        factors[condition] = recorded
+        sets |= {base.place(m.name, condition): m for m in (*models, *better)}
+        refined |= refinements
+    refined_kinds = tuple(kind.name for kind in kinds_for(lifting, refined=True)) if chosen.refine else ()
+    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
+
+
+def _check_conditions(base: IdentifiedModels) -> None:
+    """Refuse a condition without units, and say which units were not recorded in the one that feeds synthesis."""
+    facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
-            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; set data.identify_on to another one."
+            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; "
+            "set data.identify_on to another one."
         )
     elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
     if elsewhere:
         log.warning(
-            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not compared with the others. "
-            "Where conditions stand for units, give all the same one.",
+            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not "
+            "compared with the others. Where conditions stand for units, give all the same one.",
             ", ".join(elsewhere),
             facts.identify_on,
         )
-    sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, RefinedModels]()
-    first = sorted(
-        base.conditions, key=lambda c: c != facts.identify_on
-    )  # its models are refined while the others are identified
-    identified = {condition: identify_condition(base, condition, asked, work) for condition in first}
-    for condition in base.conditions:
-        factors[condition], models, refining = identified[condition]
-        better, found_out = refining()
-        sets |= {base.place(m.name, condition): m for m in (*models, *better)}
-        refined |= found_out
-    refined_kinds = tuple(kind.name for kind in kinds_for(found, refined=True)) if asked.refine else ()
-    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
 
 
-def identify_condition(
+def _begin(
     base: IdentifiedModels, condition: str, settings: IdentifySettings, work: Work
-) -> tuple[EpisodeFactors, list[ModelSet], Refining]:
-    """Reduce the training episodes of one condition, identify every kind of model from them, and begin to refine those that feed synthesis."""
-    population, facts, own = base.population, base.facts, base.parameters
-    units = [u for u in facts.groups if u in own and facts.keys("train", u, condition)]
+) -> tuple[EpisodeFactors, list[ModelSet], Callable[[], Result]]:
+    """Reduce and identify the training episodes of one condition, and begin to refine models that feed synthesis."""
+    population, facts, values = base.population, base.facts, base.parameters
+    units = [u for u in facts.groups if u in values and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
-    episodes = list(
-        work.recall(f"identify ({condition})", reduce_episodes, tasks, factor_marks(facts, tasks), (Factor,))
-    )
-    factor = Factor.stack([combine(f) for f in episodes])
-    parameters = {name: np.array([own[u][name] for u in units]) for name in base.lifting.parameters}
+    marks = [_mark(facts, task) for task in tasks]
+    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, marks, (Factor,)))
+    parameters = {name: np.array([values[u][name] for u in units]) for name in base.lifting.parameters}
+    reduced = _Reduced(base, condition, tuple(units), Factor.stack([combine(f) for f in episodes]), parameters)
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s
-    models = [
-        replace(m, longest_s=longest_s) for m in identify_models(base, condition, units, factor, parameters, settings)
-    ]
-    wanted = settings.refine and condition == facts.identify_on
-    refining = begin_refinement(base, units, factor, parameters, models, work) if wanted else _not_refined
+    models = [replace(m, longest_s=longest_s) for m in reduced.identify(settings)]
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
     together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
+    refining = reduced.begin_refinement(models, work) if settings.refine and reduced.feeds_synthesis else _nothing
     return EpisodeFactors(condition, rows, together), models, refining
 
 
-def factor_marks(facts: RecordingFacts, tasks: Iterable[Task]) -> list[str | None]:
-    """Return what the factors of each task follow from: samples, what they are of, and the lifting but for its parameters' values."""
-    found = [(facts.marks(keys), population, keys, lifting) for population, keys, lifting in tasks]
-    return [
-        None if known is None else mark_of(known, keys, own.channels, repr(lifting))
-        for known, own, keys, lifting in found
-    ]
+def _nothing() -> Result:
+    return [], {}
+
+
+def _mark(facts: RecordingFacts, task: Task) -> str | None:
+    """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
+    population, keys, lifting = task
+    samples = facts.marks(keys)
+    return None if samples is None else mark_of(samples, keys, population.channels, repr(lifting))
 
 
 def reduce_episodes(task: Task) -> Factor:
@@ -193,139 +189,123 @@ def reduce_episodes(task: Task) -> Factor:
     return Factor.stack(factors)
 
 
-def identify_models(
-    base: IdentifiedModels,
-    condition: str,
-    units: list[str],
-    factor: Factor,
-    parameters: dict[str, Array],
-    settings: IdentifySettings,
-) -> list[ModelSet]:
-    """Identify every kind of model of one condition with one common regularisation."""
-    population, on = base.population, condition == base.facts.identify_on
-    liftings = {kind.name: kind.lifting(base.lifting) for kind in kinds_for(base.lifting, refined=False)}
-    factors = {kind: lifted_factor(factor, base.lifting, parameters, lifting) for kind, lifting in liftings.items()}
-    in_pool = set(base.facts.pooled)
-    pooled = np.array([u in in_pool for u in units])
-    rows = pooled if pooled.any() else slice(None)
-    ranges = {kind: Ranges.of(factors[kind], lifting.n_lifted, rows) for kind, lifting in liftings.items()}
-    alpha = settings.alpha
-    if alpha == "auto":
-        shared = [
-            (ranges[kind].triangles(factors[kind].R[rows]), lifting.n_lifted) for kind, lifting in liftings.items()
-        ]
-        edge = smallest_stabilising_alpha(shared)
-        times = alpha_factor(shared, edge, settings.alpha_factor) if on else settings.alpha_factor
-        alpha = times * edge
-        note = (
-            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
-        )
-        log.info(note, condition, alpha, times)
-    require_excitation(factor, population.inputs, units, condition, float(alpha))
-    if alpha == 0:
-        for kind, lifting in liftings.items():
-            require_independent(
-                factors[kind], lifting.names + population.inputs + lifting.input_functions, units, condition
-            )
-    models = []
-    for kind, lifting in liftings.items():
-        nothing = np.zeros((len(units), 0, 0))
-        unfitted = ModelSet(
-            name=kind,
-            condition=condition,
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """Training episodes of one condition, reduced to factors of every unit."""
+
+    base: IdentifiedModels
+    condition: str
+    units: tuple[str, ...]
+    factor: Factor
+    parameters: dict[str, Array]
+
+    @property
+    def feeds_synthesis(self) -> bool:
+        """Whether this is the condition that the observer is designed in."""
+        return self.condition == self.base.facts.identify_on
+
+    @property
+    def pooled(self) -> npt.NDArray[np.bool_]:
+        """Units that speak for the population."""
+        return np.isin(self.units, list(self.base.facts.pooled))
+
+    def lifted(self, lifting: Lifting) -> Factor:
+        """Return factors for a kind of model."""
+        return lifted_factor(self.factor, self.base.lifting, self.parameters, lifting)
+
+    def identify(self, settings: IdentifySettings) -> list[ModelSet]:
+        """Identify every kind of model with one common regularisation."""
+        sets = [self._unfitted(kind) for kind in kinds_for(self.base.lifting, refined=False)]
+        factors = [self.lifted(m.lifting) for m in sets]
+        alpha = self._search(sets, factors, settings) if settings.alpha == "auto" else float(settings.alpha)
+        require_excitation(self.factor, self.base.population.inputs, self.units, self.condition, alpha)
+        for m, factor in zip(sets, factors, strict=True) if alpha == 0 else ():
+            require_independent(factor, m.lifting.names + m.inputs, self.units, self.condition)
+        sets = [replace(m, alpha=alpha, alpha_in_ranges=settings.alpha == "auto") for m in sets]
+        models = [fitted(m, factor) for m, factor in zip(sets, factors, strict=True)]
+        for m in models if self.feeds_synthesis else ():
+            require_stable(m, self.pooled)
+        return models
+
+    def _unfitted(self, kind: ModelKind) -> ModelSet:
+        lifting, population = kind.lifting(self.base.lifting), self.base.population
+        rows = self.pooled if self.pooled.any() else slice(None)
+        ranges, nothing = Ranges.of(self.lifted(lifting), lifting.n_lifted, rows), np.zeros((len(self.units), 0, 0))
+        return ModelSet(
+            name=kind.name,
+            condition=self.condition,
             lifting=lifting,
             channels=population.channels,
             sample_period_s=population.sample_period_s,
-            unit_ids=tuple(units),
+            unit_ids=self.units,
             A=nothing,
             B=nothing,
-            parameters=parameters if lifting.parameters else {},
+            parameters=self.parameters if lifting.parameters else {},
             residual_covariance=nothing,
-            output_scale=ranges[kind].outputs,
-            input_scale=ranges[kind].inputs,
-            alpha=float(alpha),
-            alpha_in_ranges=settings.alpha == "auto",
+            output_scale=ranges.outputs,
+            input_scale=ranges.inputs,
         )
-        models.append(fitted(unfitted, factors[kind]))
-    if on:
-        for found in models:
-            require_stable(found, pooled)
-    return models
+
+    def _search(self, sets: list[ModelSet], factors: list[Factor], settings: IdentifySettings) -> float:
+        """Return the common regularisation of channels divided by their ranges."""
+        rows = self.pooled if self.pooled.any() else slice(None)
+        triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
+        shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
+        edge, times = smallest_stabilising_alpha(shared), settings.alpha_factor
+        times = alpha_factor(shared, edge, times) if self.feeds_synthesis else times
+        note = (
+            "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
+        )
+        log.info(note, self.condition, times * edge, times)
+        return times * edge
+
+    def begin_refinement(self, starts: list[ModelSet], work: Work) -> Callable[[], Result]:
+        """Begin to refine every kind of model on free-run error."""
+        base, facts = self.base, self.base.facts
+        keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
+        starts = [replace(start, alpha=None, alpha_in_ranges=False) for start in starts]
+        factors = [self.lifted(start.lifting) for start in starts]
+        tasks = [
+            partial(refine_population, base.population, keys, start.lifting, start.parameters, factor, self.pooled)
+            for start, factor in zip(starts, factors, strict=True)
+        ]
+        results = work.begin("identify (refine)", tasks)
+
+        def refining() -> Result:
+            kinds, refined = kinds_for(base.lifting, refined=True), results()
+            of = zip(kinds, starts, refined, factors, strict=True)
+            models = [_with_matrices(start, kind.name, matrices, factor) for kind, start, (matrices, _), factor in of]
+            return models, {kind.name: facts for kind, (_, facts) in zip(kinds, refined, strict=True)}
+
+        return refining
 
 
 def fitted(models: ModelSet, factor: Factor) -> ModelSet:
-    """Return a set of models fitted to factors of its units; a regularisation that was searched acts on channels divided by their ranges."""
+    """Return a set of models fitted to factors of its units, with its regularisation."""
     matrices = models.fit(factor.R)
     radius = models.ranges.normalise(matrices).spectral_radius()
-    return replace(
-        models,
-        A=matrices.A,
-        B=matrices.B,
-        residual_covariance=residual_covariance(factor.R, models.lifting.n_lifted, matrices, factor.n_samples),
-        status=tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius),
-    )
+    status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
+    return replace(_with_matrices(models, models.name, matrices, factor), status=status)
 
 
-def alpha_factor(shared: list[tuple[Array, int]], edge: float, smallest: float) -> float:
-    """Return how many times the smallest stabilising coefficient is taken."""
-    limit = 20 * np.log10(LARGEST_RESIDUAL)
-    for doubled in range(_DOUBLINGS if edge > 0 else 0):
+def _with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, factor: Factor) -> ModelSet:
+    """Return a model set with the scales, phases and regularisation of the one that it starts from."""
+    covariance = residual_covariance(factor.R, start.lifting.n_lifted, matrices, factor.n_samples)
+    status = ("ok",) * len(start.unit_ids)
+    return replace(start, name=name, A=matrices.A, B=matrices.B, residual_covariance=covariance, status=status)
+
+
+def alpha_factor(
+    shared: list[tuple[Array, int]], edge: float, smallest: float, search: AlphaSearch | None = None
+) -> float:
+    """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
+    search, limit = search or AlphaSearch(), 20 * np.log10(RefineOptions().largest_residual)
+    for doubled in range(search.doublings if edge > 0 else 0):
         factor = smallest * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
-        if not any(
-            peak_residual_db(m.A, m.B, np.ones(m.B.shape[1]), np.ones(m.B.shape[2]), _POINTS) > limit for m in models
-        ):
+        if not any(peak_residual_db(m.A, m.B, search.points) > limit for m in models):
             return factor
     return smallest
-
-
-def begin_refinement(
-    base: IdentifiedModels,
-    units: list[str],
-    factor: Factor,
-    parameters: dict[str, Array],
-    starts: list[ModelSet],
-    work: Work,
-) -> Refining:
-    """Begin to refine every kind of model on free-run error, the population first, then each unit with a prior centred on it."""
-    facts = base.facts
-    keys = {u: facts.keys("train", u, facts.identify_on) for u in units}
-    in_pool = set(facts.pooled)
-    pooled = np.array([u in in_pool for u in units])
-    factors = [lifted_factor(factor, base.lifting, parameters, start.lifting) for start in starts]
-    tasks = [
-        partial(refine_population, base.population, keys, start.lifting, start.parameters, lifted, pooled)
-        for start, lifted in zip(starts, factors, strict=True)
-    ]
-    results = work.begin("identify (refine)", tasks)
-
-    def refining() -> tuple[list[ModelSet], dict[str, RefinedModels]]:
-        refined, kinds = results(), kinds_for(base.lifting, refined=True)
-        models = [
-            with_matrices(start, kind.name, found.units, lifted)
-            for kind, start, found, lifted in zip(kinds, starts, refined, factors, strict=True)
-        ]
-        return models, {m.name: found for m, found in zip(models, refined, strict=True)}
-
-    return refining
-
-
-def _not_refined() -> tuple[list[ModelSet], dict[str, RefinedModels]]:
-    return [], {}
-
-
-def with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, lifted: Factor) -> ModelSet:
-    """Return a refined model set with the scales and phases of the one it started from."""
-    return replace(
-        start,
-        name=name,
-        A=matrices.A,
-        B=matrices.B,
-        residual_covariance=residual_covariance(lifted.R, start.lifting.n_lifted, matrices, lifted.n_samples),
-        alpha=None,
-        alpha_in_ranges=False,
-        status=("ok",) * len(start.unit_ids),
-    )
 
 
 def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
@@ -333,6 +313,6 @@ def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:
     for unit, status, counts in zip(models.unit_ids, models.status, pooled, strict=True):
         if counts and status != "ok":
             raise IdentificationError(
-                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the model is {status}; "
-                "set identify.alpha = 'auto', or raise it."
+                f"Identifying {models.name} of unit {unit} ({models.condition}) with alpha = {models.alpha:g}: the "
+                f"model is {status}; set identify.alpha = 'auto', or raise it."
             )

@@ -1,4 +1,4 @@
-"""The kinds of models, in the order in which they are shown: with or without lifted functions, refined or by EDMD alone."""
+"""The kinds of models in their order: with or without lifted functions, refined or by EDMD alone."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ..lifting import Lifting
 
 @dataclass(frozen=True)
 class ModelKind:
-    """One kind of model; `lifted` tells whether it has the lifted functions, `refined` whether it was refined on free-run error."""
+    """One kind of model: with lifted functions or without, refined on free-run error or not."""
 
     name: str
     lifted: bool
@@ -31,13 +31,13 @@ KINDS = (
 
 def kind_of(name: str) -> ModelKind:
     """Return a kind by its name."""
-    for kind in KINDS:
-        if kind.name == name:
-            return kind
-    raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kind.name for kind in KINDS)}.")
+    kinds = {kind.name: kind for kind in KINDS}
+    if name not in kinds:
+        raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kinds)}.")
+    return kinds[name]
 
 
 def kinds_for(lifting: Lifting, *, refined: bool) -> tuple[ModelKind, ...]:
-    """Return the refined kinds of models, or those by EDMD, that a lifting gives: without functions the linear one alone."""
+    """Return the kinds of models, refined or by EDMD, of a lifting: without functions the linear one alone."""
     has_functions = bool(lifting.functions + lifting.input_functions)
     return tuple(kind for kind in KINDS if kind.refined == refined and (has_functions or not kind.lifted))

@@ -48,11 +48,13 @@ class ModelSet:
     alpha : float or None
         Tikhonov coefficient, where there is one.
     alpha_in_ranges : bool
-        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings' units.
+        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings'
+        units.
     status : tuple of str
         Per unit ``ok``, or what is wrong.
     longest_s : float or None, s
-        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is not known.
+        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is
+        not known.
 
     Examples
     --------
@@ -81,9 +83,9 @@ class ModelSet:
     longest_s: float | None = None
 
     def __repr__(self) -> str:
-        """Say what was modelled, and how."""
+        units = f"{len(self.unit_ids)} units in condition {self.condition!r}"
         outputs, inputs = ", ".join(self.lifting.names), ", ".join(self.inputs)
-        return f"ModelSet({self.name!r}: {len(self.unit_ids)} units in condition {self.condition!r}; lifted states {outputs}; inputs {inputs})"
+        return f"ModelSet({self.name!r}: {units}; lifted states {outputs}; inputs {inputs})"
 
     @property
     def recorded_inputs(self) -> tuple[str, ...]:
@@ -108,11 +110,11 @@ class ModelSet:
 
     @property
     def sizes(self) -> dict[str, float]:
-        """The same by name."""
+        """The ranges by name."""
         return self.ranges.sizes(self.lifting, self.recorded_inputs)
 
     def normalised(self) -> ModelSet:
-        """Return the models in channels divided by their ranges, which are all one then; the lifting is that of such channels."""
+        """Return the models in channels divided by their ranges, with the lifting of such channels."""
         matrices = self.ranges.normalise(KoopmanMatrices(self.A, self.B))
         x, u = self.output_scale, self.input_scale
         return replace(
@@ -127,12 +129,12 @@ class ModelSet:
         )
 
     def fit(self, R: Array) -> KoopmanMatrices:
-        """Return EDMD models of other recordings, from factors of ``[Psi | Theta_plus]``, with the regularisation of these."""
+        """Return EDMD models of other factors of ``[Psi | Theta_plus]``, with the regularisation of these."""
         alpha = self.alpha or 0.0
         return self.ranges.edmd(R, alpha) if self.alpha_in_ranges else edmd(R, self.lifting.n_lifted, alpha)
 
     def responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
-        """Return frequency responses from inputs to lifted states in the recordings' units, shape (unit, frequency, n, m)."""
+        """Return frequency responses from inputs to lifted states, shape (unit, frequency, n, m), in recorded units."""
         return np.asarray(self.scaled_responses(freqs_hz, units) * self.output_scale[:, None] / self.input_scale)
 
     def scaled_responses(self, freqs_hz: npt.ArrayLike, units: Sequence[str] | None = None) -> npt.NDArray[Any]:
@@ -147,7 +149,7 @@ class ModelSet:
         return StateSpace(A, B, np.broadcast_to(np.eye(n), A.shape), np.zeros((len(A), n, m)), self.sample_period_s)
 
     def frequencies(self, n_freqs: int = 1000, decades: float = 6.0) -> Array:
-        """Return logarithmic frequencies, Hz, from what the longest episode resolves (at most some decades below Nyquist) up to Nyquist."""
+        """Return logarithmic frequencies, Hz, from what the longest episode resolves up to Nyquist."""
         return log_grid(self.sample_period_s, n_freqs, decades, self.longest_s)
 
     def index(self, unit: str) -> int:
@@ -158,63 +160,43 @@ class ModelSet:
     def _rows(self) -> dict[str, int]:
         return {unit: row for row, unit in enumerate(self.unit_ids)}
 
-    def unit_parameters(self, units: Sequence[str]) -> dict[str, Array]:
-        """Return the lifting's parameters for some units, each of shape (len(units),)."""
-        rows = [self.index(u) for u in units]
-        return {name: values[rows] for name, values in self.parameters.items()}
-
     def spectral_radius(self) -> Array:
         """Return the spectral radius of every unit's model."""
         return self.ranges.normalise(KoopmanMatrices(self.A, self.B)).spectral_radius()
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``model.json``."""
-        content = {
-            "name": self.name,
-            "condition": self.condition,
-            "unit_ids": self.unit_ids,
-            "channels": self.channels,
-            "states": self.lifting.states,
-            "inputs": self.recorded_inputs,
-            "lifting": self.lifting.functions,
-            **self.lifting.extension(),
-            "parameters": {k: dict(zip(self.unit_ids, v.tolist(), strict=True)) for k, v in self.parameters.items()},
-            "sample_period_s": self.sample_period_s,
-            "alpha": self.alpha,
-            "alpha_in_ranges": self.alpha_in_ranges,
-            "status": self.status,
-            "longest_s": self.longest_s,
-        }
-        arrays = {
-            name: getattr(self, name) for name in ("A", "B", "residual_covariance", "output_scale", "input_scale")
-        }
-        save_artifact(folder, "model", content, arrays)
+        content = {name: getattr(self, name) for name in _CONTENT}
+        content |= {"states": self.lifting.states, "inputs": self.recorded_inputs, "lifting": self.lifting.functions}
+        content |= self.lifting.extension()
+        values = {name: v.tolist() for name, v in self.parameters.items()}
+        content["parameters"] = {name: dict(zip(self.unit_ids, v, strict=True)) for name, v in values.items()}
+        save_artifact(folder, "model", content, {name: getattr(self, name) for name in _AXES})
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> ModelSet:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "model")
-        n, m = (
-            len(content["states"]) + len(content["lifting"]),
-            len(content["inputs"]) + len(content.get("input_functions", ())),
-        )
-        axes = {"A": "unn", "B": "unm", "residual_covariance": "unn", "output_scale": "n", "input_scale": "m"}
-        check_shapes(arrays, axes, {"u": len(content["unit_ids"]), "n": n, "m": m}, Path(folder))
-        parameters = {
-            k: np.array([v[u] for u in content["unit_ids"]], dtype=float) for k, v in content["parameters"].items()
-        }
-        return cls(
-            name=content["name"],
-            condition=content["condition"],
-            lifting=Lifting.from_content(content),
-            channels=tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"]),
-            sample_period_s=content["sample_period_s"],
-            unit_ids=tuple(content["unit_ids"]),
-            parameters=parameters,
-            alpha=content["alpha"],
-            alpha_in_ranges=content.get("alpha_in_ranges", False),
-            status=tuple(content["status"]),
-            longest_s=content.get("longest_s"),
-            **arrays,
-        )
+        units, lifting = tuple(content["unit_ids"]), Lifting.from_content(content)
+        m = len(content["inputs"]) + len(lifting.input_functions)
+        check_shapes(arrays, _AXES, {"u": len(units), "n": lifting.n_lifted, "m": m}, Path(folder))
+        parameters = {k: np.array([v[u] for u in units], dtype=float) for k, v in content["parameters"].items()}
+        given = {name: content[name] for name in _CONTENT} | arrays
+        channels = tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"])
+        given |= {"unit_ids": units, "channels": channels, "status": tuple(content["status"])}
+        return cls(lifting=lifting, parameters=parameters, **given)
+
+
+_AXES = {"A": "unn", "B": "unm", "residual_covariance": "unn", "output_scale": "n", "input_scale": "m"}
+_CONTENT = (
+    "name",
+    "condition",
+    "unit_ids",
+    "channels",
+    "sample_period_s",
+    "alpha",
+    "alpha_in_ranges",
+    "status",
+    "longest_s",
+)

@@ -4,13 +4,13 @@ Symbols
 -------
 e_k   : residual of ``x_{k+1}`` regressed on the states and inputs of the last steps, each unit by itself
 q_k   : angle, rad
-P(r)  : ``2 |sum_k e_k exp(-i r q_k)|^2 / (N sum_k e_k^2)``, about the share of the residual that ``sin(r q)`` and ``cos(r q)`` explain. All r at once
-        by a histogram of the residual over the angle and one FFT.
+P(r)  : ``2 |sum_k e_k exp(-i r q_k)|^2 / (N sum_k e_k^2)``, about the share of the residual that ``sin(r q)`` and
+        ``cos(r q)`` explain, for all r by a histogram of the residual over the angle and one FFT
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,23 +19,12 @@ import numpy.typing as npt
 from ..data.population import EpisodeKey, Population
 
 Array = npt.NDArray[np.float64]
-LARGEST_RATIO = 500.0
-_LAGS, _UNITS, _EPISODES, _SAMPLES = 3, 6, 3, 40_000
-_ABOVE = 15.0  # of a peak over the median around it; the largest of some thousand values of noise alone is about 8 times their median
-_EVERY_UNIT = 3.0  # of each unit's own peak over its own surroundings
-_SHARE = 0.002  # of the residual that a term has to explain
-_GRAVITY, _LEAST_TRAVEL = (
-    0.01,
-    0.5,
-)  # the same for sin(angle), which other smooth terms resemble, and the travel that it needs, rad
-_ODD = 0.9  # of what sine and cosine explain
-_WHOLE = 0.8  # of what the best ratio explains, that a whole number near it has to explain to be taken
-_BINS = 1 << 21
+_BINS = 1 << 21  # of the histogram, at most
 
 
 @dataclass(frozen=True)
 class PeriodicTerm:
-    """A term of an angle that a linear model lacks."""
+    """A term of an angle that a linear model lacks: its share of the residual, and how far its peak stands out."""
 
     angle: str
     ratio: float
@@ -44,149 +33,157 @@ class PeriodicTerm:
     odd: bool = False
 
 
+@dataclass(frozen=True)
+class PeriodicTest:
+    """When a term counts as seen."""
+
+    largest_ratio: float = 500.0  # beyond that of any gear
+    lags: int = 3  # steps whose states and inputs the residual is regressed on: more than the order of a drive
+    units: int = 6  # that are looked at
+    episodes: int = 3  # of each
+    samples: int = 40_000  # of a unit
+    above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8 among some thousand values
+    above_in_every_unit: float = 3.0  # of the peak of each unit over its surroundings
+    least_share: float = 0.002  # of the residual that a term explains
+    gravity: float = 0.01  # the same for sin(angle), which other smooth terms resemble
+    least_travel: float = 0.5  # rad, that sin(angle) needs
+    odd: float = 0.9  # of what sine and cosine explain, that the sine alone explains where a term is odd
+    whole: float = 0.8  # of what the best ratio explains, that a whole number near it has to explain to be taken
+
+
+@dataclass(frozen=True, eq=False)
+class _Unit:
+    """Residuals of one step (n, n_states), the angle before it (n,), an orthonormal basis of the regressors (n, p)."""
+
+    residuals: Array
+    angle: Array
+    basis: Array
+
+    @classmethod
+    def of(cls, episodes: Sequence[Array], column: int, n_states: int, test: PeriodicTest) -> _Unit:
+        scale = np.maximum(np.max([np.abs(v).max(axis=0) for v in episodes], axis=0), np.finfo(float).tiny)
+        lags, rows, targets, angles, left = test.lags, [], [], [], test.samples
+        for values in episodes:
+            x, n = values[:left] / scale, min(left, len(values)) - test.lags
+            if n < 1:
+                continue
+            past = [x[lags - 1 - lag : lags - 1 - lag + n] for lag in range(lags)]
+            rows.append(np.hstack([*past, x[lags:, n_states:], np.ones((n, 1))]))
+            targets.append(x[lags:, :n_states])
+            angles.append(values[lags - 1 : lags - 1 + n, column])
+            left = max(left - len(x), 0)
+        u, s, _ = np.linalg.svd(np.vstack(rows), full_matrices=False)
+        basis, y = u[:, s > 1e-10 * s[0]], np.vstack(targets)
+        return cls(y - basis @ (basis.T @ y), np.concatenate(angles), basis)
+
+    @property
+    def travel(self) -> float:
+        """Range of the angle, rad."""
+        return float(np.ptp(self.angle))
+
+    def share(self, ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)) -> float:
+        """Return the share of the residual that functions explain beside the regressors, the largest of the states."""
+        columns = np.stack([f(r * self.angle) for r in ratios for f in functions], axis=1)
+        columns -= self.basis @ (self.basis.T @ columns)
+        u, s, _ = np.linalg.svd(columns, full_matrices=False)
+        u = u[:, s > 1e-8 * np.sqrt(len(self.angle))]
+        energy = np.maximum(np.sum(self.residuals**2, axis=0), np.finfo(float).tiny)
+        return float(np.max(np.sum((u.T @ self.residuals) ** 2, axis=0) / energy, initial=0.0))
+
+    def spectrum(self, low: float, cell: float, n_bins: int) -> Array:
+        """Return P(r), the largest over the states, shape (n_bins // 2 + 1,)."""
+        place = ((self.angle - low) / cell).astype(np.int64)
+        power = np.zeros(n_bins // 2 + 1)
+        for e in self.residuals.T:
+            energy = float(e @ e)
+            if energy > 0:
+                line = np.abs(np.fft.rfft(np.bincount(place, weights=e, minlength=n_bins))) ** 2
+                power = np.maximum(power, 2 * line / (len(e) * energy))
+        return power
+
+
 def periodic_term(
-    population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey] | None = None
+    population: Population,
+    angles: Sequence[str],
+    keys: Sequence[EpisodeKey] | None = None,
+    test: PeriodicTest | None = None,
 ) -> PeriodicTerm | None:
     """Return the periodic term that shows most, or None where none does."""
-    keys = _some_keys(population) if keys is None else keys
-    units = [[population.read(k) for k in keys if k.unit == unit] for unit in dict.fromkeys(k.unit for k in keys)]
-    names = population.states + population.inputs
-    found = [_of_angle(units, names.index(a), len(population.states), a) for a in angles]
-    return max((f for f in found if f is not None), key=lambda f: f.share, default=None)
+    test = test or PeriodicTest()
+    if keys is None:
+        condition = "noload" if "noload" in population.conditions else population.conditions[0]
+        keys = [k for u in population.unit_ids[: test.units] for k in population.keys(u, condition)[: test.episodes]]
+    recordings = [[population.read(k) for k in keys if k.unit == unit] for unit in dict.fromkeys(k.unit for k in keys)]
+    names, n = population.states + population.inputs, len(population.states)
+    terms = []
+    for angle in angles:
+        units = [_Unit.of(episodes, names.index(angle), n, test) for episodes in recordings]
+        units = [unit for unit in units if len(unit.angle) > 20 * test.lags * unit.basis.shape[1]]
+        terms += [term for term in [_term(units, angle, test)] if term is not None] if units else []
+    return max(terms, key=lambda term: term.share, default=None)
 
 
-def _some_keys(population: Population) -> list[EpisodeKey]:
-    condition = "noload" if "noload" in population.conditions else population.conditions[0]
-    return [k for u in population.unit_ids[:_UNITS] for k in population.keys(u, condition)[:_EPISODES]]
-
-
-def _of_angle(units: Sequence[Sequence[Array]], column: int, n_states: int, name: str) -> PeriodicTerm | None:
-    parts = [_residuals(episodes, column, n_states) for episodes in units]
-    parts = [p for p in parts if len(p[1]) > 20 * _LAGS * parts[0][2].shape[1]]
-    if not parts:
+def _term(units: Sequence[_Unit], name: str, test: PeriodicTest) -> PeriodicTerm | None:
+    peak = _peak(units, test)
+    if peak is not None and (share := max(unit.share([peak[0]]) for unit in units)) > test.least_share:
+        return PeriodicTerm(name, _refined(units, peak[0], test), share, peak[1])
+    shares = [unit.share([1.0]) for unit in units]
+    if min(shares) < test.gravity or max(unit.travel for unit in units) < test.least_travel:
         return None
-    low, high = min(q.min() for _, q, _ in parts), max(q.max() for _, q, _ in parts)
-    travel = max(float(np.ptp(q)) for _, q, _ in parts)
-    peak = _peak(parts, low, high - low, travel)
-    if peak is not None and (share := max(_share(p, [peak[0]]) for p in parts)) > _SHARE:
-        return PeriodicTerm(name, _refined(parts, peak[0], travel), share, peak[1])
-    shares = [_share(p, [1.0]) for p in parts]
-    if min(shares) < _GRAVITY or travel < _LEAST_TRAVEL:
-        return None
-    odd = np.mean([_share(p, [1.0], (np.sin,)) for p in parts]) > _ODD * np.mean(shares)
+    odd = np.mean([unit.share([1.0], (np.sin,)) for unit in units]) > test.odd * np.mean(shares)
     return PeriodicTerm(name, 1.0, float(np.mean(shares)), np.inf, bool(odd))
 
 
-def _residuals(episodes: Sequence[Array], column: int, n_states: int) -> tuple[Array, Array, Array]:
-    """Return residuals of one step (n, n_states), the angle before it (n,) and an orthonormal basis of the regressors (n, p), of one unit."""
-    scale = np.maximum(np.max([np.abs(v).max(axis=0) for v in episodes], axis=0), 1e-300)
-    rows, targets, angles, left = [], [], [], _SAMPLES
-    for values in episodes:
-        x = values[:left] / scale
-        n = len(x) - _LAGS
-        if n < 1:
-            continue
-        rows.append(
-            np.hstack(
-                [
-                    *(x[_LAGS - 1 - lag : _LAGS - 1 - lag + n] for lag in range(_LAGS)),
-                    x[_LAGS:, n_states:],
-                    np.ones((n, 1)),
-                ]
-            )
-        )
-        targets.append(x[_LAGS:, :n_states])
-        angles.append(values[_LAGS - 1 : _LAGS - 1 + n, column])
-        left = max(left - len(x), 0)
-    u, s, _ = np.linalg.svd(np.vstack(rows), full_matrices=False)
-    basis, y = u[:, s > 1e-10 * s[0]], np.vstack(targets)
-    return y - basis @ (basis.T @ y), np.concatenate(angles), basis
-
-
-def _peak(
-    parts: Sequence[tuple[Array, Array, Array]], low: float, width: float, travel: float
-) -> tuple[float, float] | None:
+def _peak(units: Sequence[_Unit], test: PeriodicTest) -> tuple[float, float] | None:
     """Return the ratio of the fundamental, and how far its peak stands out."""
-    advance = max(float(np.quantile(np.abs(np.diff(q)), 0.9)) for _, q, _ in parts)
-    largest = (
-        min(LARGEST_RATIO, 1.0 / advance if advance > 0 else np.inf, np.pi * _BINS / (32 * width)) if width > 0 else 0.0
-    )
-    smallest = 6 * np.pi / travel if travel > 0 else np.inf
+    low, travel = min(unit.angle.min() for unit in units), max(unit.travel for unit in units)
+    width = max(unit.angle.max() for unit in units) - low
+    advance = max(float(np.quantile(np.abs(np.diff(unit.angle)), 0.9)) for unit in units)
+    if min(width, travel, advance) <= 0:
+        return None
+    largest = min(test.largest_ratio, 1.0 / advance, np.pi * _BINS / (32 * width))
+    smallest, half = 6 * np.pi / travel, np.pi / travel
     if largest < 1.5 * smallest:
         return None
     cell = np.pi / (4 * largest)
     n_bins = 4 * int(np.ceil(width / cell) + 1)
-    spectra = np.array([_spectrum(e, q - low, cell, n_bins) for e, q, _ in parts])
+    spectra = np.array([unit.spectrum(low, cell, n_bins) for unit in units])
     ratios: Array = 2 * np.pi * np.fft.rfftfreq(n_bins, cell).astype(np.float64)
     total = spectra.mean(axis=0)
-    inside = np.flatnonzero((ratios > smallest) & (ratios < largest))
-    best: tuple[float, int] | None = None
-    floors: dict[int, npt.NDArray[np.bool_]] = {}
-    for i in inside[np.argsort(total[inside])[::-1][:50]]:
-        around = _around(ratios, float(ratios[i]), 2 * np.pi / travel, smallest, largest)
-        floor = np.median(spectra[:, around], axis=1)
-        near = np.abs(ratios - ratios[i]) < np.pi / travel
-        if total[i] > _ABOVE * np.median(total[around]) and (spectra[:, near].max(axis=1) > _EVERY_UNIT * floor).all():
-            floors[int(i)] = around
-            harmonics = sum((_at(total, ratios, k * float(ratios[i]), np.pi / travel) for k in (1, 2, 3)), 0.0)
-            if best is None or harmonics > 1.05 * best[0]:
-                best = harmonics, int(i)
-    if best is None:
+    best = (0.0, 0, 0.0)  # power with harmonics, place, height
+    for i, height in _standing_out(spectra, ratios, (smallest, largest), half, test):
+        power = sum(total[np.abs(ratios - k * ratios[i]) < half].max(initial=0.0) for k in (1, 2, 3))
+        best = (power, i, height) if power > 1.05 * best[0] else best
+    if best[0] == 0:
         return None
-    near = np.flatnonzero(np.abs(ratios - ratios[best[1]]) < np.pi / travel)
+    near = np.flatnonzero(np.abs(ratios - ratios[best[1]]) < half)
     top = int(near[total[near].argmax()])
-    return float(ratios[top]), float(total[top] / np.median(total[floors[best[1]]]))
+    return float(ratios[top]), float(best[2] * total[top] / total[best[1]])
 
 
-def _refined(parts: Sequence[tuple[Array, Array, Array]], ratio: float, travel: float) -> float:
-    """Return the ratio that explains most with its harmonics, or the whole number near it that explains nearly as much."""
+def _standing_out(
+    spectra: Array, ratios: Array, ends: tuple[float, float], half: float, test: PeriodicTest
+) -> Iterator[tuple[int, float]]:
+    """Yield peaks that stand out in the mean and in every unit, highest first: place, height over the median around."""
+    total, inside = spectra.mean(axis=0), (ratios > ends[0]) & (ratios < ends[1])
+    places = np.flatnonzero(inside)
+    for i in places[np.argsort(total[places])[::-1][:50]]:
+        off = np.abs(ratios - ratios[i])
+        around = inside & (off < max(ratios[i] / 3, 40 * half)) & (off > 6 * half)
+        floor, middle = np.median(spectra[:, around], axis=1), np.median(total[around])
+        in_every_unit = spectra[:, off < half].max(axis=1) > test.above_in_every_unit * floor
+        if total[i] > test.above * middle and in_every_unit.all():
+            yield int(i), float(total[i] / middle)
+
+
+def _refined(units: Sequence[_Unit], ratio: float, test: PeriodicTest) -> float:
+    """Return the ratio that explains most with its harmonics, or a whole number near it that nearly does."""
 
     def explained(r: float) -> float:
-        return float(np.mean([_share(p, [r, 2 * r, 3 * r]) for p in parts]))
+        return float(np.mean([unit.share([r, 2 * r, 3 * r]) for unit in units]))
 
-    near = ratio + np.linspace(-1, 1, 21) * np.pi / travel
-    best = max(near.tolist(), key=explained)
+    half = np.pi / max(unit.travel for unit in units)
+    best = max((ratio + np.linspace(-1, 1, 21) * half).tolist(), key=explained)
     whole = float(round(best))
-    is_whole = abs(best - whole) < np.pi / travel and explained(whole) > _WHOLE * explained(best)
+    is_whole = abs(best - whole) < half and explained(whole) > test.whole * explained(best)
     return whole if is_whole else float(f"{best:.4g}")
-
-
-def _spectrum(residuals: Array, angle: Array, cell: float, n_bins: int) -> Array:
-    """Return P(r), the largest over the states, shape (n_bins // 2 + 1,)."""
-    place = (angle / cell).astype(np.int64)
-    power = np.zeros(n_bins // 2 + 1)
-    for e in residuals.T:
-        energy = float(e @ e)
-        if energy > 0:
-            own = np.abs(np.fft.rfft(np.bincount(place, weights=e, minlength=n_bins))) ** 2
-            power = np.maximum(power, 2 * own / (len(e) * energy))
-    return power
-
-
-def _around(ratios: Array, ratio: float, resolution: float, smallest: float, largest: float) -> npt.NDArray[np.bool_]:
-    """Ratios near one, without its own peak."""
-    reach = max(ratio / 3, 20 * resolution)
-    return np.asarray(
-        (np.abs(ratios - ratio) < reach)
-        & (np.abs(ratios - ratio) > 3 * resolution)
-        & (ratios > smallest)
-        & (ratios < largest)
-    )
-
-
-def _at(power: Array, ratios: Array, ratio: float, half: float) -> float:
-    near = power[np.abs(ratios - ratio) < half]
-    return float(near.max()) if near.size else 0.0
-
-
-def _share(
-    part: tuple[Array, Array, Array], ratios: Sequence[float], functions: Sequence[np.ufunc] = (np.sin, np.cos)
-) -> float:
-    """Return the share of the residual of one unit that sines and cosines explain beside the regressors, the largest over the states."""
-    residuals, angle, basis = part
-    pair = np.stack([f(r * angle) for r in ratios for f in functions], axis=1)
-    pair -= basis @ (basis.T @ pair)
-    u, s, _ = np.linalg.svd(pair, full_matrices=False)
-    u = u[:, s > 1e-8 * np.sqrt(len(angle))]
-    energy = np.sum(residuals**2, axis=0)
-    return float(np.max(np.sum((u.T @ residuals) ** 2, axis=0) / np.maximum(energy, 1e-300), initial=0.0))

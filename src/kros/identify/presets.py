@@ -1,10 +1,11 @@
-"""What follows from a plant and from formulas where nothing is declared, so that the shortest call and the smallest study work."""
+"""What follows from a plant and from formulas where nothing is declared."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,17 +13,16 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
 from ..data.population import Population, split_episodes
-from ..lifting import Lifting, concatenate
+from ..lifting import Lifting
+from ..lifting.families import family
 from ..lifting.formula import Formula
-from ..lifting.tables import family
 from .calibration import PhaseSpec
 from .settings import CalibrationSettings, LiftingSettings
 
 Array = npt.NDArray[np.float64]
 HARMONIC_DRIVE = "harmonic-drive"
 PHASE = "phase"
-_SAMPLED_EPISODES = 40
-_SAMPLES = 5000
+_EPISODES, _SAMPLES = 40, 5000  # of the training recordings that centres of families are found among, at most
 
 
 def resolve_lifting(
@@ -31,16 +31,12 @@ def resolve_lifting(
     population: Population,
     test: Iterable[str] | None = None,
 ) -> Lifting:
-    """Return the lifting that is declared, or the plant's own (35); `test` names held-out episodes, of which families see nothing."""
-    inputs = declared.input_functions
-    if declared.functions is None and not declared.families:
-        if population.metadata.get("plant") == HARMONIC_DRIVE:
-            functions: tuple[str, ...] = (f"sin({_declared_ratio(calibration, population):g}*position + {PHASE})",)
-        else:
-            functions = ()
-    else:
-        sample = partial(_sample, population, test)
-        functions = concatenate(declared.functions or (), *(family(table, sample) for table in declared.families))
+    """Return the lifting that is declared, or the plant's (35); families see no episodes of `test`."""
+    inputs, functions = declared.input_functions, declared.functions or ()
+    if declared.functions is None and not declared.families and population.metadata.get("plant") == HARMONIC_DRIVE:
+        functions = (f"sin({_declared_ratio(calibration, population):g}*position + {PHASE})",)
+    sample = partial(_sample, population, test)
+    functions = sum((family(table, sample) for table in declared.families), functions)
     parameters = (PHASE,) if any(re.search(rf"\b{PHASE}\b", f) for f in functions + inputs) else ()
     lifting = Lifting(population.states, functions, parameters, population.inputs, inputs)
     _ = lifting.separation, lifting.input_separation  # refused before anything is written
@@ -58,62 +54,56 @@ def lifting_settings(lifting: LiftingSettings | Mapping[str, object] | Sequence[
 
 
 def _sample(population: Population, test: Iterable[str] | None, names: tuple[str, ...]) -> Array:
-    """Values of formulas on training episodes, one of every unit and condition, thinned to some thousand samples."""
+    """Return values of formulas on training episodes, one of every unit and condition, thinned."""
     keys = [split.train[0] for split in split_episodes(population, test).values()]
-    keys = keys[:: max(1, -(-len(keys) // _SAMPLED_EPISODES))]
+    keys = keys[:: max(1, -(-len(keys) // _EPISODES))]
     known = population.states + population.inputs
     rows = []
     for key in keys:
         values = population.read(key)
         values = values[:: max(1, len(values) * len(keys) // _SAMPLES)]
-        columns = {name: values[:, i] for i, name in enumerate(known)}
-        evaluated = [np.broadcast_to(Formula(name, known).evaluator(columns), len(values)) for name in names]
+        columns = dict(zip(known, values.T, strict=False))
+        evaluated = [np.broadcast_to(Formula(name, known).evaluate(columns), len(values)) for name in names]
         rows.append(np.stack(evaluated, axis=-1))
     return np.concatenate(rows)
 
 
 def resolve_phase(declared: CalibrationSettings, population: Population, lifting: Lifting) -> PhaseSpec | None:
-    """Return what has to be calibrated for the lifting's parameters: nothing, or the phase of a disturbance that is fixed to an angle."""
+    """Return what has to be calibrated: nothing, or the phase of a disturbance that is fixed to an angle."""
     if not lifting.parameters:
         return None
     if lifting.parameters != (PHASE,):
-        raise ConfigError(
-            f"Lifting parameters {lifting.parameters}: only {PHASE!r} can be calibrated; write other constants into the formulas."
-        )
-    known = {k: v for k, v in declared.model_dump().items() if v is not None}
+        problem = f"only {PHASE!r} can be calibrated; write other constants into the formulas"
+        raise ConfigError(f"Lifting parameters {lifting.parameters}: {problem}.")
+    known: dict[str, Any] = declared.model_dump(exclude_none=True)
     if "ratio" not in known and "gear_ratio" in population.metadata:
         known["ratio"] = float(population.metadata["gear_ratio"])
     if "ratio" not in known:
         known = _written_ratio(lifting, population.states, known.get("angle")) | known
     if "ratio" not in known:
         raise ConfigError("Calibration: the ratio of the disturbance to the angle is unknown; set calibrate.ratio.")
-    spec = PhaseSpec(**known)
-    channels = population.states + population.inputs
+    spec, channels = PhaseSpec(**known), population.states + population.inputs
     for name in (spec.angle, spec.reference, spec.measured):
         if name not in channels:
-            raise ConfigError(
-                f"Calibration: there is no channel {name!r} in {', '.join(channels)}{did_you_mean(name, channels) or ';'} set "
-                "calibrate.angle, .reference and .measured."
-            )
+            near = did_you_mean(name, channels) or ";"
+            remedy = "set calibrate.angle, .reference and .measured"
+            raise ConfigError(f"Calibration: there is no channel {name!r} in {', '.join(channels)}{near} {remedy}.")
     return spec
 
 
-def _written_ratio(lifting: Lifting, angles: Sequence[str], wanted: str | None) -> dict[str, str | float]:
-    """Return angle and ratio where all functions of the phase have it beside one angle times one number, ``ratio*angle + phase``."""
+def _written_ratio(lifting: Lifting, angles: Sequence[str], angle: str | None) -> dict[str, Any]:
+    """Return angle and ratio where every function of the phase reads ``ratio*angle + phase``."""
     import sympy as sp
 
-    phase, found = sp.Symbol(PHASE, real=True), set()
-    for formula in lifting.formulas:
-        for argument in {
-            a for node in formula.written.atoms(sp.Function) for a in node.args if phase in a.free_symbols
-        }:
-            rest = sp.expand(argument / argument.coeff(phase)) - phase if argument.coeff(phase) != 0 else phase
-            symbols = {s.name for s in rest.free_symbols}
-            if len(symbols) == 1 and (name := symbols.pop()) in angles and wanted in (None, name):
-                ratio = sp.diff(rest, sp.Symbol(name, real=True))
-                if ratio.is_number:
-                    found.add((name, float(ratio)))
-    return dict(zip(("angle", "ratio"), found.pop(), strict=True)) if len(found) == 1 else {}
+    phase, pairs = sp.Symbol(PHASE, real=True), set()
+    nodes = (node for formula in lifting.formulas for node in formula.written.atoms(sp.Function))
+    for argument in {a for node in nodes for a in node.args if phase in a.free_symbols}:
+        rest = sp.expand(argument / argument.coeff(phase)) - phase if argument.coeff(phase) != 0 else phase
+        names = [symbol.name for symbol in rest.free_symbols]
+        ratio = sp.diff(rest, sp.Symbol(names[0], real=True)) if len(names) == 1 else phase
+        if ratio.is_number and names[0] in angles and angle in (None, names[0]):
+            pairs.add((names[0], float(ratio)))
+    return dict(zip(("angle", "ratio"), pairs.pop(), strict=True)) if len(pairs) == 1 else {}
 
 
 def gearbox_band_hz(

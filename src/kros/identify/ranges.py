@@ -4,8 +4,8 @@ With the ranges ``X`` of the lifted states and ``U`` of the model's inputs as di
 
 .. math:: z = X^{-1} x, \qquad A_z = X^{-1} A X, \qquad B_z = X^{-1} B U.
 
-Lifted functions have a range of their own, as states and inputs do. Only a regularisation, a threshold or a penalty sees the difference, and all of them
-are meant for signals of about one.
+Lifted functions have a range of their own, as states and inputs do. Only a regularisation, a threshold or a penalty
+sees the difference, and all of them are meant for signals of about one.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Ranges:
 
     @classmethod
     def of(cls, factor: Factor, n_lifted: int, rows: Any = slice(None)) -> Ranges:
-        """Return the largest magnitudes in the training episodes of some units; one for a channel that is zero in all of them."""
+        """Return the largest magnitudes in the training of some units; one for a channel that is always zero."""
         peak = factor.peak[rows].max(axis=0)
         peak = np.where(peak > 0, peak, 1.0)
         return cls(peak[:n_lifted], peak[n_lifted:])
@@ -57,7 +57,7 @@ class Ranges:
         return self.inverse.normalise(models)
 
     def triangles(self, R: Array) -> Array:
-        """Return factors of ``[Psi | Theta_plus]``, shape (..., p + n_lifted, p + n_lifted), of channels divided by the ranges."""
+        """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
         return np.asarray(R / np.concatenate([self.outputs, self.inputs, self.outputs]))
 
     def factor(self, factor: Factor) -> Factor:
@@ -68,5 +68,5 @@ class Ranges:
         return replace(factor, R=self.triangles(factor.R), peak=peak, input_range=ends)
 
     def edmd(self, R: Array, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
-        """Return EDMD models of the channels as recorded whose regularisation acts on channels divided by the ranges; see `edmd`."""
+        """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""
         return self.restore(edmd(self.triangles(R), len(self.outputs), alpha))

@@ -7,25 +7,21 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from ..core.settings import Settings
-from ..lifting.tables import check_family
+from ..lifting.families import check_family
 
 
 class LiftingSettings(Settings):
     """Lifted functions of the Koopman model; where none are declared, those that suit the plant that the reader names.
 
-    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further inputs of the model.
+    `families` are tables, each with a ``kind``, whose formulas stand behind `functions`; `input_functions` are further
+    inputs of the model.
     """
 
-    functions: tuple[str, ...] | None = Field(
-        None,
-        description="lifted functions of the states, as formulas; without any and without families those that suit the plant that the reader names",
-    )
+    functions: tuple[str, ...] | None = Field(None, description="lifted functions of the states, as formulas")
     families: tuple[dict[str, Any], ...] = Field(
         (), description="tables with a kind each, whose formulas stand behind the functions"
     )
-    input_functions: tuple[str, ...] = Field(
-        (), description="further inputs of the model, as formulas of states and inputs"
-    )
+    input_functions: tuple[str, ...] = Field((), description="further inputs of the model, of states and inputs")
 
     @field_validator("families")
     @classmethod
@@ -38,11 +34,8 @@ class LiftingSettings(Settings):
 class CalibrationSettings(Settings):
     """Phase calibration; ``None`` takes what suits the plant that the reader names."""
 
-    angle: str | None = Field(
-        None,
-        description="state in the periodic function; by default that of the formula, such as position in sin(100*position + phase)",
-    )
-    ratio: float | None = Field(None, gt=0, description="periods a radian; by default that of the formula, here 100")
+    angle: str | None = Field(None, description="state in the periodic function; default: that of the formula")
+    ratio: float | None = Field(None, gt=0, description="periods a radian; default: that of the formula, such as 100")
     reference: str | None = Field(
         None, description="commanded speed, which is constant for a while in the segments that are used"
     )
@@ -52,15 +45,16 @@ class CalibrationSettings(Settings):
 class IdentifySettings(Settings):
     """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
 
-    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the population is finite; the factor
-    is doubled until the peak residual around the best nominal unit is at most one half, where that can be reached.
-    `refine` adds models that are refined on their free-run error, the population first, then each unit, held near the population's model by
-    a prior that is never so weak that the peak residual exceeds one half.
+    At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
+    population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
+    half, where that can be reached. `refine` adds models that are refined on their free-run error, the population
+    first, then each unit, held near the population's model by a prior that is never so weak that the peak residual
+    exceeds one half.
     """
 
     alpha: float | Literal["auto"] = Field(
         "auto",
-        description="regularisation, in channels divided by their ranges; a number is in the recordings' units of measure, as the paper's",
+        description="regularisation of channels divided by their ranges; a number: of recorded units, as in the paper",
     )
     alpha_factor: float = Field(
         4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model"

@@ -28,23 +28,25 @@ def quantify_models(
 ) -> UncertaintyForControl:
     """Quantify how models of python-control differ from a nominal one.
 
-    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map makes of the imaginary axis and
-    mapped back, which approximates nothing; the bound is checked between the points of the grid too, and holds up to the end that the certificate names
-    and beyond it for residuals that do not grow there. Frequency responses are known on
-    their grid alone, and the certificate says so. (Bare arrays of responses: `kros.uncertainty.quantify_responses`.)
+    Systems are exact at every frequency: weights of continuous ones are fitted on the unit circle that the bilinear map
+    makes of the imaginary axis and mapped back, which approximates nothing; the bound is checked between the points of
+    the grid too, and holds up to the end that the certificate names and beyond it for residuals that do not grow there.
+    Frequency responses are known on their grid alone, and the certificate says so. (Bare arrays of responses:
+    `kros.uncertainty.quantify_responses`.)
 
     Parameters
     ----------
     models : sequence or mapping of control.StateSpace, control.TransferFunction or control.FRD
-        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or all response data.
+        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or
+        all response data.
     form : Form or str
     freqs_hz : array_like, shape (frequency,), Hz, optional
         Response data bring their own.
     nominal : int, str, system or response data, optional
         The best unit by default.
     **options
-        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``output_scale``, ``input_scale``, ``max_order``,
-        ``tolerance_db`` and others. Weights act on scaled signals.
+        Of `kros.uncertainty.quantify_systems` or `quantify_responses`: ``output_scale``, ``input_scale``,
+        ``max_order``, ``tolerance_db`` and others. Weights act on scaled signals.
 
     Returns
     -------
@@ -76,31 +78,32 @@ def quantify_models(
         raise DataError("quantify_models: found no models; give at least two.")
     if all(is_system(model) for model in models):
         base = from_control(nominal) if is_system(nominal) else nominal
-        return uncertainty_to_control(
-            quantify_systems([from_control(m) for m in models], form, freqs_hz, nominal=base, **options)
-        )
+        systems = [from_control(model) for model in models]
+        return uncertainty_to_control(quantify_systems(systems, form, freqs_hz, nominal=base, **options))
     if not all(isinstance(model, control.FRD) for model in models):
-        kinds = sorted({type(model).__name__ for model in models})
-        raise DimensionError(
-            f"quantify_models: found {' and '.join(kinds)} in one list; give all as systems or all as control.FRD."
-        )
+        kinds = " and ".join(sorted({type(model).__name__ for model in models}))
+        raise DimensionError(f"quantify_models: found {kinds} in one list; give all as systems or all as control.FRD.")
     if freqs_hz is not None:
         raise ConfigError("quantify_models: response data bring their own frequencies; drop freqs_hz.")
+    return _quantify_data(list(models), form, nominal, options)
+
+
+def _quantify_data(models: list[Any], form: Form | str, nominal: Any, options: dict[str, Any]) -> UncertaintyForControl:
+    """Quantify response data, which are known on their grid alone."""
     freqs, period = _common_axis([*models, *([nominal] if isinstance(nominal, control.FRD) else [])])
     base = _response(nominal) if isinstance(nominal, control.FRD) else nominal
     responses = [_response(model) for model in models]
-    shapes = {response.shape for response in responses}
+    shapes = sorted({response.shape for response in responses})
     if len(shapes) > 1:
-        raise DimensionError(
-            f"quantify_models: responses differ in shape (frequency, outputs, inputs): {sorted(shapes)}; bring them to one."
-        )
+        problem = f"responses differ in shape (frequency, outputs, inputs), {shapes}"
+        raise DimensionError(f"quantify_models: {problem}; bring them to one.")
     model = quantify_responses(np.array(responses), freqs, form, sample_period_s=period, nominal=base, **options)
     G = model.nominal_response
-    scaled = G / model.output_scale[:, None] * model.input_scale
-    data, scaled_data = (
-        control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0) for g in (G, scaled)
+    data, scaled = (
+        control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, period or 0)
+        for g in (G, G / model.output_scale[:, None] * model.input_scale)
     )
-    return with_weights(data, scaled_data, model, model.certificate)
+    return with_weights(data, scaled, model, model.certificate)
 
 
 def _common_axis(data: list[Any]) -> tuple[Array, float]:
@@ -108,17 +111,14 @@ def _common_axis(data: list[Any]) -> tuple[Array, float]:
     first = data[0]
     for k, other in enumerate(data):
         if not isinstance(other, control.FRD):
-            raise DimensionError(
-                f"quantify_models: candidates beside response data should be response data, found {type(other).__name__}."
-            )
+            problem = f"candidates beside response data should be response data, found {type(other).__name__}"
+            raise DimensionError(f"quantify_models: {problem}.")
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
-            raise DimensionError(
-                f"quantify_models: response {k} has other frequencies than the first; interpolate or measure them on one grid."
-            )
+            problem = f"response {k} has other frequencies than the first"
+            raise DimensionError(f"quantify_models: {problem}; interpolate or measure them on one grid.")
         if other.dt != first.dt:
-            raise DimensionError(
-                f"quantify_models: response {k} has dt = {other.dt}, the first dt = {first.dt}; bring them to one."
-            )
+            problem = f"response {k} has dt = {other.dt}, the first dt = {first.dt}"
+            raise DimensionError(f"quantify_models: {problem}; bring them to one.")
     if first.dt is True:
         raise DimensionError(
             "quantify_models: the sampling period of the responses is not known (dt = True); give it in seconds."

@@ -1,7 +1,7 @@
 """Identification of one Koopman model as a scikit-learn regressor, for pipelines, grid searches and cross-validation.
 
-One model is fitted to all rows, of whatever unit. A batch of units with a model each, and the uncertainty between them, is what
-`kros.data.Population` and the stages after it are for.
+One model is fitted to all rows, of whatever unit. A batch of units with a model each, and the uncertainty between them,
+is what `kros.data.Population` and the stages after it are for.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
 from ..identify import edmd, free_run
+from ..identify.edmd import relative_pivots
 from ..identify.factors import triangular
 from ..lifting import Lifting
 
@@ -23,19 +24,19 @@ try:
     from sklearn.utils.validation import check_array, check_is_fitted, validate_data
 except ImportError as error:
     raise MissingDependencyError(
-        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or identify with kros.identify."
+        "KoopmanRegressor needs scikit-learn 1.6 or newer; install it (pip install 'kros[sklearn]'), or use "
+        "kros.identify."
     ) from error
 
 Array = npt.NDArray[np.float64]
 EPISODE = "episode"
-_DEPENDENT = 1e-13  # of a column's norm: what is left of one that is a sum of others, by rounding
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """Koopman (or linear) model from rows of states and inputs to the next states.
 
-    EDMD with Tikhonov regularisation (30)-(33): ``min ||theta(x+) - [A B][theta(x); u]||^2 + alpha ||[A B]||^2``, with ``theta(x)`` the
-    states followed by the lifted functions. There is no intercept.
+    EDMD with Tikhonov regularisation (30)-(33): ``min ||theta(x+) - [A B][theta(x); u]||^2 + alpha ||[A B]||^2``, with
+    ``theta(x)`` the states followed by the lifted functions. There is no intercept.
 
     ===========================  ==================================================================================
     ``X`` alone                  rows in order of time; each row is paired with the next one of its episode
@@ -47,23 +48,25 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     functions : sequence of str
-        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model, and no delays.
+        Lifted functions as formulas of the states, such as ``"sin(100*position)"``; none for a linear model, and no
+        delays.
     states : sequence of str, optional
         Names of the states, which the formulas use. Default: the names of the DataFrame, else ``x0, x1, ...``.
     n_inputs : int, optional
-        How many of the last columns are inputs. Default: what `states` leave over, else what the columns of `y` leave over, else none.
+        How many of the last columns are inputs. Default: what `states` leave over, else what the columns of `y` leave
+        over, else none.
     alpha : float
         Tikhonov coefficient, added to the unnormalised Gram matrix; zero for plain least squares.
     episode_feature : bool
         Whether the first column of an array is the episode, a number.
     horizon : int or None
-        `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the free run of the
-        whole episode from its first state.
+        `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the
+        free run of the whole episode from its first state.
 
     Notes
     -----
-    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs); ``lifting_``, ``state_names_`` and
-    ``input_names_``; and ``n_pairs_``, the number of transitions.
+    `fit` sets ``A_``, shape (n_lifted, n_lifted), and ``B_``, shape (n_lifted, n_inputs); ``lifting_``,
+    ``state_names_`` and ``input_names_``; and ``n_pairs_``, the number of transitions.
 
     Examples
     --------
@@ -119,40 +122,28 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         IdentificationError
             With ``alpha = 0``, a function or input that depends on the others or does not vary; the message names it.
         """
-        if (
-            isinstance(self.functions, str)
-            or not 0 <= self.alpha < np.inf
-            or (self.horizon is not None and self.horizon < 1)
-        ):
-            raise ConfigError(
-                f"KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one or None, found "
-                f"{self.functions!r}, {self.alpha!r}, {self.horizon!r}."
-            )
+        self._check_parameters()
         values, edges = self._read(X, reset=True)
-        target = (
-            None if y is None else check_array(y, dtype=np.float64, ensure_2d=False, input_name="y", estimator=self)
-        )
+        checked = {"dtype": np.float64, "ensure_2d": False, "input_name": "y", "estimator": self}
+        target = None if y is None else check_array(y, **checked)
         self._one_dimensional = target is not None and target.ndim == 1
         after = None if target is None else target.reshape(len(target), -1)
         if after is not None and len(after) != len(values):
-            raise DataError(
-                f"X has {len(values)} rows and y has {len(after)}; y holds the next state of every row of X."
-            )
+            problem = f"X has {len(values)} rows and y has {len(after)}"
+            raise DataError(f"{problem}; y holds the next state of every row of X.")
         self._name_columns(X, values.shape[1], None if after is None else after.shape[1])
         before, n = values, len(self.state_names_)
         if after is None:
             if np.diff(edges).min() < 2:
-                raise DataError(
-                    "KoopmanRegressor: an episode has n_samples = 1, a transition needs at least 2; leave the episode out."
-                )
+                problem = "an episode has n_samples = 1, a transition needs at least 2"
+                raise DataError(f"KoopmanRegressor: {problem}; leave the episode out.")
             now = np.delete(np.arange(len(values)), edges[1:] - 1)
             before, after = values[now], values[now + 1, :n]
         with np.errstate(all="ignore"):
             rows = np.concatenate([self.lifting_.lift(before[:, :n]), before[:, n:], self.lifting_.lift(after)], axis=1)
         if not np.isfinite(rows).all():
-            raise DataError(
-                "KoopmanRegressor: a lifted function of X is NaN or inf in some row; choose functions that are defined everywhere."
-            )
+            problem = "a lifted function of X is NaN or inf in some row"
+            raise DataError(f"KoopmanRegressor: {problem}; choose functions that are defined everywhere.")
         R, names = triangular(rows), (*self.lifting_.names, *self.input_names_)
         if self.alpha == 0:
             _require_excited(R[: len(names), : len(names)], names, len(rows))
@@ -160,8 +151,16 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.A_, self.B_, self.n_pairs_ = matrices.A, matrices.B, len(rows)
         return self
 
+    def _check_parameters(self) -> None:
+        far = self.horizon is None or self.horizon >= 1
+        if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
+            raise ConfigError(
+                "KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one "
+                f"or None, found {self.functions!r}, {self.alpha!r}, {self.horizon!r}."
+            )
+
     def predict(self, X: Any) -> Array:
-        """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) where `fit` was given a `y` of one dimension.
+        """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) after such a `y`.
 
         Parameters
         ----------
@@ -174,18 +173,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return predicted[:, 0] if self._one_dimensional else predicted
 
     def predict_trajectory(self, X: Any) -> Array:
-        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states); row k belongs to row k of `X`.
+        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states).
 
         Parameters
         ----------
         X : array_like or DataFrame, shape (n_samples, n_columns)
-            Of the states only the first row of each episode is used; the state is retracted and lifted again at every step.
+            Of the states only the first row of each episode is used; the state is retracted and lifted again at every
+            step.
         """
         check_is_fitted(self)
         return self._free_run(*self._read(X, reset=False))
 
     def score(self, X: Any, y: Any = None) -> float:
-        """Return R2 of the prediction `horizon` samples ahead, the mean over the states; minus infinity where the prediction diverges.
+        """Return R2 of the prediction `horizon` samples ahead, the mean over the states; -inf where it diverges.
 
         Parameters
         ----------
@@ -201,9 +201,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         if y is not None:
             if self.horizon != 1:
-                raise DataError(
-                    f"score: pairs of rows (X, y) allow one step, the horizon is {self.horizon}; leave out y, or set horizon = 1."
-                )
+                problem = f"pairs of rows (X, y) allow one step, the horizon is {self.horizon}"
+                raise DataError(f"score: {problem}; leave out y, or set horizon = 1.")
             return _r2(np.asarray(y, dtype=float), self.predict(X))
         values, edges = self._read(X, reset=False)
         n, row = len(self.state_names_), np.arange(len(values))
@@ -217,12 +216,9 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return _r2(values[start + self.horizon, :n], x)
 
     def _step(self, x: Array, u: Array) -> Array:
-        n = len(self.state_names_)
+        W = np.concatenate([self.A_, self.B_], axis=1)[: len(self.state_names_)]
         with np.errstate(all="ignore"):
-            return np.asarray(
-                np.concatenate([self.lifting_.lift(x), u], axis=1)
-                @ np.concatenate([self.A_[:n], self.B_[:n]], axis=1).T
-            )
+            return np.asarray(np.concatenate([self.lifting_.lift(x), u], axis=1) @ W.T)
 
     def _free_run(self, values: Array, edges: npt.NDArray[np.int64]) -> Array:
         """Run all episodes as one batch, the shorter ones on with zero inputs and then cut."""
@@ -242,47 +238,39 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if self.episode_feature and ids is None:
             ids, values = values[:, 0], values[:, 1:]
         if not values.shape[1]:
-            raise DataError(
-                "KoopmanRegressor: rows hold no state beside the episode; add the columns of states and inputs."
-            )
+            problem = "rows hold no state beside the episode"
+            raise DataError(f"KoopmanRegressor: {problem}; add the columns of states and inputs.")
         if not reset and values.shape[1] != len(self.state_names_) + len(self.input_names_):
-            raise DataError(
-                f"KoopmanRegressor: found {values.shape[1]} columns beside the episode; pass rows in the layout of `fit`."
-            )
+            problem = f"found {values.shape[1]} columns beside the episode"
+            raise DataError(f"KoopmanRegressor: {problem}; pass rows in the layout of `fit`.")
         inner = np.zeros(0, dtype=np.int64) if ids is None else np.flatnonzero(ids[1:] != ids[:-1]) + 1
         if ids is not None and len(set(ids[[0, *inner]].tolist())) <= len(inner):
-            raise DataError(
-                "KoopmanRegressor: an episode stands in several places; keep its rows together and in order of time."
-            )
+            problem = "an episode stands in several places"
+            raise DataError(f"KoopmanRegressor: {problem}; keep its rows together and in order of time.")
         return values, np.concatenate([[0], inner, [len(values)]]).astype(np.int64)
 
     def _name_columns(self, X: Any, n_columns: int, n_targets: int | None) -> None:
-        """Name states and inputs; what is said about their number has to agree."""
-        said = [n_columns - self.n_inputs] if self.n_inputs is not None else []
-        said += [len(self.states)] if self.states is not None else []
-        said += [n_targets] if n_targets is not None else []
-        n = said[0] if said else n_columns
-        if set(said) - {n} or not 1 <= n <= n_columns:
-            raise DataError(
-                f"X has {n_columns} columns of states and inputs, which does not agree with n_inputs = {self.n_inputs}, states = {self.states}"
-                + (f" and y with {n_targets} columns." if n_targets is not None else ".")
-            )
+        """Name states and inputs; what is declared about their number has to agree."""
+        declared = [n_targets] if n_targets is not None else []
+        declared += [len(self.states)] if self.states is not None else []
+        declared += [n_columns - self.n_inputs] if self.n_inputs is not None else []
+        n = declared[0] if declared else n_columns
+        if set(declared) - {n} or not 1 <= n <= n_columns:
+            targets = f" and y with {n_targets} columns" if n_targets is not None else ""
+            problem = f"does not agree with n_inputs = {self.n_inputs}, states = {self.states}{targets}"
+            raise DataError(f"X has {n_columns} columns of states and inputs, which {problem}.")
         named = hasattr(X, "iloc") and all(isinstance(c, str) for c in X.columns)
         frame = [c for c in X.columns if c != EPISODE][-n_columns:] if named else []
         names = frame or [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(n_columns - n)]
-        self.state_names_, self.input_names_ = (
-            tuple(names[:n] if self.states is None else self.states),
-            tuple(names[n:]),
-        )
+        self.state_names_ = tuple(names[:n] if self.states is None else self.states)
+        self.input_names_ = tuple(names[n:])
         if frame and self.state_names_ != tuple(frame[:n]):
-            raise DataError(
-                f"The states are {self.state_names_}, the frame has the columns {frame}; put the states first, the inputs after them."
-            )
+            problem = f"The states are {self.state_names_}, the frame has the columns {frame}"
+            raise DataError(f"{problem}; put the states first, the inputs after them.")
         self.lifting_ = Lifting(self.state_names_, tuple(self.functions), (), self.input_names_)
         if self.lifting_.history:
-            raise ConfigError(
-                "KoopmanRegressor: rows stand by themselves, functions cannot read earlier samples; use kros.identify."
-            )
+            problem = "rows stand by themselves, functions cannot read earlier samples"
+            raise ConfigError(f"KoopmanRegressor: {problem}; use kros.identify.")
 
     def __sklearn_tags__(self) -> Any:
         """Return scikit-learn's facts about the estimator: no target is needed."""
@@ -294,20 +282,19 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
     """Name the first column that plain least squares cannot tell from those before it."""
     if n_pairs < len(names):
-        raise DataError(
-            f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]; record more, or use alpha > 0."
-        )
-    dependent = np.flatnonzero(np.abs(np.diagonal(R)) <= _DEPENDENT * np.linalg.norm(R, axis=0))
+        problem = f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]"
+        raise DataError(f"{problem}; record more, or use alpha > 0.")
+    dependent = np.flatnonzero(
+        relative_pivots(R) <= 450 * np.finfo(float).eps
+    )  # what rounding leaves of a sum of others
     if dependent.size:
-        raise IdentificationError(
-            f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified: it depends on the columns before it, or is zero; remove it, "
-            "excite it, or use alpha > 0."
-        )
+        problem = f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified"
+        reason = "it depends on the columns before it, or is zero"
+        raise IdentificationError(f"{problem}: {reason}; remove it, excite it, or use alpha > 0.")
 
 
 def _r2(truth: Array, predicted: Array) -> float:
     if len(truth) < 2:
-        raise DataError(
-            f"score: found {len(truth)} samples to compare with, R2 needs 2; pass longer episodes, or lower the horizon."
-        )
+        problem = f"found {len(truth)} samples to compare with, R2 needs 2"
+        raise DataError(f"score: {problem}; pass longer episodes, or lower the horizon.")
     return float(r2_score(truth, predicted)) if np.isfinite(predicted).all() else -np.inf

@@ -9,13 +9,11 @@ Examples
 """
 
 from ..core.removed import refusing
-from .families import concatenate, delays, harmonics, polynomials
-from .kernels import fourier_features, kmeans_centres, radial
+from .families import delays, fourier_features, harmonics, kmeans_centres, polynomials, radial
 from .lifting import Lifting
 
 __all__ = [
     "Lifting",
-    "concatenate",
     "delays",
     "fourier_features",
     "harmonics",

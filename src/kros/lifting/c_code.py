@@ -1,4 +1,4 @@
-"""SymPy trees as C99 expressions, in the order of operations in which kros evaluates them."""
+"""Formulas as C99 expressions, in the order of operations of their program."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..core.errors import ConfigError
-from .evaluation import shape_of
+from .program import Writer, tree_of
 
-_DIRECT = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "atan")
+_SIGNS = {"add": "+", "multiply": "*", "divide": "/"}
+_NAMES = {"Abs": "fabs"}
 
 
 @dataclass(frozen=True)
@@ -33,48 +33,44 @@ class Precision:
 
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
     """Return a SymPy tree as a C expression."""
-    numbers: list[float] = []
-    shape = shape_of(expression, numbers)
-    text = _CWriter(name, precision or Precision(), iter(numbers)).write(shape)
-    return text[1:-1] if shape[0] in ("add", "multiply") else text
+    writer = Writer(sorted(symbol.name for symbol in expression.free_symbols))
+    value = writer.write(tree_of(expression))
+    return _CText(writer, name, precision or Precision()).bare(value)
 
 
 @dataclass(frozen=True)
-class _CWriter:
+class _CText:
+    writer: Writer
     name: Callable[[str], str]
     precision: Precision
-    numbers: Any
 
-    def write(self, shape: Any) -> str:
-        kind, *rest = shape
+    def bare(self, value: int) -> str:
+        """Return the text of a value without the parentheses around a sum or a product."""
+        text = self.of(value)
+        return text[1:-1] if self._kind(value) in ("add", "multiply") else text
+
+    def of(self, value: int) -> str:
+        """Return the text of a value."""
+        kind, literal = self._kind(value), self.precision.literal
         if kind == "symbol":
-            return self.name(rest[0])
+            return self.name(self.writer.names[value])
         if kind == "number":
-            value = next(self.numbers)
-            text = self.precision.literal(value)
-            return f"({text})" if value < 0 else text
-        if kind in ("add", "multiply"):
-            return "(" + (" + " if kind == "add" else " * ").join(self.write(child) for child in rest) + ")"
+            text = literal(self.writer.constants[-1 - value])
+            return f"({text})" if text.startswith("-") else text
+        _, first, second = self.writer.operations[value - len(self.writer.names)]
+        if kind in _SIGNS:
+            left = self.bare(first) if self._kind(first) == kind else self.of(first)
+            return f"({left} {_SIGNS[kind]} {self.of(second)})"
+        inner = self.bare(first)
         if kind == "power":
-            return self._power(rest[0], self.write(rest[1]))
-        inner, suffix = self.write(rest[0]), self.precision.suffix
-        inner = inner[1:-1] if rest[0][0] in ("add", "multiply") else inner
-        if kind in _DIRECT:
-            return f"{kind}{suffix}({inner})"
-        if kind == "Abs":
-            return f"fabs{suffix}({inner})"
+            return f"pow{self.precision.suffix}({inner}, {literal(self.writer.constants[-1 - second])})"
         if kind == "sign":
-            zero, one = self.precision.literal(0.0), self.precision.literal(1.0)
+            zero, one = literal(0.0), literal(1.0)
             return f"((({inner}) > {zero}) ? {one} : ((({inner}) < {zero}) ? -{one} : {zero}))"
-        raise ConfigError(f"Formula node {kind!r}: it has no expression in C; write the formula with other functions.")
+        return f"{_NAMES.get(kind, kind)}{self.precision.suffix}({inner})"
 
-    def _power(self, exponent: float, base: str) -> str:
-        one, suffix = self.precision.literal(1.0), self.precision.suffix
-        plain = {
-            2.0: f"({base} * {base})",
-            3.0: f"({base} * {base} * {base})",
-            -1.0: f"({one} / {base})",
-            -2.0: f"({one} / ({base} * {base}))",
-        }
-        roots = {0.5: f"sqrt{suffix}({base})", -0.5: f"({one} / sqrt{suffix}({base}))"}
-        return {**plain, **roots}.get(exponent, f"pow{suffix}({base}, {self.precision.literal(exponent)})")
+    def _kind(self, value: int) -> str:
+        if value < 0:
+            return "number"
+        given = len(self.writer.names)
+        return "symbol" if value < given else self.writer.operations[value - given][0]

@@ -1,15 +1,19 @@
-"""Formulas of states and parameters, such as ``sin(100*position + phase)``, and of earlier values, such as ``position[-1]``.
+"""Formulas of states, parameters and earlier values, such as ``sin(100*position + phase)`` and ``position[-1]``.
 
 Text is read with `ast` against a whitelist and turned into SymPy nodes one by one; nothing is ever evaluated as Python.
-From the one SymPy tree come the vectorised evaluation, the derivative, the slope bounds and the C expression.
+From the one SymPy tree come the derivative, the slope bounds, and the program that NumPy, the compiled loops and C
+follow. SymPy computes numbers exactly: powers of powers of whole numbers, and exponentials of exponentials, take time
+and memory without a bound while they are read. Every operation is therefore settled at once: its numbers become those
+of double precision, and what has no finite value there, or is too large, is refused.
 """
 
 from __future__ import annotations
 
 import ast
+import math
 import operator
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -19,19 +23,27 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.files import did_you_mean
-from .evaluation import FUNCTIONS, Evaluator, compile_expression
-from .limits import MAX_EXPONENT, MAX_LENGTH, TooCostlyError, finite, require_size, settled
+from .program import FUNCTIONS, Program
 
-_BINARY = {
+_OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.Pow: operator.pow,
+    ast.UAdd: operator.pos,
+    ast.USub: operator.neg,
 }
-_UNARY: dict[type, Callable[[Any], Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
 _SPELLINGS = {"abs": "Abs"}
 MAX_DELAY = 1000
+MAX_LENGTH = 2000
+MAX_EXPONENT = 64
+MAX_NODES = 300  # numbers, names, operators and functions
+MAX_DEPTH = 20  # functions and powers inside each other; sums and products are as deep as their deepest term
+MAX_FACTORS = 40  # of one product, whose derivative has as many terms of as many factors
+MAX_TERMS = 2000  # of a formula with parameters, multiplied out
+_EXACT = 2**53
+_CHAINS = ((ast.Add, ast.Sub), (ast.Mult, ast.Div))
 
 
 @dataclass(frozen=True)
@@ -40,9 +52,7 @@ class Formula:
 
     text: str  # as written by the user
     names: tuple[str, ...]  # quantities that may appear
-    delayed: tuple[
-        str, ...
-    ] = ()  # quantities of which earlier values may appear: ``position[-2]`` is the value two samples before
+    delayed: tuple[str, ...] = ()  # those of which earlier values may appear, such as ``position[-2]``
     sizes: tuple[tuple[str, float], ...] = ()  # sizes of quantities whose values come divided by them
     size: float = 1.0  # what the value of the formula is divided by
 
@@ -58,24 +68,26 @@ class Formula:
 
         sizes = dict(self.sizes)
         known = {symbol: sizes.get(base_and_delay(symbol.name)[0], 1.0) for symbol in self.written.free_symbols}
-        tree = self.written.xreplace(
-            {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
-        )
+        larger = {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
+        tree = self.written.xreplace(larger)
         return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
 
     @cached_property
     def used(self) -> frozenset[str]:
-        """Names that the formula depends on; an earlier value has a name of its own."""
+        """Names that the formula depends on, those of earlier values among them."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
     @cached_property
-    def evaluator(self) -> Evaluator:
-        """Vectorised evaluation: a mapping from names to arrays gives an array."""
-        return compile_expression(self.expression)
+    def _program(self) -> Program:
+        return Program.of([self.expression])
 
     def __call__(self, **values: npt.ArrayLike) -> npt.NDArray[np.float64]:
         """Evaluate at arrays that broadcast against each other."""
-        return np.asarray(self.evaluator({k: np.asarray(v, dtype=float) for k, v in values.items()}))
+        return self.evaluate({name: np.asarray(value, dtype=float) for name, value in values.items()})
+
+    def evaluate(self, values: Mapping[str, npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
+        """Evaluate at arrays by name."""
+        return np.asarray(self._program.run(values)[0])
 
     def derivative(self, name: str) -> Any:
         """Return the SymPy tree of the partial derivative with respect to one name."""
@@ -98,19 +110,17 @@ def base_and_delay(name: str) -> tuple[str, int]:
 
 
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
-    """Read a formula into a SymPy tree. What may take long is refused before it does: see `limits`."""
+    """Read a formula into a SymPy tree; what may take long is refused before it does."""
     if len(require_text(text)) > MAX_LENGTH:
-        raise ConfigError(
-            f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it into several functions."
-        )
+        remedy = f"at most {MAX_LENGTH} are read; split it into several functions"
+        raise ConfigError(f"Formula of {len(text)} characters: {remedy}.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Python warns of text such as 1if
             tree = ast.parse(text.strip(), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError, Warning) as error:
-        raise ConfigError(
-            f"Formula {text!r}: not readable ({error}); write it like 'sin(100*position + phase)'."
-        ) from error
+        remedy = "write it like 'sin(100*position + phase)'"
+        raise ConfigError(f"Formula {text!r}: not readable ({error}); {remedy}.") from error
     try:
         require_size(tree.body)
         return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
@@ -120,26 +130,18 @@ def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
 
 @cache
 def _real_magnitude() -> tuple[Any, Any]:
-    """Functions that differentiate as Abs and sign of real numbers do; SymPy's own ask first whether their argument is complex."""
+    """Functions that differentiate as Abs and sign do for real numbers; SymPy's ask whether these are complex."""
     import sympy as sp
 
-    def slope_of_jump(self: Any, argindex: int = 1) -> Any:
-        return 2 * sp.DiracDelta(self.args[0])
-
-    jump = type("RealSign", (sp.Function,), {"fdiff": slope_of_jump})
-
-    def slope_of_magnitude(self: Any, argindex: int = 1) -> Any:
-        return jump(self.args[0])
-
-    return type("RealMagnitude", (sp.Function,), {"fdiff": slope_of_magnitude}), jump
+    jump = type("RealSign", (sp.Function,), {"fdiff": lambda self, argindex=1: 2 * sp.DiracDelta(self.args[0])})
+    return type("RealMagnitude", (sp.Function,), {"fdiff": lambda self, argindex=1: jump(self.args[0])}), jump
 
 
 def require_text(text: object) -> str:
     """Return what is a text, as a formula should be."""
     if not isinstance(text, str):
-        raise ConfigError(
-            f"Formula {text!r}: should be a text such as 'sin(100*position + phase)', found {type(text).__name__}."
-        )
+        needed = "should be a text such as 'sin(100*position + phase)'"
+        raise ConfigError(f"Formula {text!r}: {needed}, found {type(text).__name__}.")
     return text
 
 
@@ -165,21 +167,20 @@ class _Reader:
             return self._name(node.id)
         if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name):
             return self._earlier(node.value.id, node.slice)
-        if isinstance(node, ast.BinOp) and type(node.op) in _BINARY:
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
             left, right = self.read(node.left), self.read(node.right)
             if isinstance(node.op, ast.Pow) and not (right.is_number and abs(finite(right)) <= MAX_EXPONENT):
                 raise self._error(f"the exponent {right} should be a number of magnitude at most {MAX_EXPONENT}.")
-            return _BINARY[type(node.op)](left, right)
-        if isinstance(node, ast.UnaryOp) and type(node.op) in _UNARY:
-            return _UNARY[type(node.op)](self.read(node.operand))
+            return _OPERATORS[type(node.op)](left, right)
+        if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+            return _OPERATORS[type(node.op)](self.read(node.operand))
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1 and not node.keywords:
             function = _SPELLINGS.get(node.func.id, node.func.id)
             if function in FUNCTIONS:
                 return getattr(sp, function)(self.read(node.args[0]))
             raise self._error(f"unknown function {node.func.id!r}; known are {', '.join(sorted(FUNCTIONS))}.")
-        raise self._error(
-            f"{ast.unparse(node)!r} is not allowed; use numbers, names, + - * / ** and functions of one argument."
-        )
+        remedy = "use numbers, names, + - * / ** and functions of one argument"
+        raise self._error(f"{ast.unparse(node)!r} is not allowed; {remedy}.")
 
     def _name(self, name: str) -> Any:
         import sympy as sp
@@ -188,35 +189,108 @@ class _Reader:
             return sp.Symbol(name, real=True)
         if name == "pi":
             return sp.pi
-        raise self._error(
-            f"unknown name {name!r}{did_you_mean(name, self.names) or ';'} known are {', '.join(self.names)} and pi."
-        )
+        near = did_you_mean(name, self.names) or ";"
+        raise self._error(f"unknown name {name!r}{near} known are {', '.join(self.names)} and pi.")
 
     def _earlier(self, name: str, index: ast.expr) -> Any:
         import sympy as sp
 
+        written = f"{name}[{ast.unparse(index)}]"
         if name not in self.delayed:
-            known = (
-                f"only {', '.join(self.delayed)} have earlier values"
-                if self.delayed
-                else "nothing here has earlier values"
-            )
-            raise self._error(f"there is no {name}[{ast.unparse(index)}]; {known}.")
+            known = ", ".join(self.delayed) or "states and inputs"
+            raise self._error(f"there is no {written}; only {known} have earlier values.")
         negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
         amount = index.operand if isinstance(index, ast.UnaryOp) else index
         if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
-            raise self._error(
-                f"the delay in {name}[{ast.unparse(index)}] should be a whole number of samples, such as {name}[-1]."
-            )
+            raise self._error(f"the delay in {written} should be a whole number of samples, such as {name}[-1].")
         if not negative or amount.value == 0:
-            raise self._error(
-                f"{name}[{ast.unparse(index)}] is not an earlier value; write {name}[-1] for one sample before, {name} for the present."
-            )
+            example = f"write {name}[-1] for one sample before, {name} for the present"
+            raise self._error(f"{written} is not an earlier value; {example}.")
         if amount.value > MAX_DELAY:
-            raise self._error(
-                f"the delay in {name}[-{amount.value}] is too deep; at most {MAX_DELAY} samples are kept."
-            )
+            raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
         return sp.Symbol(delayed_name(name, amount.value), real=True)
 
     def _error(self, problem: str) -> ConfigError:
         return ConfigError(f"Formula {self.text!r}: {problem}")
+
+
+class TooCostlyError(ConfigError):
+    """A part of a formula that is not finite, or takes too long."""
+
+
+def require_size(tree: ast.AST) -> None:
+    """Refuse a tree with too many nodes, or too deep; without recursion, which it may be too deep for."""
+    todo: list[tuple[ast.AST, int, Any]] = [(tree, 0, None)]
+    count = 0
+    while todo:
+        node, depth, chain = todo.pop()
+        if isinstance(node, ast.expr):
+            count += 1
+            kind = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
+            depth += not (isinstance(node, ast.Name | ast.Constant) or (kind is not None and kind is chain))
+            if count > MAX_NODES or depth > MAX_DEPTH:
+                many, deep = (
+                    f"has more than {MAX_NODES} numbers, names and operators",
+                    f"is nested more than {MAX_DEPTH} deep",
+                )
+                raise TooCostlyError(f"{many if count > MAX_NODES else deep}; split it into several functions.")
+            chain = kind
+        todo += [(child, depth, chain) for child in ast.iter_child_nodes(node)]
+
+
+def settled(value: Any) -> Any:
+    """Return the result of one operation with numbers as doubles hold them; exact whole numbers and fractions stay."""
+    import sympy as sp
+
+    if value.is_number:
+        return _number(value)
+    if value.args and any(a.is_Rational and _large(a) for a in value.args):
+        value = value.func(*(_number(a) if a.is_Rational else a for a in value.args))
+    for part in (value, *value.args):
+        if part.is_number:
+            finite(part)
+        if isinstance(part, sp.Pow) and part.exp.is_number and abs(finite(part.exp)) > MAX_EXPONENT:
+            problem = f"holds a power of {finite(part.exp):g}"
+            raise TooCostlyError(f"{problem}; exponents are numbers of magnitude at most {MAX_EXPONENT}.")
+    if isinstance(value, sp.Mul) and len(value.args) > MAX_FACTORS:
+        raise TooCostlyError(f"holds a product of {len(value.args)} factors; at most {MAX_FACTORS} are read.")
+    return value
+
+
+def finite(number: Any) -> float:
+    """Return the value of a SymPy number in double precision."""
+    try:
+        value = float(number)
+    except (TypeError, ArithmeticError):
+        value = math.nan
+    if not math.isfinite(value):
+        remedy = "check for a division by zero, a root of a negative number, and powers"
+        raise TooCostlyError(f"holds a number that is not finite and real; {remedy}.")
+    return value
+
+
+def count_terms(expression: Any) -> float:
+    """Return an upper bound of the terms that multiplying out leaves, of the expression or of any part of it."""
+    import sympy as sp
+
+    inner = [count_terms(a) for a in expression.args]
+    if isinstance(expression, sp.Add):
+        return float(sum(inner))
+    if isinstance(expression, sp.Mul):
+        return float(math.prod(inner))
+    if isinstance(expression, sp.Pow) and expression.exp.is_Integer and inner[0] > 1:
+        power = abs(int(expression.exp))
+        return float(math.comb(power + min(int(inner[0]), MAX_TERMS) - 1, power))
+    return max(inner, default=1.0)
+
+
+def _number(value: Any) -> Any:
+    import sympy as sp
+
+    number = finite(value)
+    exact = value.is_Rational and not _large(value)
+    return value if exact or (value / sp.pi).is_Rational else sp.Float(number, 17)
+
+
+def _large(value: Any) -> bool:
+    return bool(abs(value.p) > _EXACT or value.q > _EXACT)

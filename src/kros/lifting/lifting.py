@@ -1,4 +1,4 @@
-"""The lifting of a population: original states first, lifted functions after them; inputs may have functions of their own.
+"""The lifting of a population: original states, then lifted functions; inputs may have functions, too.
 
 Symbols
 -------
@@ -7,13 +7,13 @@ w         : window, the states and the earlier values that formulas name, (..., 
 theta(w)  : lifted states [x; sigma(w)], (..., n + p)           (25)
 sigma     : lifted functions, formulas of states, earlier values and per-unit parameters
 u         : recorded inputs, (..., m)
-gamma     : input functions, formulas of inputs, states, earlier values and per-unit parameters; lifted inputs [u; gamma(u, w)]
+gamma     : input functions, formulas of inputs and of what sigma reads; lifted inputs [u; gamma(u, w)]
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -21,10 +21,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from .continuity import slope_bounds_of
-from .evaluation import ColumnEvaluator
 from .formula import Formula, base_and_delay, require_text
-from .intervals import Box
+from .intervals import Box, slope_bounds_of
+from .program import Columns
 from .separation import FormulaSeparation
 from .window import Window
 
@@ -40,13 +39,16 @@ class Lifting:
     ----------
     states : tuple of str
     functions : tuple of str
-        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters; empty for a linear model.
+        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters;
+        empty for a linear model.
     parameters : tuple of str
-        Names of quantities that every unit has a value of its own for, such as ``phase``.
+        Names of quantities whose value differs from unit to unit, such as ``phase``.
     inputs : tuple of str
-        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes through.
+        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes
+        through.
     input_functions : tuple of str
-        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``; ``1`` makes it affine.
+        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``; ``1`` makes it
+        affine.
     sizes : tuple of (str, float)
         Sizes of states, inputs and functions by name, see `in_sizes`; one where none is given.
 
@@ -70,12 +72,13 @@ class Lifting:
     sizes: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
+        """Refuse what cannot be lifted."""
         everything = (*self.states, *self.parameters, *self.inputs)
         clash = {name for name in everything if everything.count(name) > 1}
         if clash:
             raise ConfigError(
-                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, parameters {self.parameters} and "
-                f"inputs {self.inputs}; rename {clash}."
+                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, "
+                f"parameters {self.parameters} and inputs {self.inputs}; rename {clash}."
             )
         _refuse_repeated(self.formulas, self.states)
         _refuse_repeated(self.input_formulas, self.inputs)
@@ -83,27 +86,27 @@ class Lifting:
             present = sorted(formula.used & set(self.inputs))
             if present:
                 raise ConfigError(
-                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted state would need from the future; "
-                    f"make it an input function, or read {present[0]}[-1]."
+                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted "
+                    f"state would need from the future; make it an input function, or read {present[0]}[-1]."
                 )
             if not formula.used - set(self.parameters):
-                raise ConfigError(
-                    f"Lifting: {formula.text!r} depends on no state ({', '.join(self.states)}); a constant cannot be lifted, remove it."
-                )
+                problem = f"depends on no state ({', '.join(self.states)}); a constant cannot be lifted"
+                raise ConfigError(f"Lifting: {formula.text!r} {problem}, remove it.")
         for formula in self.input_formulas:
             if formula.used and not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
+                known = ", ".join(self.inputs) or "none are named"
                 raise ConfigError(
-                    f"Lifting: the input function {formula.text!r} depends on no input ({', '.join(self.inputs) or 'none are named'}); "
+                    f"Lifting: the input function {formula.text!r} depends on no input ({known}); "
                     "a function of states alone belongs to the lifted functions."
                 )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Rebuild from the texts in a worker process: compiled formulas do not travel."""
-        return Lifting, (self.states, self.functions, self.parameters, self.inputs, self.input_functions, self.sizes)
+        """Rebuild from the texts in a worker process: programs do not travel."""
+        return Lifting, tuple(getattr(self, f.name) for f in fields(self))
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Lifting:
-        """Rebuild a lifting from an artifact: ``states``, ``lifting``, ``parameters`` and, where there are any, those of `extension`."""
+        """Rebuild a lifting from ``states``, ``lifting``, ``parameters`` and what `extension` gave."""
         return cls(
             tuple(content["states"]),
             tuple(content["lifting"]),
@@ -115,18 +118,17 @@ class Lifting:
 
     def extension(self) -> dict[str, Any]:
         """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
-        found: dict[str, Any] = (
-            {"lifting_inputs": self.inputs, "input_functions": self.input_functions} if self.inputs else {}
-        )
-        return found | ({"sizes": self.sizes} if self.sizes else {})
+        extra = {"lifting_inputs": self.inputs, "input_functions": self.input_functions, "sizes": self.sizes}
+        return {name: value for name, value in extra.items() if value}
 
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
-        """Return the same lifting for states and inputs divided by sizes, with functions divided by theirs; formulas stay as they are written.
+        """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
 
         Parameters
         ----------
         sizes : mapping of str to float
-            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is the way back.
+            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is
+            the way back.
 
         Examples
         --------
@@ -153,16 +155,15 @@ class Lifting:
         return self._parsed(self.input_functions)
 
     def _parsed(self, texts: tuple[str, ...]) -> tuple[Formula, ...]:
-        names, delayed, own = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
-        sizes = tuple((name, own[name]) for name in delayed if name in own)
-        return tuple(Formula(text, names, delayed, sizes, own.get(require_text(text), 1.0)) for text in texts)
+        names, delayed, known = self.states + self.parameters + self.inputs, self.states + self.inputs, dict(self.sizes)
+        sizes = tuple((name, known[name]) for name in delayed if name in known)
+        return tuple(Formula(text, names, delayed, sizes, known.get(require_text(text), 1.0)) for text in texts)
 
     @cached_property
     def window(self) -> Window:
         """Which earlier values the formulas read."""
-        return Window.of(
-            self.states, self.inputs, [name for f in self.formulas + self.input_formulas for name in f.used]
-        )
+        used = [name for f in self.formulas + self.input_formulas for name in f.used]
+        return Window.of(self.states, self.inputs, used)
 
     @property
     def history(self) -> int:
@@ -185,18 +186,9 @@ class Lifting:
         return self.states + self.functions
 
     def lift(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the lifted states.
+        """Return the lifted states (..., n + p) of windows (..., n_window): of states alone where there are no delays.
 
-        Parameters
-        ----------
-        x : array_like, shape (..., n_window)
-            Windows (see `windows`); states alone, shape (..., n), for a lifting without delays.
-        parameters : mapping of str to array_like
-            Values that broadcast against ``x[..., 0]``.
-
-        Returns
-        -------
-        ndarray, shape (..., n + p)
+        Values of parameters broadcast against ``x[..., 0]``.
         """
         x = self._windows(x)
         lifted = np.empty((*x.shape[:-1], self.n_lifted))
@@ -209,39 +201,22 @@ class Lifting:
 
         Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
         """
-        self._columns.fill(self._values(lifted, parameters, earlier), lifted)
+        self._columns[0].fill(lifted, self._values(parameters, lifted, earlier))
 
     def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the inputs with the input functions behind them.
-
-        Parameters
-        ----------
-        u : array_like, shape (..., m)
-        window : array_like, shape (..., n_window)
-        parameters : mapping of str to array_like
-
-        Returns
-        -------
-        ndarray, shape (..., m + r)
-        """
+        """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
         u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
         if not self.input_functions:
             return u
         window = self._windows(window)
-        out = np.empty((*u.shape[:-1], u.shape[-1] + len(self.input_functions)))
-        out[..., : u.shape[-1]] = u
-        self._input_columns.fill(self._values(window, parameters, window[..., self.n_states :], u), out)
+        out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
+        values = self._values(parameters, window, window[..., self.n_states :], u)
+        self._columns[1].fill(out, values)
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window), the first one at sample `history`.
-
-        Raises
-        ------
-        DataError
-            When the recording is shorter than the history.
-        """
+        """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
         self.window.require_inputs(u)
         return self.window.slide(x, u)
 
@@ -250,54 +225,48 @@ class Lifting:
         given = parameters if parameters is not None else {}
         missing = [name for name in self.parameters if name not in given]
         if missing:
-            raise DimensionError(
-                f"Lifting: parameter values for {missing} are missing, found {sorted(given)}; calibrate the unit first."
-            )
+            problem = f"parameter values for {missing} are missing, found {sorted(given)}"
+            raise DimensionError(f"Lifting: {problem}; calibrate the unit first.")
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
-    def retract(self, lifted: npt.ArrayLike) -> Array:
-        """Return the original states, a slice of the lifted ones."""
-        return np.asarray(lifted, dtype=float)[..., : self.n_states]
-
     def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted functions alone by every entry of the window, shape (..., p, n_window)."""
-        x = self._windows(x)
-        slopes = np.empty((*x.shape[:-1], len(self.functions) * x.shape[-1]))
-        self._derivatives.fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
-        return slopes.reshape(*x.shape[:-1], len(self.functions), x.shape[-1])
+        """Return the derivative of the lifted functions by every entry of the window, shape (..., p, n_window)."""
+        return self._slopes(self.window.names, x, parameters)
 
     def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
-        """Return the derivative of the lifted functions alone by one of the parameters, shape (..., p); x as in `slopes`."""
-        x = self._windows(x)
-        slopes = np.empty((*x.shape[:-1], len(self.functions)))
-        self._parameter_derivatives[name].fill(self._values(x, parameters, x[..., self.n_states :]), slopes)
-        return slopes
+        """Return the derivative of the lifted functions by one of the parameters, shape (..., p)."""
+        return self._slopes((name,), x, parameters)[..., 0]
 
     def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the input functions by every entry of the window, the inputs held, shape (..., r, n_window).
-
-        Parameters
-        ----------
-        u : array_like, shape (..., m)
-        window : array_like, shape (..., n_window)
-        parameters : mapping of str to array_like
-        """
-        u, window = np.asarray(u, dtype=float), self._windows(window)
+        """Return the derivative of the input functions by every entry of the window, shape (..., r, n_window)."""
+        u = np.asarray(u, dtype=float)
         self.window.require_inputs(u)
-        slopes = np.empty((*window.shape[:-1], len(self.input_functions) * window.shape[-1]))
-        self._input_derivatives.fill(self._values(window, parameters, window[..., self.n_states :], u), slopes)
-        return slopes.reshape(*window.shape[:-1], len(self.input_functions), window.shape[-1])
+        return self._slopes(self.window.names, window, parameters, u)
+
+    def _slopes(
+        self, names: tuple[str, ...], x: npt.ArrayLike, parameters: Parameters | None, u: Array | None = None
+    ) -> Array:
+        """Return derivatives by some names of the lifted functions, or with inputs of the input functions."""
+        x, formulas = self._windows(x), self.formulas if u is None else self.input_formulas
+        slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
+        if (names, u is None) not in self._derivatives:
+            trees = [formula.derivative(name) for formula in formulas for name in names]
+            self._derivatives[names, u is None] = Columns.of(trees)
+        values = self._values(parameters, x, x[..., self.n_states :], u)
+        self._derivatives[names, u is None].fill(slopes, values)
+        return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives: the bounds hold between any two points of the box, and are infinite where a slope is, or where
-        a function jumps or is not defined. Every operation rounds outwards.
+        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and
+        are infinite where a slope is, or where a function jumps or is not defined.
 
         Parameters
         ----------
         box : mapping of str to (lower, upper) or number
-            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its quantity.
+            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its
+            quantity.
         parameters : mapping of str to number or (lower, upper)
             A parameter that is not named may be anything.
 
@@ -310,8 +279,7 @@ class Lifting:
         >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
         array([[100.]])
         """
-        given = {**(box or {}), **(parameters or {})}
-        return slope_bounds_of(self.formulas, self.window.names, given)
+        return slope_bounds_of(self.formulas, self.window.names, {**(box or {}), **(parameters or {})})
 
     @cached_property
     def separation(self) -> FormulaSeparation:
@@ -324,72 +292,51 @@ class Lifting:
         return FormulaSeparation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
-    def _columns(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.expression for formula in self.formulas], first=self.n_states)
+    def _columns(self) -> tuple[Columns, Columns]:
+        """Columns of the lifted functions and of the input functions."""
+        functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
+        return Columns.of(functions, self.n_states), Columns.of(gamma, len(self.inputs))
 
     @cached_property
-    def _input_columns(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.expression for formula in self.input_formulas], first=len(self.inputs))
+    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Columns]:
+        return {}
 
     @cached_property
-    def _derivatives(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas for name in self.window.names])
-
-    @cached_property
-    def _parameter_derivatives(self) -> dict[str, ColumnEvaluator]:
-        return {
-            name: ColumnEvaluator.of([formula.derivative(name) for formula in self.formulas])
-            for name in self.parameters
-        }
-
-    @cached_property
-    def _input_derivatives(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of(
-            [formula.derivative(name) for formula in self.input_formulas for name in self.window.names]
-        )
-
-    @cached_property
-    def _read_states(self) -> tuple[tuple[int, str], ...]:
-        """Places and names of the present states that functions read: an observer may have many of which they do not know."""
-        used = {name for formula in self.formulas + self.input_formulas for name in formula.used}
-        return tuple((i, name) for i, name in enumerate(self.states) if name in used)
+    def _read(self) -> frozenset[str]:
+        return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
 
     def _windows(self, x: npt.ArrayLike) -> Array:
         x = np.asarray(x, dtype=float)
         names = self.window.names
         if x.shape[-1:] != (len(names),):
-            what = "states" if names == self.states else "entries of a window"
-            raise DimensionError(
-                f"Lifting: expected {len(names)} {what} {names} on the last axis, found shape {x.shape}."
-            )
+            raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")
         return x
 
     def _values(
-        self, x: Array, parameters: Parameters | None, earlier: Array | None = None, u: Array | None = None
+        self, parameters: Parameters | None, x: Array, earlier: Array | None, u: Array | None = None
     ) -> dict[str, Array]:
+        """Return arrays by name, of states those that functions read: an observer may have many more."""
         values = self.parameter_values(parameters)
-        values.update({name: x[..., i] for i, name in self._read_states})
-        if earlier is not None:
-            values.update({name: earlier[..., i] for i, name in enumerate(self.window.earlier)})
-        elif self.window.depths:
-            raise DimensionError(
-                f"Lifting: the earlier values {self.window.earlier} are missing; pass them, or lift windows."
-            )
-        if u is not None:
-            values.update({name: u[..., i] for i, name in enumerate(self.inputs)})
+        values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
+        if earlier is None and self.window.depths:
+            problem = f"the earlier values {self.window.earlier} are missing"
+            raise DimensionError(f"Lifting: {problem}; pass them, or lift windows.")
+        for names, columns in ((self.window.earlier, earlier), (self.inputs, u)):
+            if columns is not None:
+                values |= {name: columns[..., i] for i, name in enumerate(names)}
         return values
 
 
 def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) -> None:
     import sympy as sp
 
-    known: dict[Any, str] = {}
+    names, known = {sp.Symbol(name, real=True): name for name in originals}, dict[Any, str]()
     for formula in formulas:
-        original = next((name for name in originals if formula.written == sp.Symbol(name, real=True)), None)
-        if original is not None:
+        if formula.written in names:
+            original = names[formula.written]
             raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
         if formula.written in known:
-            raise ConfigError(
-                f"Lifting: functions repeat one of them, {formula.text!r} is {known[formula.written]!r}; every lifted function must be listed once."
-            )
+            other = known[formula.written]
+            problem = f"functions repeat one of them, {formula.text!r} is {other!r}"
+            raise ConfigError(f"Lifting: {problem}; list every function once.")
         known[formula.written] = formula.text

@@ -1,4 +1,4 @@
-"""Formulas as parameter-dependent combinations of parameter-free ones, so that data are read once for all parameter values."""
+"""Formulas as combinations of parameter-free ones, so that data are read once for all parameter values."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from .evaluation import ColumnEvaluator, compile_expression
-from .formula import Formula
-from .limits import MAX_TERMS, count_terms
+from .formula import MAX_TERMS, Formula, count_terms
+from .program import Columns, Program
 from .window import Window
 
 Array = npt.NDArray[np.float64]
@@ -28,31 +27,27 @@ class FormulaSeparation:
     basis: tuple[Any, ...]  # SymPy trees of ``g``
     terms: tuple[
         tuple[tuple[int, Any], ...], ...
-    ]  # for each function its pairs of a column of ``g`` and the SymPy tree of the coefficient
+    ]  # of each function pairs of a column of ``g`` and the coefficient's tree
 
     @classmethod
     def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
         """Separate every formula; one that does not separate raises ConfigError."""
         import sympy as sp
 
-        own = {sp.Symbol(name, real=True) for name in parameters}
+        symbols = {sp.Symbol(name, real=True) for name in parameters}
         basis: dict[Any, int] = {}
-        rows = []
-        for formula in formulas:
-            row = []
-            for coefficient, function in _terms(formula, own):
-                row.append((basis.setdefault(function, len(basis)), coefficient))
-            rows.append(tuple(row))
-        return cls(window, parameters, tuple(basis), tuple(rows))
+        pairs = [_terms(formula, symbols) for formula in formulas]
+        rows = tuple(tuple((basis.setdefault(g, len(basis)), coefficient) for coefficient, g in row) for row in pairs)
+        return cls(window, parameters, tuple(basis), rows)
 
     @cached_property
-    def _columns(self) -> ColumnEvaluator:
-        return ColumnEvaluator.of(self.basis)
+    def _columns(self) -> Columns:
+        return Columns.of(self.basis)
 
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
-        """Return the parameter-free functions at windows (..., n_window), with the present inputs for input functions; shape (..., n_basis)."""
+        """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
-        self._columns.fill(self.window.values(window, u), out)
+        self._columns.fill(out, self.window.values(window, u))
         return out
 
     def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:
@@ -62,12 +57,12 @@ class FormulaSeparation:
         matrix = np.zeros((*shape, len(self.terms), len(self.basis)))
         for i, row in enumerate(self.terms):
             for j, coefficient in row:
-                matrix[..., i, j] += compile_expression(coefficient)(values)
+                matrix[..., i, j] += Program.of([coefficient]).run(values)[0]
         return matrix
 
 
 def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
-    """Pairs of a coefficient of parameters and a function without them; a formula without parameters is its own function."""
+    """Pairs of a coefficient of parameters and a function without them."""
     import sympy as sp
 
     if not formula.expression.free_symbols & parameters:
@@ -77,13 +72,13 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
     _require_short(formula, apart)
     pairs = []
     for term in sp.Add.make_args(sp.expand(apart, trig=False)):
-        coefficient, function = term.as_independent(
-            *(s for s in term.free_symbols if s not in parameters), as_Add=False
-        )
+        data = (symbol for symbol in term.free_symbols if symbol not in parameters)
+        coefficient, function = term.as_independent(*data, as_Add=False)
         if function.free_symbols & parameters:
             names = tuple(sorted(p.name for p in parameters))
             raise ConfigError(
-                f"Lifting function {formula.text!r}: parameters {names} must enter as factors or as phases of sin and cos; rewrite it."
+                f"Lifting function {formula.text!r}: parameters {names} must enter as factors or as phases of sin and "
+                "cos."
             )
         pairs.append((coefficient, function))
     return pairs
@@ -93,8 +88,8 @@ def _require_short(formula: Formula, expression: Any) -> None:
     count = count_terms(expression)
     if count > MAX_TERMS:
         raise ConfigError(
-            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} terms, at most {MAX_TERMS} are kept; "
-            "split it into several functions."
+            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} "
+            f"terms, at most {MAX_TERMS} are kept; split it into several functions."
         )
 
 
@@ -103,18 +98,16 @@ def _split_angles(expression: Any, parameters: set[Any]) -> Any:
     import sympy as sp
 
     def split(argument: Any) -> tuple[Any, Any]:
-        own: list[Any] = []
-        data: list[Any] = []
-        for term in sp.Add.make_args(sp.expand(argument) if argument.free_symbols & parameters else argument):
-            (own if term.free_symbols and term.free_symbols <= parameters else data).append(term)
-        return sp.Add(*data), sp.Add(*own)
+        terms = sp.Add.make_args(sp.expand(argument) if argument.free_symbols & parameters else argument)
+        phase = [term for term in terms if term.free_symbols and term.free_symbols <= parameters]
+        return sp.Add(*(term for term in terms if term not in phase)), sp.Add(*phase)
 
     def sine(argument: Any) -> Any:
-        data, own = split(argument)
-        return sp.sin(data) * sp.cos(own) + sp.cos(data) * sp.sin(own)
+        data, phase = split(argument)
+        return sp.sin(data) * sp.cos(phase) + sp.cos(data) * sp.sin(phase)
 
     def cosine(argument: Any) -> Any:
-        data, own = split(argument)
-        return sp.cos(data) * sp.cos(own) - sp.sin(data) * sp.sin(own)
+        data, phase = split(argument)
+        return sp.cos(data) * sp.cos(phase) - sp.sin(data) * sp.sin(phase)
 
     return expression.replace(sp.sin, sine).replace(sp.cos, cosine)

@@ -2,7 +2,7 @@
 
 A window is what a lifting is evaluated on: the present states, then the earlier values that its formulas name,
 
-    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its own depth d.
+    w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its depth d
 
 At the next sample each earlier value takes the place behind it; the shift is exact, no model is asked.
 """
@@ -35,11 +35,9 @@ class Window:
     def of(cls, states: tuple[str, ...], inputs: tuple[str, ...], used: Iterable[str]) -> Window:
         """Collect the delays from the names that formulas use."""
         depths: dict[str, int] = {}
-        for name in used:
-            base, delay = base_and_delay(name)
-            if delay:
-                depths[base] = max(depths.get(base, 0), delay)
-        return cls(states, inputs, tuple((q, depths[q]) for q in states + inputs if q in depths))
+        for base, delay in map(base_and_delay, used):
+            depths[base] = max(depths.get(base, 0), delay)
+        return cls(states, inputs, tuple((q, depths[q]) for q in states + inputs if depths.get(q)))
 
     @property
     def history(self) -> int:
@@ -47,17 +45,19 @@ class Window:
         return max((depth for _, depth in self.depths), default=0)
 
     @cached_property
-    def earlier(self) -> tuple[str, ...]:
-        """Names of the earlier values, in the order of the window."""
-        return tuple(delayed_name(q, d) for q, d in self.quantities if d)
+    def delayed(self) -> tuple[tuple[str, int], ...]:
+        """The quantity behind every earlier value, and how many samples before it is meant."""
+        return tuple((q, d) for q, depth in self.depths for d in range(1, depth + 1))
 
     @cached_property
+    def earlier(self) -> tuple[str, ...]:
+        """Names of the earlier values, in the order of the window."""
+        return tuple(delayed_name(q, d) for q, d in self.delayed)
+
+    @property
     def quantities(self) -> tuple[tuple[str, int], ...]:
         """The quantity behind every entry, and how many samples before it is meant."""
-        return (
-            *((state, 0) for state in self.states),
-            *((q, d) for q, depth in self.depths for d in range(1, depth + 1)),
-        )
+        return (*((state, 0) for state in self.states), *self.delayed)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -68,19 +68,16 @@ class Window:
     def shift(self) -> Index:
         """Entry of ``[window, inputs]`` that every earlier value has at the next sample."""
         entries = (*self.names, *self.inputs)
-        return np.array(
-            [entries.index(delayed_name(q, d - 1)) for q, depth in self.depths for d in range(1, depth + 1)],
-            dtype=np.intp,
-        )
+        return np.array([entries.index(delayed_name(q, d - 1)) for q, d in self.delayed], dtype=np.intp)
 
     @cached_property
     def present(self) -> Index:
         """Entry of ``[window, inputs]`` of the quantity that every earlier value is one of."""
         entries = (*self.names, *self.inputs)
-        return np.array([entries.index(q) for q, depth in self.depths for _ in range(depth)], dtype=np.intp)
+        return np.array([entries.index(q) for q, _ in self.delayed], dtype=np.intp)
 
     def advance(self, window: Array, u: Array) -> Array:
-        """Return the earlier values of the next sample, shape (..., n_earlier), from a window and the inputs of this one."""
+        """Return the earlier values of the next sample, shape (..., n_earlier), from a window and its inputs."""
         return np.concatenate([window, u], axis=-1)[..., self.shift]
 
     def hold(self, x: Array, u: Array) -> Array:
@@ -93,35 +90,30 @@ class Window:
         if not self.depths:
             return x
         self.require(x.shape[-2])
-        columns = {
-            name: values[..., i]
-            for names, values in ((self.states, x), (self.inputs, u))
-            for i, name in enumerate(names)
-        }
-        end, h = x.shape[-2], self.history
-        earlier = [columns[q][..., h - d : end - d] for q, depth in self.depths for d in range(1, depth + 1)]
+        columns = {name: x[..., i] for i, name in enumerate(self.states)}
+        columns |= {name: u[..., i] for i, name in enumerate(self.inputs)}
+        h, end = self.history, x.shape[-2]
+        earlier = [columns[q][..., h - d : end - d] for q, d in self.delayed]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
     def require(self, n_samples: int, beyond: int = 0) -> None:
         """Refuse a recording that is shorter than the history and `beyond` samples after its first window."""
         needed = self.history + 1 + beyond
         if n_samples < needed:
-            deepest = max(self.depths, key=lambda item: item[1], default=("", 0))
-            reason = f" for the delay of {deepest[1]} in {deepest[0]!r}" if self.depths else ""
+            name, depth = max(self.depths, key=lambda item: item[1], default=("", 0))
+            reason = f" for the delay of {depth} in {name!r}" if self.depths else ""
+            remedy = "leave the episode out or use shorter delays"
             raise DataError(
-                f"Lifting a recording: needs at least {needed} samples{reason}, found {n_samples}; leave the episode out or use shorter delays."
+                f"Lifting a recording: needs at least {needed} samples{reason}, found {n_samples}; {remedy}."
             )
 
     def require_inputs(self, u: Array) -> None:
         """Refuse inputs that are not those the formulas were written for."""
         if self.inputs and u.shape[-1] != len(self.inputs):
-            raise DimensionError(
-                f"Lifting: expected {len(self.inputs)} inputs {self.inputs} on the last axis, found shape {u.shape}."
-            )
+            needed = f"{len(self.inputs)} inputs {self.inputs} on the last axis"
+            raise DimensionError(f"Lifting: expected {needed}, found shape {u.shape}.")
 
     def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
         """Return the columns by name, the present inputs with them where they are given."""
         named = {name: window[..., i] for i, name in enumerate(self.names)}
-        if u is not None:
-            named.update({name: u[..., i] for i, name in enumerate(self.inputs)})
-        return named
+        return named if u is None else named | {name: u[..., i] for i, name in enumerate(self.inputs)}

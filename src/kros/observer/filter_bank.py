@@ -1,8 +1,8 @@
 r"""What makes an observer a filter bank: how it starts, and what stands for measurements that are missing.
 
-While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its internal states are the filters z of measurements and inputs, and
-the filters w of inputs alone with their own estimate :math:`x^u` of all recorded states. While measurements arrive, the estimate is that of z. The
-fallback
+While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its internal
+states are the filters z of measurements and inputs, whose estimate is given then, and the filters w of inputs alone with
+their own estimate :math:`x^u` of all recorded states. The fallback
 
 .. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
 

@@ -7,8 +7,11 @@ Examples
 True
 """
 
-from .model import RefinedModels
+from ...core.removed import refusing
+from .gauss_newton import GaussNewton
+from .model import Refinement
 from .options import RefineOptions
 from .population import refine_population
 
-__all__ = ["RefineOptions", "RefinedModels", "refine_population"]
+__all__ = ["GaussNewton", "RefineOptions", "Refinement", "refine_population"]
+__getattr__ = refusing(__name__)

@@ -1,6 +1,7 @@
-"""Distance of a unit from the pooled model as the uncertainty of the population will count it: the prior.
+"""Distance of models as the uncertainty of the population will count it: the prior, and the spread of a population.
 
-In scaled inputs and outputs E is the residual of the inverse input multiplicative form, with the pooled model G0 as nominal:
+In channels divided by their ranges E is the residual of the inverse input multiplicative form, with the pooled model G0
+as nominal:
 
     E = G^+ (G - G0),      G = Phi B,  Phi = (zI - A)^-1,      dE = (G^+ Phi) dW Z (I - E),  Z = [G; I]
     cost = N strength level^2 mean over frequency of [(1 + e)^power - 1] / power,      e = (||E||_F / level)^2
@@ -18,12 +19,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
-from ...core.small_matrices import entries_last, pseudo_inverse_first
+from ...core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max_first
+from .minimax import smallest_largest
 
 Array = npt.NDArray[np.float64]
 Complex = npt.NDArray[Any]
-_DECADES_BELOW_NYQUIST = 6
-_POINTS = 100
+
+
+def unit_circle(points: int, decades: int = 6) -> Complex:
+    """Return ``exp(j omega)`` at logarithmic frequencies, some decades below Nyquist up to it."""
+    return np.asarray(np.exp(1j * np.pi * np.logspace(-decades, 0, points)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,11 +38,10 @@ class ResponsePrior:
     A: Array  # (n, n)
     B: Array  # (n, m)
     T: Array  # (n + m, n + m)
-    output_scale: Array  # (n,)
-    input_scale: Array  # (m,)
+    level: float
+    power: int
     weight: float = 1.0
-    level: float = 0.3
-    power: int = 2
+    points: int = 100
 
     def scaled(self, weight: float) -> ResponsePrior:
         """Return the same prior with another weight."""
@@ -46,37 +50,54 @@ class ResponsePrior:
     def residual(self, V: Array) -> tuple[Complex, Complex, Complex]:
         """Return E (unit, frequency, m, m) of models V, ``G^+ Phi`` and ``T^T Z (I - E)``."""
         W = V @ self.T.T
-        n = self.A.shape[-1]
-        m = self.B.shape[-1]
-        z = np.exp(1j * np.pi * np.logspace(-_DECADES_BELOW_NYQUIST, 0, _POINTS))
+        n, m = self.B.shape
+        z = unit_circle(self.points)
         shifted = z[:, None, None] * np.eye(n)
         Phi = np.linalg.inv(shifted - W[:, None, :, :n])
-        G = Phi @ W[:, None, :, n:] * self.input_scale
-        G0 = np.linalg.solve(shifted - self.A, self.B + 0j * z[:, None, None]) * self.input_scale
-        left = entries_last(pseudo_inverse_first(G / self.output_scale[:, None])) / self.output_scale
+        G = Phi @ W[:, None, :, n:]
+        G0 = np.linalg.solve(shifted - self.A, self.B + 0j * z[:, None, None])
+        left = entries_last(pseudo_inverse_first(G))
         E = left @ (G - G0)
-        Z = np.concatenate([G, np.broadcast_to(np.diag(self.input_scale), (*G.shape[:2], m, m))], axis=-2)
+        Z = np.concatenate([G, np.broadcast_to(np.eye(m), (*G.shape[:2], m, m))], axis=-2)
         return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))
 
     def normal(self, V: Array) -> Array:
-        """Return ``[J r]^T [J r]`` with r = -E, weighted so that the gradient is that of the cost; shape (unit, P + 1, P + 1)."""
+        """Return ``[J r]^T [J r]`` with r = -E, weighted for the gradient of the cost; shape (unit, P + 1, P + 1)."""
         E, a, Z = self.residual(V)
         size = np.sum(np.abs(E) ** 2, axis=(-1, -2)) / self.level**2  # (unit, frequency)
         slope = self.weight * (1 + size) ** (self.power - 1) / size.shape[1]
         units, rows, columns = V.shape
         by_row = (adjoint(a) @ a) * slope[..., None, None]
         by_column = Z.conj() @ np.swapaxes(Z, -1, -2)
-        form = (
-            by_row.reshape(*size.shape, -1).transpose(0, 2, 1) @ by_column.reshape(*size.shape, -1)
-        ).real  # (unit, rows rows, columns columns)
-        H = (
-            form.reshape(units, rows, rows, columns, columns)
-            .transpose(0, 1, 3, 2, 4)
-            .reshape(units, rows * columns, -1)
-        )
+        flat = by_row.reshape(*size.shape, -1).transpose(0, 2, 1), by_column.reshape(*size.shape, -1)
+        form = (flat[0] @ flat[1]).real.reshape(units, rows, rows, columns, columns)
+        H = form.transpose(0, 1, 3, 2, 4).reshape(units, rows * columns, -1)
         pull = adjoint(a) @ (E * slope[..., None, None]) @ adjoint(Z)
         g = -pull.real.sum(axis=1).reshape(units, -1)
         out = np.empty((units, H.shape[-1] + 1, H.shape[-1] + 1))
         out[:, :-1, :-1], out[:, :-1, -1], out[:, -1, :-1] = H, g, g
         out[:, -1, -1] = self.weight * self.level**2 * np.mean(((1 + size) ** self.power - 1) / self.power, axis=1)
         return out
+
+
+def peak_residual_db(A: Array, B: Array, points: int = 200) -> float:
+    """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, channels over ranges."""
+    if len(A) < 2:
+        return float("nan")
+    z = unit_circle(points)
+    G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
+    inverse, G, every = pseudo_inverse_first(G), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
+
+    def bound_of(row: int) -> tuple[Complex, Complex]:
+        sizes = sigma_max_first(multiply(inverse, G[:, :, row, None] - G))
+        return sizes.max(axis=0), sizes.argmax(axis=0)
+
+    def against(rows: Complex, witness: Complex) -> Complex:
+        farthest = G[:, :, None, witness, every]
+        return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - farthest))
+
+    if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
+        return -np.inf
+    _, _, peaks, exact = smallest_largest((len(A), points), 0, bound_of, against, lambda bound: bound.max(axis=-1))
+    with np.errstate(divide="ignore"):
+        return float(20 * np.log10(peaks[exact].min()))

@@ -1,10 +1,11 @@
-r"""Exact search for the candidate whose largest residual is smallest, without visiting all pairs of candidates and units.
+r"""Exact search for the candidate whose largest residual is smallest, without visiting all pairs.
 
-A candidate's bound is the largest residual over the units, `b_c(f) = max_k sigma(E(c, k, f))`; any units and frequencies that were looked at give a bound of
-`b_c` from below. The search evaluates the candidate with the lowest such bound over *all* units, asks which unit was the worst at every frequency, and
-raises the lower bounds of all other candidates by these witnesses. A candidate whose lower bound exceeds the best score so far is never evaluated;
-when none is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units, so that
-few rounds are needed; each visits as many pairs as there are units, not their square.
+A candidate's bound is the largest residual over the units, `b_c(f) = max_k sigma(E(c, k, f))`; any units and
+frequencies that were looked at give a bound of `b_c` from below. The search evaluates the candidate with the lowest
+such bound over *all* units, asks which unit was the worst at every frequency, and raises the lower bounds of all other
+candidates by these witnesses. A candidate whose lower bound exceeds the best score so far is never evaluated; when none
+is left below, the best is the best of all: nothing is assumed about the population. A population has few extreme units,
+so that few rounds are needed; each visits as many pairs as there are units, not their square.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ def smallest_largest(
     against: Callable[[Array, Array], Array],
     score: Score,
 ) -> tuple[int, Array, Array, Array]:
-    """Return the candidate whose bound has the lowest score, its bound, all scores (lower bounds where not evaluated), and which are exact."""
+    """Return the best candidate, its bound, all scores (lower bounds where not evaluated), and which are exact."""
     lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
     best, row = np.inf, first
     while scores[row] <= best * (1 + TIE):
@@ -41,11 +42,7 @@ def smallest_largest(
         lower[rows] = np.maximum(lower[rows], against(rows, witness))
         scores[rows] = np.maximum(scores[rows], score(lower[rows]))
         row = int(rows[np.argmin(scores[rows])])
-    index = first_best(np.where(evaluated, scores, np.inf))
+    exact = np.where(evaluated, scores, np.inf)
+    least = exact.min()
+    index = int(np.argmax(exact <= least + TIE * np.abs(least)))  # the first of those that rounding may have told apart
     return index, lower[index], scores, evaluated
-
-
-def first_best(scores: Array) -> int:
-    """Return the first of the lowest scores, which rounding may have told apart."""
-    least = scores.min()
-    return int(np.argmax(scores <= least + TIE * np.abs(least))) if np.isfinite(least) else int(np.argmin(scores))

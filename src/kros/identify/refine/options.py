@@ -2,49 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from ...core.errors import ConfigError
-
-LARGEST_RESIDUAL = (
-    0.5  # peak residual beyond which the set of models that covers a population is too large for a robust observer
-)
-NEGLIGIBLE_RESIDUAL = 0.1  # peak residual up to which less uncertainty is worth nothing, so that accuracy alone decides
-TOLERANCE = 0.1  # the strongest prior whose held-out error exceeds the lowest by no more than this share is chosen
-GUARD = 2e-3  # spectral radii above one less this are penalised, so that the search slides along the edge of stability
-ALPHA_FACTOR = 4.0  # the start is a pooled EDMD model with this times the smallest alpha that stabilises it
-LEAST_GAIN = 1e-3  # relative decrease of the cost below which a horizon is done
-SEED = 0  # where the segments start
+from .gauss_newton import GaussNewton
 
 
 @dataclass(frozen=True)
 class RefineOptions:
-    """Settings of `refine_population`.
-
-    Parameters
-    ----------
-    horizons : tuple of int
-        Samples of the free runs, from short to long; the last is the one that the result minimises.
-    segments : int
-        Stretches of recordings used of every unit, spread over its training episodes.
-    strengths : tuple of float
-        Strengths of the prior to choose from, tried from the strongest on until weaker ones do not improve the held-out error. At 1 a
-        residual of one at all frequencies costs as much as the free-run error of the pooled model (with ``power = 1``; see `metric`).
-    balance : float
-        A state's error counts in units of ``start**balance * range**(1 - balance)``, with `start` the free-run error of the EDMD
-        model and `range` that of the state: 0 weighs states by their range, 1 asks every state for the same improvement.
-    starts : tuple of (int, float)
-        First horizons and weighings from which the pooled model is sought; the end whose whole free runs are best is taken.
-    pooled_segments : int
-        Segments of all units together from which the pooled model is sought; it is finished on all.
-    margin : float
-        Stable means a spectral radius below ``1 - margin``.
-    iterations : int
-        Most steps of Levenberg-Marquardt per horizon of the pooled model, and of the units at the strength chosen.
-    path_iterations : int
-        Most steps at each strength before one is chosen; each starts where the stronger prior ended.
-    bound : float
-        A free run on training episodes may reach this times the range of the states.
+    """Settings of `refine_population`: errors of channels divided by their ranges, horizons in samples.
 
     Raises
     ------
@@ -58,33 +24,61 @@ class RefineOptions:
     (10, 100)
     """
 
-    horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)
-    segments: int = 24
-    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)
-    balance: float = 0.65
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))
-    pooled_segments: int = 120
-    margin: float = 1e-5
-    iterations: int = 15
-    path_iterations: int = 8
-    bound: float = 10.0
+    # Data of the search
+    horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)  # of the free runs; the last one is minimised
+    segments: int = 24  # stretches of recordings of every unit, spread over its training episodes
+    pooled_segments: int = 120  # of all units together, from which the pooled model is sought; it is finished on all
+    compared: int = 64  # residuals of a state in a segment, at least: neighbouring errors of a long run say the same
+    seed: int = 0  # where the segments start
+
+    # Pooled model
+    alpha_factor: float = 4.0  # its EDMD start has this times the smallest alpha that stabilises it
+    starts: tuple[tuple[int, float], ...] = (
+        (5, 0.8),
+        (320, 0.8),
+    )  # first horizon and balance: there are several minima
+    trial_iterations: int = 4  # within the edge of stability, before whole free runs compare the ends of the starts
+    balance: float = 0.65  # errors count in units of error**balance of EDMD: 0 weighs ranges, 1 the improvement
+    least_error: float = 1e-6  # of a state's free run by EDMD: exact data have none to scale by
+    row_weight: float = 0.1  # of a lifted function's one-step error, which does not enter free runs
+
+    # Stability
+    margin: float = 1e-5  # stable means a spectral radius below one less this
+    guard: float = 2e-3  # radii above one less this are penalised: the search slides along the edge of stability
+    shortenings: int = 20  # steps in which an unstable model's rows of lifted functions are shortened
+    penalties: int = 8  # decades over which the weight of the edge of stability then grows
+    bound: float = 10.0  # largest value of a free run on training episodes
+
+    # Prior
+    prior_level: float = 0.3  # residual up to which the prior is quadratic
+    prior_power: int = 2  # beyond the level, which flattens the residual's peak
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)  # strongest first
+    patience: int = 3  # strengths over which the held-out error must fall by half of the tolerance
+    tolerance: float = (
+        0.1  # the strongest prior is chosen whose held-out error exceeds the lowest by at most this share
+    )
+    largest_residual: float = 0.5  # peak beyond which a set of models is too large for a robust observer
+    negligible_residual: float = 0.1  # peak up to which accuracy alone decides
+
+    # Search
+    search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon, and of the units at the strength chosen
+    restarts: int = 4  # searches in which units that have not converged continue
+    path_iterations: int = 8  # at each strength before one is chosen; each starts where the stronger prior ended
 
     def __post_init__(self) -> None:
-        good = {
-            "horizons": len(self.horizons) > 0
-            and min(self.horizons, default=0) >= 1
-            and tuple(sorted(self.horizons)) == self.horizons,
+        """Refuse what is out of its range."""
+        usable = {
+            "horizons": min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
-            "strengths": len(self.strengths) > 0 and min(self.strengths, default=0.0) > 0,
-            "balance": 0 <= self.balance <= 1,
-            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "pooled_segments": self.pooled_segments >= 1,
+            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
+            "balance": 0 <= self.balance <= 1,
+            "strengths": min(self.strengths, default=0.0) > 0,
             "margin": 0 <= self.margin < 1,
-            "iterations": min(self.iterations, self.path_iterations) >= 1,
             "bound": self.bound >= 1,
+            "search": min(self.search.iterations, self.path_iterations) >= 1,
         }
-        for name, fine in good.items():
+        for name, fine in usable.items():
             if not fine:
-                raise ConfigError(
-                    f"Refinement: {name} = {getattr(self, name)} is out of its range; see RefineOptions for what it may be."
-                )
+                problem = f"{name} = {getattr(self, name)} is out of its range"
+                raise ConfigError(f"Refinement: {problem}; see RefineOptions for what it may be.")

@@ -1,9 +1,9 @@
-"""The pooled model: EDMD on all units together, then free-run error at growing horizons, from several weighings of the states."""
+"""The pooled model: EDMD on all units together, then free-run error at growing horizons, from several starts."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -11,172 +11,114 @@ import numpy.typing as npt
 
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle
-from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
-from ..factors import Factor
-from ..ranges import Ranges
-from .marquardt import minimise
-from .options import ALPHA_FACTOR, GUARD, LEAST_GAIN, RefineOptions
+from .model import TrainingData
+from .options import RefineOptions
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .segments import Segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-_COMPARED = 4  # steps within the edge of stability before starts are compared
-_HEAVIER = 8  # decades over which the edge of stability grows
-_LEAST_ERROR = 1e-6  # relative to a state's range: exact data have no error to scale by
 
 
 def start_pooled(
-    lifting: Lifting,
-    parameters: Mapping[str, Array],
-    factor: Factor,
-    segments: Segments,
-    rows: npt.NDArray[np.int64],
-    options: RefineOptions,
-) -> tuple[Array, RefinementProblem, Array, Array]:
-    """Pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units without a prior, errors and ranges of states."""
-    nl, n = lifting.n_lifted, lifting.n_states
-    R = qr_triangle(factor.R[rows].reshape(-1, factor.R.shape[-1]))
+    data: TrainingData, segments: Segments, options: RefineOptions
+) -> tuple[Array, RefinementProblem, Array]:
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
+    lifting, rows = data.lifting, data.rows
+    n, nl = lifting.n_states, lifting.n_lifted
+    R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
     p = R.shape[-1] - nl
-    alpha = ALPHA_FACTOR * smallest_stabilising_alpha([(R[None], nl)], options.margin)
-    matrices = edmd(R, nl, alpha)
-    T = _whitening(R[:p, :p], int(factor.n_samples[rows].sum()))
+    matrices = edmd(R, nl, options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin))
+    T = _whitening(R[:p, :p], int(data.factor.n_samples[rows].sum()))
     V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
-    one_step = OneStep.of(factor.R, T, n, nl, factor.n_samples, rows)
-    problem = RefinementProblem(lifting, parameters, segments, T, np.ones(n), one_step, options.margin)
-    normal = restrict(problem, rows).run(V)
+    one_step = OneStep.of(data.factor, T, n, rows)
+    problem = RefinementProblem(lifting, data.parameters, segments, T, np.ones(n), one_step, options)
+    normal = problem.of_one_model(rows).run(V)
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
-    span = ranges(factor, rows, lifting)[0][:n]
-    error = np.clip(np.where(np.isfinite(error), error, span), _LEAST_ERROR * span, span)
-    return V, replace(problem, sigma=_sigma(error, span, options.balance)), error, span
+    error = np.clip(np.where(np.isfinite(error), error, 1.0), options.least_error, 1.0)
+    return V, replace(problem, sigma=error**options.balance), error
 
 
-def refine_pooled(
-    V: Array,
-    problem: RefinementProblem,
-    error: Array,
-    span: Array,
-    score: Callable[[Array], float],
-    options: RefineOptions,
-) -> Array:
-    """Fit one model to all units, horizons growing; shape (n_lifted, p)."""
-    few = replace(
-        problem, segments=problem.segments.first(max(2, -(-options.pooled_segments // problem.segments.n_units)))
-    )
-    found: list[tuple[float, float, Array]] = []
+def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Callable[[Array], float]) -> Array:
+    """Fit one model to all units, horizons growing, from every start; shape (n_lifted, p)."""
+    options = problem.options
+    count = max(2, -(-options.pooled_segments // problem.segments.n_units))
+    few = replace(problem, segments=problem.segments.first(count))
+    briefly = replace(options.search, iterations=options.trial_iterations)
+    ends: list[tuple[float, float, Array]] = []
     sigma = problem.sigma
     for first, balance in options.starts:
-        grown = _grow(V, replace(few, sigma=_sigma(error, span, balance)), options, few.finite, first)
-        if grown is None:
-            continue
-        end = minimise(few.evaluate, few.finite, grown, options.iterations, LEAST_GAIN)
-        stable = _stabilise(end.V, few, options)
-        if stable is not None and np.isfinite(end.cost).all():
-            sigma = sigma if found else normalised(few, stable).sigma
-            edged = replace(few, sigma=sigma, guard=GUARD)
-            kept = minimise(edged.evaluate, edged.admissible, stable, _COMPARED, LEAST_GAIN)
-            found.append((score(kept.V[0]), float(kept.cost[0]), kept.V))
+        inside = _stable_end(V, few, error**balance, first)
+        if inside is not None:
+            sigma = sigma if ends else normalised(few, inside).sigma
+            edged = replace(few, sigma=sigma, edged=True)
+            end = briefly.minimise(edged.evaluate, edged.admissible, inside)
+            ends.append((score(end.V[0]), float(end.cost[0]), end.V))
             log.debug(
-                "pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *found[-1][:2]
+                "pooled model from horizon %d and balance %g: score %.6g, cost %.6g", first, balance, *ends[-1][:2]
             )
-    if not found:
-        log.warning(
-            "refinement of the pooled model: the best models are unstable, so it is sought among the stable ones"
+    if not ends:
+        raise IdentificationError(
+            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
+            "or the model is unstable; leave out lifting functions that grow, or set identify.refine = false."
         )
-        grown = _grow(V, problem, options, problem.admissible, 1)
-        if grown is None:
-            raise IdentificationError(
-                f"Refinement of the pooled model: free runs over {max(options.horizons)} samples diverge from every start; add shorter "
-                "horizons, or leave out lifting functions that grow."
-            )
-        return np.asarray(grown[0])
-    edged = replace(problem, sigma=sigma, guard=GUARD)
-    best = min(found, key=lambda row: row[:2])[2]
-    return np.asarray(minimise(edged.evaluate, edged.admissible, best, options.iterations, LEAST_GAIN).V[0])
+    edged = replace(problem, sigma=sigma, edged=True)
+    best = min(ends, key=lambda row: row[:2])[2]
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, best).V[0])
 
 
-def _grow(
-    V: Array,
-    problem: RefinementProblem,
-    options: RefineOptions,
-    admissible: Callable[[Array], npt.NDArray[np.bool_]],
-    first: int,
-) -> Array | None:
-    """Minimise at growing horizons from the first one asked for, at most the longest; None where free runs diverge."""
-    V = V.copy()
-    V[:, problem.lifting.n_states :] = (
-        problem.one_step.rows if admissible == problem.finite else V[:, problem.lifting.n_states :]
-    )
-    for horizon in (h for h in options.horizons if h >= min(first, options.horizons[-1])):
-        now = problem.at(horizon)
-        solution = minimise(now.evaluate, admissible, V, options.iterations, LEAST_GAIN)
+def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
+    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
+    options = problem.options
+    stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
+    for stage in (*stages, problem):
+        solution = options.search.minimise(stage.evaluate, problem.finite, V)
         if not np.isfinite(solution.cost).all():
             return None
         V = solution.V
-    return V
+    return _stabilise(V, problem)
 
 
-def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
-    """The problem with errors in units of those that a pooled model V leaves, and with a soft edge of stability."""
-    normal = problem.run(V)
-    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, _LEAST_ERROR**2))
-    return replace(problem, sigma=problem.sigma * size, guard=GUARD)
-
-
-def _stabilise(V: Array, problem: RefinementProblem, options: RefineOptions) -> Array | None:
-    """Bring a model from outside the edge of stability to the inside; None where that fails."""
-    n = problem.lifting.n_states
+def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
+    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
+    n, options = problem.lifting.n_states, problem.options
     shortened = []
-    for factor in np.linspace(1.0, 0.0, 21):
+    for share in np.linspace(1.0, 0.0, options.shortenings + 1):
         shortened.append(V.copy())
-        shortened[-1][:, n:] *= factor
-    for margin in (max(GUARD, problem.margin), problem.margin):
+        shortened[-1][:, n:] *= share
+    for margin in (max(options.guard, options.margin), options.margin):
         for trial in shortened:
-            if replace(problem, margin=margin).admissible(trial).all():
+            if problem.admissible(trial, margin).all():
                 return trial
-    V = min(shortened, key=lambda trial: _radius(trial, problem))
-    weight = problem.residuals * problem.segments.n_units
-    for heavier in 10.0 ** np.arange(_HEAVIER):
+    V = min(shortened, key=lambda trial: float(matrices_of(trial, problem).spectral_radius().max()))
+    for heavier in 10.0 ** np.arange(options.penalties):
 
-        def evaluate(trial: Array, share: float = heavier) -> Array:
-            return problem.evaluate(trial) + share * stability_barrier(trial, problem.T, GUARD, weight)
+        def evaluate(trial: Array, weight: float = heavier) -> Array:
+            edge = stability_barrier(trial, problem.T, options.guard, problem.edge_weight)
+            return problem.evaluate(trial) + weight * edge
 
-        found = minimise(evaluate, problem.finite, V, options.iterations, LEAST_GAIN)
-        if not np.isfinite(found.cost).all():
+        solution = options.search.minimise(evaluate, problem.finite, V)
+        if not np.isfinite(solution.cost).all():
             return None
-        V = found.V
+        V = solution.V
         if problem.admissible(V).all():
             return V
     return None
 
 
-def _radius(V: Array, problem: RefinementProblem) -> float:
-    return float(np.abs(np.linalg.eigvals((V @ problem.T.T)[..., : problem.lifting.n_lifted])).max())
+def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
+    """Return the problem with errors in units of those of a pooled model V, and with a soft edge of stability."""
+    normal, least = problem.run(V), problem.options.least_error
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, least**2))
+    return replace(problem, sigma=problem.sigma * size, edged=True)
 
 
-def restrict(problem: RefinementProblem, rows: npt.NDArray[np.int64]) -> RefinementProblem:
-    """The problem of one model for some units."""
-    own = {name: values[rows] for name, values in problem.parameters.items()}
-    one_step = replace(problem.one_step, matrix=problem.one_step.matrix[rows], least=problem.one_step.least[rows])
-    return replace(problem, parameters=own, segments=problem.segments.units(rows), one_step=one_step, pooled=True)
-
-
-def ranges(factor: Factor, rows: npt.NDArray[np.int64], lifting: Lifting) -> tuple[Array, Array]:
-    """Ranges of lifted states and inputs over the pooled units."""
-    found = Ranges.of(factor, lifting.n_lifted, rows)
-    return found.outputs, found.inputs
-
-
-def matrices_of(V: Array, T: Array, n_lifted: int) -> KoopmanMatrices:
+def matrices_of(V: Array, problem: RefinementProblem) -> KoopmanMatrices:
     """Return A and B of whitened parameters."""
-    W = V @ T.T
+    W, n_lifted = V @ problem.T.T, problem.lifting.n_lifted
     return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
-
-
-def _sigma(error: Array, span: Array, balance: float) -> Array:
-    return np.asarray(error**balance * span ** (1 - balance))
 
 
 def _whitening(R11: Array, n_samples: int) -> Array:

@@ -1,15 +1,17 @@
-"""What is minimised: free-run error of the states, one-step error of the lifted functions, distance from the pooled model.
+"""What is minimised: free-run error of states, one-step error of lifted functions, distance from the pooled model.
 
     sum ||(x_data - x_free_run) / sigma||^2  +  sum ||(sigma+ - w psi) / sigma_row||^2  +  edge of stability  +  prior
 
-The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one slides along it.
+The edge of stability is soft: a search that only rejects unstable models stops where it first meets the edge, this one
+slides along it.
 
-    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2,      d|lambda| = Re[conj(lambda) / |lambda|  y^H dA x / (y^H x)]
+    edge = weight sum_i max(0, (|lambda_i| - 1 + guard) / guard)^2
+    d|lambda| = Re[conj(lambda) / |lambda|  y^H dA x / (y^H x)]
 
 with right and left eigenvectors x, y of A, and ``dA = (dV T^T)`` without its columns of inputs.
 
-A free run retracts and re-lifts, so it does not see the rows of the lifted functions; they enter only the linear model used in
-synthesis, and are fitted one step ahead, from the triangular factors.
+A free run retracts and re-lifts, so the rows of the lifted functions do not enter it; they enter only the linear model
+used in synthesis, and are fitted one step ahead, from the triangular factors.
 
 Symbols
 -------
@@ -25,16 +27,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
+from ..factors import Factor
 from .metric import ResponsePrior
+from .options import RefineOptions
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
 
 Array = npt.NDArray[np.float64]
-_SAMPLES = 64  # residuals of a state that a segment contributes, at least
-_ROW_WEIGHT = 0.1  # of a lifted function's one-step error against a state's free-run error
-_LEAST_VARIANCE = (
-    1e-10  # of the one-step error, relative to the mean square of the function; an earlier value is predicted exactly
-)
+Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,41 +44,33 @@ class OneStep:
     matrix: Array  # (unit, p + f, p + f)
     least: Array  # (unit, f)
     variance: Array  # (f,)
-    rows: Array  # (f, p)
 
     @classmethod
-    def of(
-        cls,
-        R: Array,
-        T: Array,
-        n_states: int,
-        n_lifted: int,
-        n_samples: npt.NDArray[np.int64],
-        pooled: npt.NDArray[np.int64],
-    ) -> OneStep:
-        """Read them from factors of ``[Psi | Theta_plus]``, shape (unit, p + n_lifted, p + n_lifted); `pooled` units set the variance."""
+    def of(cls, factor: Factor, T: Array, n_states: int, pooled: Rows, least_variance: float = 1e-10) -> OneStep:
+        """Read them from factors of ``[Psi | Theta_plus]``; `pooled` units set the variance.
+
+        The variance is at least a share of the function's mean square: an earlier value is predicted exactly.
+        """
         p = len(T)
-        white = np.concatenate([R[..., :p] @ T, R[..., p + n_states : p + n_lifted]], axis=-1)
-        matrix = np.swapaxes(white, -1, -2) @ white / n_samples[:, None, None]
+        white = np.concatenate([factor.R[..., :p] @ T, factor.R[..., p + n_states :]], axis=-1)
+        matrix = np.swapaxes(white, -1, -2) @ white / factor.n_samples[:, None, None]
         mean = matrix[pooled].mean(axis=0)
         rows = np.linalg.lstsq(mean[:p, :p], mean[:p, p:], rcond=None)[0].T
         left = np.diagonal(mean[p:, p:]) - np.sum(rows * mean[:p, p:].T, axis=1)
-        own = np.stack([np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T for M in matrix])
-        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - np.sum(
-            own * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2
-        )
-        return cls(matrix, least, np.maximum(left, _LEAST_VARIANCE * np.diagonal(mean[p:, p:])), rows)
+        best = np.stack([np.linalg.lstsq(M[:p, :p], M[:p, p:], rcond=None)[0].T for M in matrix])
+        explained = np.sum(best * np.swapaxes(matrix[:, :p, p:], 1, 2), axis=2)
+        least = np.diagonal(matrix[:, p:, p:], axis1=1, axis2=2) - explained
+        return cls(matrix, least, np.maximum(left, least_variance * np.diagonal(mean[p:, p:])))
 
     def normal(self, rows: Array, row: int) -> Array:
         """Return ``[J r]^T [J r]`` of one function for rows (unit, p), per sample and in units of its variance."""
         p = rows.shape[-1]
         G, c = self.matrix[:, :p, :p], self.matrix[:, :p, p + row]
         slope = c - (G @ rows[..., None])[..., 0]
-        rest = np.maximum(
-            self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1) - self.least[:, row], 0.0
-        )
+        power = self.matrix[:, p + row, p + row] - np.sum(rows * (c + slope), axis=-1)
         out = np.empty((len(rows), p + 1, p + 1))
-        out[:, :p, :p], out[:, :p, p], out[:, p, :p], out[:, p, p] = G, slope, slope, rest
+        out[:, :p, :p], out[:, :p, p], out[:, p, :p] = G, slope, slope
+        out[:, p, p] = np.maximum(power - self.least[:, row], 0.0)
         return np.asarray(out / self.variance[row])
 
 
@@ -92,11 +84,11 @@ class RefinementProblem:
     T: Array  # (p, p)
     sigma: Array  # (n,)
     one_step: OneStep
-    margin: float
-    pooled: bool = False
-    guard: float | None = None
+    options: RefineOptions
+    pooled: bool = False  # one model for all units
+    edged: bool = False  # whether the edge of stability counts
     prior: ResponsePrior | None = None
-    counted: float | None = None
+    counted: float | None = None  # residuals of the problem that this is a part of
 
     @property
     def residuals(self) -> float:
@@ -108,21 +100,42 @@ class RefinementProblem:
     @property
     def stride(self) -> int:
         """Every how many steps the error counts."""
-        return max(1, self.segments.horizon // _SAMPLES)
+        return max(1, self.segments.horizon // self.options.compared)
+
+    @property
+    def edge_weight(self) -> float:
+        """Weight of the edge of stability: that of all residuals."""
+        return self.residuals * (self.segments.n_units if self.pooled else 1)
 
     def at(self, horizon: int) -> RefinementProblem:
         """Return the same problem at a horizon up to that of the segments."""
         return replace(self, segments=self.segments.cut(horizon))
 
-    def admissible(self, V: Array) -> npt.NDArray[np.bool_]:
-        """Tell which models are finite and stable as linear systems."""
+    def of_units(self, rows: Rows) -> RefinementProblem:
+        """Return the problem of some units, with the same weights."""
+        values = {name: given[rows] for name, given in self.parameters.items()}
+        one_step = replace(self.one_step, matrix=self.one_step.matrix[rows], least=self.one_step.least[rows])
+        part = replace(self, parameters=values, segments=self.segments.units(rows), one_step=one_step)
+        return replace(part, counted=self.residuals)
+
+    def of_one_model(self, rows: Rows) -> RefinementProblem:
+        """Return the problem of one model for some units."""
+        return replace(self.of_units(rows), pooled=True, counted=None)
+
+    def with_prior(self, strength: float) -> RefinementProblem:
+        """Return the problem with a prior in proportion to the residuals that a unit's free runs have."""
+        assert self.prior is not None
+        return replace(self, prior=self.prior.scaled(strength * self.residuals))
+
+    def admissible(self, V: Array, margin: float | None = None) -> npt.NDArray[np.bool_]:
+        """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
         finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
-        A = np.where(finite[..., None, None], A, 0.0)
-        return np.asarray(finite & (np.abs(np.linalg.eigvals(A)).max(axis=-1) < 1 - self.margin))
+        radius = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], A, 0.0))).max(axis=-1)
+        return np.asarray(finite & (radius < 1 - (self.options.margin if margin is None else margin)))
 
     def finite(self, V: Array) -> npt.NDArray[np.bool_]:
-        """Tell which models hold numbers only."""
+        """Return which models hold numbers only."""
         return np.asarray(np.isfinite(V).all(axis=(-1, -2)))
 
     def run(self, V: Array) -> Normal:
@@ -138,16 +151,12 @@ class RefinementProblem:
         each = np.broadcast_to(V, (len(normal.matrix), nl, p))
         total = np.zeros((len(each), nl * p + 1, nl * p + 1))
         _add(total, normal.matrix, slice(0, n * p))
+        weight = self.options.row_weight * normal.counts[:, None, None]
         for row in range(n, nl):
-            _add(
-                total,
-                _ROW_WEIGHT * normal.counts[:, None, None] * self.one_step.normal(each[:, row], row - n),
-                slice(row * p, (row + 1) * p),
-            )
+            _add(total, weight * self.one_step.normal(each[:, row], row - n), slice(row * p, (row + 1) * p))
         total = total.sum(axis=0, keepdims=True) if self.pooled else total
-        if self.guard is not None:
-            weight = self.residuals * (self.segments.n_units if self.pooled else 1)
-            total += stability_barrier(V, self.T, self.guard, weight)
+        if self.edged:
+            total += stability_barrier(V, self.T, self.options.guard, self.edge_weight)
         if self.prior is not None:
             total += self.prior.normal(V)
         return total
@@ -161,7 +170,7 @@ def _add(total: Array, part: Array, place: slice) -> None:
 
 
 def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
-    """Return ``[J r]^T [J r]`` of the cost above, shape (problem, n p + 1, n p + 1), for V (problem, n, p) and T (p, p)."""
+    """Return ``[J r]^T [J r]`` of the edge above, shape (problem, n p + 1, n p + 1)."""
     problems, n, p = V.shape
     values, right = np.linalg.eig((V @ T.T)[..., :n])
     size = np.abs(values)

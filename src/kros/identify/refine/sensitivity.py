@@ -1,18 +1,18 @@
-"""Free runs with analytic sensitivities: how the run's states move with the model, batched over units and their segments.
+"""Free runs with analytic sensitivities: how the states move with the model, batched over units and segments.
 
-A model is ``x+ = W psi``, with ``psi = [x; sigma(w); u; v(w, u)]`` on the window w, the states x and the earlier values of states and inputs
-that the lifting reads. Lifted states are re-lifted at every step, so that
+A model is ``x+ = W psi``, with ``psi = [x; sigma(w); u; v(w, u)]`` on the window w, the states x and the earlier values
+of states and inputs that the lifting reads. Lifted states are re-lifted at every step, so that
 
     dx+/dV = sum over d of F_d S_d + (dW/dV) psi,      F_d = W d psi/dx[-d],      W = V T^T
 
-where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d is 0 alone. Values
-that were recorded, all inputs and the states of the first window, do not move with the model.
+where the columns of T whiten the data; all least squares is done in V, whose entries are of one size. Without delays d
+is 0 alone. Values that were recorded, all inputs and the states of the first window, do not move with the model.
 
 Symbols
 -------
 V       : free parameters, (unit, n, p), with p = n_lifted + m, input functions counted;   T : whitening, (p, p)
-S_d     : sensitivities dx/dV of d samples ago, (n, n p, batch), the batch last so that every operation runs over contiguous memory
-F       : F_0, and behind it the columns of every F_d of the states that the lifting reads d samples ago, (n, n + q, batch)
+S_d     : sensitivities dx/dV of d samples ago, (n, n p, batch), the batch last for contiguous memory
+F       : F_0, and behind it the columns of every F_d that the lifting reads, (n, n + q, batch)
 normal  : ``[J r]^T [J r]`` of every unit, (unit, n p + 1, n p + 1), over the residuals r = (x_data - x) / sigma
 """
 
@@ -56,28 +56,16 @@ def normal_equations(
     sigma: Array,
     stride: int = 1,
 ) -> Normal:
-    """Run all segments with their unit's model and accumulate the normal equations, errors in units of sigma (n,), at every `stride`-th step."""
+    """Run all segments with their unit's model; add up normal equations over sigma (n,), every `stride` steps."""
     n, h = lifting.n_states, segments.history
     n_samples, m, units, per_unit = segments.inputs.shape
     batch, width = units * per_unit, n * V.shape[-1] + 1
-    own = {name: np.repeat(values, per_unit) for name, values in parameters.items()}
+    values = {name: np.repeat(given, per_unit) for name, given in parameters.items()}
     W = np.repeat(np.moveaxis(V @ T.T, 0, -1), per_unit, axis=-1)  # (n, p, batch)
     x, u = segments.states.reshape(n_samples, n, batch), segments.inputs.reshape(n_samples, m, batch)
     window = lifting.windows(x[: h + 1].transpose(2, 0, 1), u[: h + 1].transpose(2, 0, 1))[:, 0].T.copy()
-    run = _Run(
-        W,
-        T,
-        lifting,
-        own,
-        x,
-        u,
-        segments.valid.reshape(n_samples, batch),
-        h,
-        sigma,
-        stride,
-        units,
-        _moving_past(lifting),
-    )
+    valid = segments.valid.reshape(n_samples, batch)
+    run = _Run(W, T, lifting, values, x, u, valid, sigma, stride, units)
     matrix, squares = np.zeros((units, width, width)), np.zeros((units, n))
     with np.errstate(over="ignore", invalid="ignore"):
         for J in run.rows(window):
@@ -89,7 +77,7 @@ def normal_equations(
 
 @dataclass(frozen=True, eq=False)
 class _Run:
-    """Free runs of all segments: models W (n, p, batch), recordings x (n_samples, n, batch) and u (n_samples, m, batch)."""
+    """Free runs of all segments: models W (n, p, batch), recordings x (sample, n, batch) and u (sample, m, batch)."""
 
     W: Array
     T: Array
@@ -98,94 +86,87 @@ class _Run:
     x: Array
     u: Array
     valid: npt.NDArray[np.bool_]
-    history: int
     sigma: Array
     stride: int
     units: int
-    past: Sequence[Past]
 
     def rows(self, window: Array) -> Iterator[Array]:
-        """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from the first window on, which is moved on."""
+        """Yield ``[J r]^T`` of some samples after the other, shape (unit, n p + 1, residuals), from a window on."""
         n, p, batch = self.W.shape
+        past = _moving_past(self.lifting)
         S = np.zeros(
-            (2 + max((d for _, _, d in self.past), default=0), n, n * p, batch)
+            (2 + max((d for _, _, d in past), default=0), n, n * p, batch)
         )  # now, earlier, and space for the next
         loops = library()
-        return self._in_numpy(window, S) if loops is None else self._compiled(loops, window, S)
+        return self._in_numpy(window, S, past) if loops is None else self._compiled(loops, window, S, past)
 
-    def _compiled(self, loops: Library, window: Array, S: Array) -> Iterator[Array]:
-        (n, p, batch), lifting, (n_samples, m), per_unit = (
-            self.W.shape,
-            self.lifting,
-            self.u.shape[:2],
-            self.W.shape[2] // self.units,
-        )
-        entries = (*range(n), *(entry for entry, _, _ in self.past))
+    def _compiled(self, loops: Library, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
+        (n, p, batch), lifting, h, m = self.W.shape, self.lifting, self.lifting.history, self.u.shape[1]
+        per_unit, total = batch // self.units, (len(self.x) - 1 - h) // self.stride
+        entries = (*range(n), *(entry for entry, _, _ in past))
         tape = tape_of(lifting, m, entries)
         job = {
-            "samples": n_samples,
+            "samples": len(self.x),
             "batch": batch,
             "per_unit": per_unit,
-            "history": self.history,
+            "history": h,
             "stride": self.stride,
             "terms": len(entries),
             "depth": len(S),
             "slopes": len(tape.slopes),
-            "W": self.W,
-            "T": self.T,
-            "term": [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in self.past)],
+            "term": [*((state, 0) for state in range(n)), *((state, delay) for _, state, delay in past)],
             "slope": tape.slopes,
-            "x": self.x,
-            "u": self.u,
-            "valid": self.valid,
-            "sigma": self.sigma,
             "window": window,
             "S": S,
         }
-        of_lifting, total = (
-            formulas(lifting, tape, self.parameters, m, batch),
-            (n_samples - 1 - self.history) // self.stride,
-        )
+        job |= {name: getattr(self, name) for name in ("W", "T", "x", "u", "valid", "sigma")}
+        of_lifting = formulas(lifting, tape, self.parameters, m, batch)
         together = max(1, _AT_ONCE // (batch * n * (n * p + 1)))
         for start in range(0, total, together):
-            count, first = min(together, total - start), self.history + start * self.stride
+            count, first = min(together, total - start), h + start * self.stride
             J = np.empty((self.units, n * p + 1, count * n * per_unit))
-            loops.call(
-                "kros_sensitivities",
-                of_lifting,
-                ("sensitivity_job", job | {"first": first, "last": first + count * self.stride, "rows": count, "J": J}),
-            )
+            part = {"first": first, "last": first + count * self.stride, "rows": count, "J": J}
+            loops.call("kros_sensitivities", of_lifting, ("sensitivity_job", job | part))
             yield J
 
-    def _in_numpy(self, window: Array, S: Array) -> Iterator[Array]:
-        lifting, W, (n, p, batch), nl, h = self.lifting, self.W, self.W.shape, self.lifting.n_lifted, self.history
-        psi, work, F, kept = (
-            np.empty((p, batch)),
-            np.empty((n * p, batch)),
-            np.empty((n, n + len(self.past), batch)),
-            list(S),
-        )
+    def _in_numpy(self, window: Array, S: Array, past: Sequence[Past]) -> Iterator[Array]:
+        (n, p, batch), lifting, nl, h = self.W.shape, self.lifting, self.lifting.n_lifted, self.lifting.history
+        psi, recent = np.empty((p, batch)), list(S)
         psi[:n] = window[:n]
         for k in range(h, len(self.x) - 1):
             u = self.u[k]
             lifting.lift_into(psi[:nl].T, self.parameters, window[n:].T)
             psi[nl:] = lifting.lift_inputs(u.T, window.T, self.parameters).T
-            _state_matrix(F, W, window, u, lifting, self.parameters, self.past)
-            _advance(kept, F, self.T.T @ psi, work, self.past)
+            terms = np.stack([*recent[0], *(recent[delay][state] for _, state, delay in past)])
+            following = np.einsum("abj,bqj->aqj", self._state_matrix(window, u, past), terms)
+            following.reshape(n, n, p, batch)[range(n), range(n)] += self.T.T @ psi
             window[n:] = lifting.window.advance(window.T, u.T).T
-            psi[:n] = window[:n] = np.einsum("apb,pb->ab", W, psi)
-            kept = [kept[-1], *kept[:-1]]
+            psi[:n] = window[:n] = np.einsum("apb,pb->ab", self.W, psi)
+            recent = [following, *recent[:-1]]
             if (k + 1 - h) % self.stride == 0:
-                yield self._residuals(kept[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
+                yield self._residuals(recent[0], self.x[k + 1] - psi[:n], self.valid[k + 1])
+
+    def _state_matrix(self, window: Array, u: Array, past: Sequence[Past]) -> Array:
+        """F = W d psi/dw, shape (n, n + q, batch)."""
+        lifting, W, n, nl = self.lifting, self.W, self.lifting.n_states, self.lifting.n_lifted
+        moving = [*range(n), *(entry for entry, _, _ in past)]
+        F = np.zeros((n, len(moving), window.shape[1]))
+        F[:, :n] = W[:, :n]
+        if lifting.functions:
+            slopes = lifting.slopes(window.T, self.parameters)[..., moving]  # (batch, function, n + q)
+            F += np.einsum("afb,bfj->ajb", W[:, n:nl], slopes)
+        if lifting.input_functions:
+            slopes = lifting.input_slopes(u.T, window.T, self.parameters)[..., moving]
+            F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
+        return F
 
     def _residuals(self, S: Array, error: Array, valid: npt.NDArray[np.bool_]) -> Array:
         """``[J r]^T`` of one sample; J = dx/dV / sigma."""
         rows = np.concatenate([S, error[:, None]], axis=1) / self.sigma[:, None, None]  # (n, n p + 1, batch)
         rows[:, :, ~valid] = 0.0
         n, width, batch = rows.shape
-        return (
-            rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3).reshape(self.units, width, -1)
-        )
+        by_unit = rows.reshape(n, width, self.units, batch // self.units).transpose(2, 1, 0, 3)
+        return by_unit.reshape(self.units, width, -1)
 
 
 def _moving_past(lifting: Lifting) -> list[Past]:
@@ -197,30 +178,3 @@ def _moving_past(lifting: Lifting) -> list[Past]:
         for entry, (quantity, delay) in enumerate(window.quantities)
         if delay and window.names[entry] in read and quantity in states
     ]
-
-
-def _state_matrix(
-    F: Array, W: Array, window: Array, u: Array, lifting: Lifting, parameters: Mapping[str, Array], past: Sequence[Past]
-) -> None:
-    """F = W d psi/dw, shape (n, n + q, batch)."""
-    n, nl = lifting.n_states, lifting.n_lifted
-    moving = [*range(n), *(entry for entry, _, _ in past)] if len(window) > n else slice(None)
-    F[:, :n], F[:, n:] = W[:, :n], 0.0
-    if lifting.functions:
-        slopes = lifting.slopes(window.T, parameters)[..., moving]  # (batch, function, n + q)
-        F += np.einsum("afb,bfj->ajb", W[:, n:nl], slopes)
-    if lifting.input_functions:
-        slopes = lifting.input_slopes(u.T, window.T, parameters)[..., moving]
-        F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
-
-
-def _advance(S: Sequence[Array], F: Array, white: Array, work: Array, past: Sequence[Past]) -> None:
-    """S_next = sum over d of F_d S_d + (dV) white, with S_next in the place of the oldest."""
-    p = len(white)
-    terms = [*S[0], *(S[delay][state] for _, state, delay in past)]
-    for a, into in enumerate(S[-1]):
-        np.multiply(terms[0], F[a, 0], out=into)
-        for b in range(1, len(terms)):
-            np.multiply(terms[b], F[a, b], out=work)
-            np.add(into, work, out=into)
-        into[a * p : (a + 1) * p] += white

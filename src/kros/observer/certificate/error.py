@@ -30,8 +30,8 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
-from ...lifting.continuity import break_of, slope_bounds_of
 from ...lifting.formula import delayed_name
+from ...lifting.intervals import break_of, slope_bounds_of
 from ..data import ObserverData
 
 Array = npt.NDArray[np.float64]

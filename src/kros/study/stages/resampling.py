@@ -15,18 +15,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ...data.population import EpisodeKey, Population
-from ...data.scaled import scale_population
-from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights, lifted_factor
+from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights
 from ...identify.bootstrap import bootstrap_refined
+from ...identify.factors import lifted_factor
 from ...identify.ranges import Ranges
+from ...identify.refine import Refinement, RefineOptions
 from ...identify.refine.episodes import episode_normals
-from ...identify.refine.model import RefinedModels
-from ...identify.refine.options import RefineOptions
-from ...lifting import Lifting
+from ...identify.refine.model import TrainingData
 from ..engine.context import Context
-
-Array = npt.NDArray[np.float64]
 
 DRAWS = 60
 _SEED = 0
@@ -85,46 +81,29 @@ def _by_unit(values: npt.NDArray[Any], places: list[list[int]], most: int) -> np
 class _Refined:
     """Models that were refined together and what they were refined on, in channels divided by their ranges as they were."""
 
-    models: RefinedModels
+    models: KoopmanMatrices
+    refinement: Refinement
+    data: TrainingData
     ranges: Ranges
-    population: Population
-    keys: dict[str, tuple[EpisodeKey, ...]]
-    lifting: Lifting
-    parameters: dict[str, Array]
-    factor: Factor
     counts: list[int]
-    pooled: npt.NDArray[np.bool_]
 
 
 def _refined_models(context: Context, models: ModelSet) -> _Refined:
     units, facts, ranges = list(models.unit_ids), context.facts, models.ranges
     factor, counts = episode_factor(context, models, units)
-    return _Refined(
-        context.identified.refined[models.name].in_channels(ranges),
-        ranges,
-        scale_population(context.population.select(units, [facts.identify_on]), models.sizes),
-        {u: tuple(facts.keys("train", u, facts.identify_on)) for u in units},
-        models.lifting.in_sizes(models.sizes),
-        dict(models.parameters),
-        ranges.factor(factor),
-        counts,
-        np.array([u in facts.pooled for u in units]),
-    )
+    keys = {u: tuple(facts.keys("train", u, facts.identify_on)) for u in units}
+    pooled = np.array([u in facts.pooled for u in units])
+    recorded = context.population.select(units, [facts.identify_on])
+    data = TrainingData(recorded, keys, models.lifting, dict(models.parameters), factor, pooled).divided_by(ranges)
+    matrices = ranges.normalise(KoopmanMatrices(models.A, models.B))
+    return _Refined(matrices, context.identified.refined[models.name].divided_by(ranges), data, ranges, counts)
 
 
 def _refined_samples(of: _Refined, rows: Sequence[int]) -> ModelSamples:
     """Samples of some of the units, in the recordings' units of measure."""
-    normal = episode_normals(
-        of.models, of.population, of.keys, of.lifting, of.parameters, of.factor, RefineOptions(), of.pooled
-    )
-    weights, units = episode_weights(of.counts, DRAWS, _SEED), of.models.units
-    return _chosen(
-        _restored(
-            bootstrap_refined(units, of.models.whitening, of.models.information, normal, weights, list(of.keys)),
-            of.ranges,
-        ),
-        rows,
-    )
+    normal = episode_normals(of.models, of.refinement, of.data, RefineOptions())
+    weights, T, H = episode_weights(of.counts, DRAWS, _SEED), of.refinement.whitening, of.refinement.information
+    return _chosen(_restored(bootstrap_refined(of.models, T, H, normal, weights, list(of.data.keys)), of.ranges), rows)
 
 
 def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:

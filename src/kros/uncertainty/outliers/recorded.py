@@ -17,7 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...identify import Factor, ModelSet, combine, lifted_factor
+from ...identify import Factor, ModelSet, combine
+from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors
 from .score import OutlierScore, Status
 

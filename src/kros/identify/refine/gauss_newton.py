@@ -1,0 +1,116 @@
+"""The one search for parameters: Gauss-Newton steps with Levenberg's damping, for many small problems side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Evaluate = Callable[[Array], Array]
+Rows = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """Where the search ended."""
+
+    V: Array  # (problem, rows, columns)
+    matrix: Array  # [J r]^T [J r] at V, (problem, P + 1, P + 1)
+    iterations: int
+    converged: npt.NDArray[np.bool_]  # (problem,)
+
+    @property
+    def cost(self) -> Array:
+        """Sum of squared residuals, shape (problem,)."""
+        return self.matrix[:, -1, -1]
+
+    def updated(self, rows: Rows, part: Solution) -> Solution:
+        """Return the solution with some problems as another search left them."""
+        V, matrix, converged = self.V.copy(), self.matrix.copy(), self.converged.copy()
+        V[rows], matrix[rows], converged[rows] = part.V, part.matrix, part.converged
+        return Solution(V, matrix, self.iterations + part.iterations, converged)
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Minimise sums of squares of r(V) by steps ``(H + mu I) d = J^T r``, ``H = J^T J`` scaled to a unit diagonal.
+
+    Every problem has damping, acceptance and constraint by itself: a step that raises the cost or leaves the constraint
+    is not taken.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.identify.refine import GaussNewton
+    >>> def evaluate(V):  # r = 3 - V
+    ...     rows = np.stack([np.ones(1), 3.0 - V[:, 0, 0]], axis=1)
+    ...     return rows[:, :, None] * rows[:, None, :]
+    >>> GaussNewton().minimise(evaluate, lambda V: np.ones(1, bool), np.zeros((1, 1, 1))).V.round(6).item()
+    3.0
+    """
+
+    iterations: int = 15  # at most
+    least_gain: float = 1e-3  # converged: a step with the first damping lowers the cost by a smaller share
+    damping: float = 1e-3  # first, relative to the unit diagonal: small, since searches start near their minimum
+    least_damping: float = 1e-9
+    most_damping: float = 1e8  # converged, too: no step with so much damping lowers the cost
+    factor: float = 10.0  # by which damping falls after a step that was taken, and grows after another
+
+    def minimise(
+        self,
+        evaluate: Evaluate,
+        admissible: Callable[[Array], npt.NDArray[np.bool_]],
+        V: Array,
+        narrowed: Callable[[Rows], Evaluate] | None = None,
+    ) -> Solution:
+        """Return the minima from the start V (problem, rows, columns).
+
+        Parameters
+        ----------
+        evaluate : callable
+            From V to ``[J r]^T [J r]``, shape (problem, P + 1, P + 1), with J the slopes of what is subtracted from the
+            data.
+        admissible : callable
+            From V to the problems whose constraint holds, shape (problem,).
+        V : ndarray, shape (problem, rows, columns)
+        narrowed : callable, optional
+            From rows of the problems to `evaluate` of these alone, for which a search continues when others have
+            converged.
+        """
+        V, matrix = V.copy(), evaluate(V)
+        damping, done = np.full(len(V), self.damping), np.zeros(len(V), dtype=bool)
+        rows, used = np.arange(len(V)), 0
+        while used < self.iterations and not done.all():
+            if narrowed is not None and 4 * np.count_nonzero(~done) <= 3 * len(rows):  # data are copied
+                rows = np.flatnonzero(~done)
+                evaluate = narrowed(rows)
+            now, before, mu = V[rows], matrix[rows], damping[rows]
+            trial = now + _step(before, mu).reshape(now.shape)
+            allowed = admissible(trial) & ~done[rows]
+            after = evaluate(np.where(allowed[:, None, None], trial, now))
+            cost, last = after[:, -1, -1], before[:, -1, -1]
+            better = allowed & (cost < last)
+            small = cost >= (1 - self.least_gain) * last
+            stuck = ~better & (mu >= self.most_damping)
+            done[rows] |= (better & small & (mu <= self.damping)) | stuck | (last == 0)
+            V[rows] = np.where(better[:, None, None], trial, now)
+            matrix[rows] = np.where(better[:, None, None], after, before)
+            mu = np.where(better, mu / self.factor, mu * self.factor)
+            damping[rows] = np.clip(mu, self.least_damping, self.most_damping)
+            used += 1
+        return Solution(V, matrix, used, done)
+
+
+def _step(matrix: Array, mu: Array) -> Array:
+    """Solve the damped normal equations in parameters scaled to a unit diagonal."""
+    fine = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))  # a run that diverges gives no direction
+    H = np.where(fine[:, None, None], matrix[:, :-1, :-1], np.eye(matrix.shape[-1] - 1))
+    g = np.where(fine[:, None], matrix[:, :-1, -1], 0.0)
+    diagonal = np.diagonal(H, axis1=1, axis2=2)
+    least = np.finfo(float).eps ** 2 * diagonal.max(axis=1, keepdims=True) + np.finfo(float).tiny
+    scale = 1 / np.sqrt(np.maximum(diagonal, least))
+    scaled = H * scale[:, :, None] * scale[:, None, :] + mu[:, None, None] * np.eye(H.shape[-1])
+    return np.asarray(np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale)

@@ -1,0 +1,218 @@
+"""Formulas as operations on numbered values, which NumPy and the compiled loops run and C is written from.
+
+A program is data: no code is generated for a lifting, and what formulas have in common is computed once. The order of
+operations is the same everywhere, so that results agree to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import ConfigError
+
+Whole = npt.NDArray[np.int32]
+Tree = tuple[Any, ...]
+_NUMPY = {"Abs": "abs", "atan": "arctan"}
+FUNCTIONS = ("sin", "cos", "tan", "exp", "log", "sqrt", "tanh", "Abs", "sign", "atan")
+_KINDS = ("add", "multiply", "divide", "power", *FUNCTIONS)  # in the order of loops.c
+
+
+@dataclass(frozen=True, eq=False)
+class Program:
+    """Operations of some expressions; registers hold the quantities, then the constants, then results."""
+
+    names: tuple[str, ...]  # quantities
+    constants: npt.NDArray[np.float64]  # shape (constants,)
+    code: Whole  # shape (operations, 4): kind, register of the result, registers of the two operands
+    outputs: Whole  # register of every expression
+    registers: int
+
+    @classmethod
+    def of(cls, expressions: Sequence[Any], names: Sequence[str] | None = None) -> Program:
+        """Write SymPy trees of quantities, by default those that the trees name."""
+        used = sorted({symbol.name for tree in expressions for symbol in tree.free_symbols})
+        return cls.of_trees([tree_of(expression) for expression in expressions], used if names is None else names)
+
+    @classmethod
+    def of_trees(cls, trees: Sequence[Tree], names: Sequence[str]) -> Program:
+        """Write trees as `tree_of` returns them."""
+        writer = Writer(list(names))
+        return writer.finished([writer.write(tree) for tree in trees])
+
+    def run(self, values: Mapping[str, Any]) -> list[Any]:
+        """Return the values of the expressions for arrays by name, which broadcast against each other."""
+        registers: list[Any] = [values[name] for name in self.names] + self.constants.tolist()
+        registers += [None] * (self.registers - len(registers))
+        for function, into, operands in self._steps:
+            registers[into] = function(*(registers[i] for i in operands))
+        return [registers[i] for i in self.outputs]
+
+    @cached_property
+    def _steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...]]]:
+        rows = [(_KINDS[kind], into, operands) for kind, into, *operands in self.code.tolist()]
+        steps = ((k, into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows)
+        return [(getattr(np, _NUMPY.get(k, k)), into, i) for k, into, i in steps]
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Expressions evaluated together, one column each: those that differ in their numbers alone in one pass."""
+
+    single: tuple[list[int], Program]  # columns whose shape no other has
+    groups: tuple[tuple[Any, Program, dict[str, Any]], ...]  # columns, program of one of them, numbers of all
+
+    @classmethod
+    def of(cls, expressions: Sequence[Any], first: int = 0) -> Columns:
+        """Group expressions by shape; they go to the columns from `first` on."""
+        members: dict[Tree, list[int]] = {}
+        trees = [tree_of(expression) for expression in expressions]
+        for column, tree in enumerate(trees):
+            members.setdefault(_shape(tree), []).append(column)
+        names = sorted({symbol.name for expression in expressions for symbol in expression.free_symbols})
+        single = [columns[0] for columns in members.values() if len(columns) == 1]
+        program, groups = Program.of_trees([trees[i] for i in single], names), []
+        for columns in (columns for columns in members.values() if len(columns) > 1):
+            numbers = np.array([_numbers(trees[i]) for i in columns]).T
+            places = [f"number {i}" for i in range(len(numbers))]
+            tree = _named(trees[columns[0]], iter(places))
+            given = dict(zip(places, numbers, strict=True))
+            whole = len(columns) == columns[-1] + 1 - columns[0]  # written without a gather
+            at = slice(first + columns[0], first + columns[-1] + 1) if whole else [first + i for i in columns]
+            groups.append((at, Program.of_trees([tree], (*names, *places)), given))
+        return cls(([first + i for i in single], program), tuple(groups))
+
+    def fill(self, out: npt.NDArray[np.float64], values: Mapping[str, Any]) -> None:
+        """Write the values of the expressions into their columns, along the last axis."""
+        for column, value in zip(self.single[0], self.single[1].run(values), strict=True):
+            out[..., column] = value
+        wide = {name: np.asarray(value)[..., None] for name, value in values.items()} if self.groups else {}
+        for columns, program, numbers in self.groups:
+            out[..., columns] = program.run(wide | numbers)[0]
+
+
+@dataclass
+class Writer:
+    """Values are numbered as they come: quantities, then what is new; constants have negative numbers."""
+
+    names: list[str]
+    constants: list[float] = field(default_factory=list)
+    operations: list[tuple[str, int, int]] = field(default_factory=list)
+    known: dict[tuple[str, int, int], int] = field(default_factory=dict)
+
+    def write(self, tree: Tree) -> int:
+        """Return the value of a tree."""
+        kind, *rest = tree
+        if kind == "symbol":
+            return self.names.index(rest[0])
+        if kind == "number":
+            return self._constant(rest[0])
+        if kind == "power":
+            return self._power(rest[0], self.write(rest[1]))
+        first, *others = (self.write(child) for child in rest)
+        if kind in FUNCTIONS:
+            return self._do(kind, first, first)
+        for other in others:
+            first = self._do(kind, first, other)
+        return first
+
+    def _power(self, exponent: float, base: int) -> int:
+        """Write powers that products, quotients and roots give exactly rounded as these."""
+        if exponent < 0 and abs(exponent) in (0.5, 1.0, 2.0):
+            return self._do("divide", self._constant(1.0), self._power(-exponent, base))
+        if exponent == 0.5:
+            return self._do("sqrt", base, base)
+        if exponent not in (1.0, 2.0, 3.0):
+            return self._do("power", base, self._constant(exponent))
+        product = base
+        for _ in range(int(exponent) - 1):
+            product = self._do("multiply", product, base)
+        return product
+
+    def _constant(self, value: float) -> int:
+        if value not in self.constants:
+            self.constants.append(value)
+        return -1 - self.constants.index(value)
+
+    def _do(self, kind: str, first: int, second: int) -> int:
+        operation = (kind, first, second)
+        if operation not in self.known:
+            self.known[operation] = len(self.names) + len(self.operations)
+            self.operations.append(operation)
+        return self.known[operation]
+
+    def finished(self, outputs: Sequence[int]) -> Program:
+        """Put values into registers; one that nothing reads any more is used again."""
+        given = len(self.names)
+        registers = {value: value for value in range(given)} | {-1 - i: given + i for i in range(len(self.constants))}
+        lasting = {*outputs, *registers}
+        last = {value: i for i, (_, first, second) in enumerate(self.operations) for value in (first, second)}
+        free: list[int] = []
+        count, code = len(registers), np.zeros((len(self.operations), 4), dtype=np.int32)
+        for i, (kind, first, second) in enumerate(self.operations):
+            operands = registers[first], registers[second]
+            free += [registers[value] for value in {first, second} if last[value] == i and value not in lasting]
+            if free:
+                into = free.pop()
+            else:
+                into, count = count, count + 1
+            registers[given + i], code[i] = into, (_KINDS.index(kind), into, *operands)
+        places = np.array([registers[value] for value in outputs], dtype=np.int32)
+        return Program(tuple(self.names), np.array(self.constants, dtype=float), code, places, count)
+
+
+def tree_of(expression: Any) -> Tree:
+    """Return kind and arguments of every node, those of sums and products ordered by their shape."""
+    import sympy as sp
+
+    if expression.is_Symbol:
+        return "symbol", expression.name
+    if expression.is_number:
+        return "number", _real(expression)
+    if isinstance(expression, sp.Add | sp.Mul):
+        children = sorted((tree_of(argument) for argument in expression.args), key=lambda tree: repr(_shape(tree)))
+        return ("add" if isinstance(expression, sp.Add) else "multiply", *children)
+    if isinstance(expression, sp.Pow) and expression.exp.is_number:
+        return "power", _real(expression.exp), tree_of(expression.base)
+    name = type(expression).__name__
+    if name == "DiracDelta":  # the slope of a sign is zero almost everywhere
+        return "number", 0.0
+    if name not in FUNCTIONS:
+        remedy = f"write the formula with {', '.join(sorted(FUNCTIONS))}"
+        raise ConfigError(f"Formula node {expression!r}: no numerical evaluation is known; {remedy}.")
+    return name, tree_of(expression.args[0])
+
+
+def _shape(tree: Tree) -> Tree:
+    """Return a tree without its numbers: formulas that differ in these alone are computed in the same order."""
+    kind, *rest = tree
+    if kind in ("symbol", "number"):
+        return tree if kind == "symbol" else ("number",)
+    return (kind, *(_shape(part) if isinstance(part, tuple) else part for part in rest))
+
+
+def _numbers(tree: Tree) -> list[float]:
+    """Return the numbers of a tree, exponents apart."""
+    if tree[0] == "number":
+        return [tree[1]]
+    return [number for part in tree[1:] if isinstance(part, tuple) for number in _numbers(part)]
+
+
+def _named(tree: Tree, names: Iterator[str]) -> Tree:
+    """Return the tree with names in place of its numbers."""
+    if tree[0] == "number":
+        return "symbol", next(names)
+    return (tree[0], *(_named(part, names) if isinstance(part, tuple) else part for part in tree[1:]))
+
+
+def _real(number: Any) -> float:
+    try:
+        return float(number)
+    except TypeError as error:
+        remedy = "keep roots and logarithms of positive quantities"
+        raise ConfigError(f"Formula node {number!r}: is not a real number; {remedy}.") from error

@@ -34,7 +34,7 @@ def computed(monkeypatch) -> dict[str, list[str]]:
 
     def counted(self: Work, title: str, function: Callable[..., Any], tasks: Sequence[Any]) -> Any:
         tasks = list(tasks)
-        own = [task for _, task in tasks]  # behind its mark
+        own = [task for _, task in tasks]  # behind its digest
         found.setdefault(title, []).extend(task.unit if hasattr(task, "unit") else task[0].unit_ids[0] for task in own)
         return map(function, tasks)
 
@@ -58,7 +58,9 @@ def results(run: Path) -> dict[str, Any]:
         return [cleaned(v) for v in value] if isinstance(value, list) else value
 
     files = [
-        p for p in sorted(run.rglob("*")) if p.is_file() and p.relative_to(run).parts[0] not in ("stages", ".kros.lock")
+        p
+        for p in sorted(run.rglob("*"))
+        if p.is_file() and p.relative_to(run).parts[0] not in ("store", "manifest.json")
     ]
     return {
         p.relative_to(run).as_posix(): cleaned(json.loads(p.read_text())) if p.suffix == ".json" else p.read_bytes()
@@ -177,7 +179,8 @@ def test_what_is_damaged_is_computed_again(drives, tmp_path, computed, damage):
     source = without(drives, tmp_path / "raw", folders(drives)[0])
     run = study(source, tmp_path / "run")
     put_back(drives, source)
-    kept, copies = run / "seen" / "read.gz", sorted((run / "recordings").glob("*.parquet"))
+    copies = sorted((run / "recordings").glob("*.parquet"))
+    kept = next(path for path in (run / "store").glob("*.npz") if b"GroupRecord" in path.read_bytes())
     if damage == "recordings":
         copies[0].write_bytes(b"something else")
         copies[1].unlink()
@@ -188,5 +191,5 @@ def test_what_is_damaged_is_computed_again(drives, tmp_path, computed, damage):
         kept.write_bytes(whole[: len(whole) // 2] if damage == "cut" else whole[:200] + bytes(200) + whole[400:])
     computed.clear()
     study(source, run)
-    assert len(computed["read"]) == (3 if damage == "recordings" else 10)
+    assert len(computed["read"]) == (3 if damage == "recordings" else 2)
     assert results(run) == fresh(source, tmp_path)

@@ -103,7 +103,7 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     assert all(
         line.endswith("unchanged") for line in again.stderr.splitlines() if line[:1].islower() or line[:1].isdigit()
     )
-    made = json.loads((folder / "left_out" / "1" / "stages" / "synthesize.json").read_text())
+    made = json.loads((folder / "left_out" / "1" / "manifest.json").read_text())
     shutil.copytree(folder, folder.parent / "copy")
     off = kros(
         "run",
@@ -118,7 +118,7 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     )
     assert "left_out" not in json.loads(off.stdout)
     assert not (folder.parent / "copy" / "left_out" / "left_out.json").exists()
-    assert read_json(folder / "left_out" / "1" / "stages" / "synthesize.json") == made
+    assert read_json(folder / "left_out" / "1" / "manifest.json") == made
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ import numpy as np
 from . import limits
 from .archive import pack_arrays, unpack_arrays
 from .errors import DataError
-from .files import read_bytes, shortened
+from .files import TEMPORARY, read_bytes, shortened
 
 SCHEMA = 1
 CHECKSUM = "checksum"
@@ -51,7 +51,7 @@ _OBJECTS, _LISTS = frozenset({dict, LoadedContent}), frozenset({list, tuple})
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old content or the new, never half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)

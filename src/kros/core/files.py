@@ -21,7 +21,17 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+TEMPORARY = ".kros."
+"""How names begin of what is beside its place until it is whole."""
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+
+
+def is_file(path: Path) -> bool:
+    """Tell whether there is a regular file, not a link to one."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:

@@ -6,7 +6,7 @@ Population --survey--> Population that can be used, RecordingFacts
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from hashlib import sha256
@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact
 from ..core.errors import DataError
+from ..core.files import is_file
 from ..core.loading import loader
-from ..core.records import is_file
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, scan_digests
@@ -156,7 +156,6 @@ def survey(
     work: Work | None = None,
     reserve: Sequence[str] = (),
     earlier: Path | None = None,
-    wrote: Callable[[Path, str], None] | None = None,
     fewest: int = 0,
 ) -> tuple[Population, RecordingFacts]:
     """Read all recordings once, without those that `work` knows from earlier; refuse episodes of less than `fewest` samples."""
@@ -169,10 +168,6 @@ def survey(
         return folder is None or _taken(known, earlier, folder)
 
     found = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
-    if wrote is not None and folder is not None:
-        for group in found:
-            if group.record is not None and group.written is not None:
-                wrote(folder / group.record.file, group.written)
     kept = _kept(population, found, folder)
     left, aside = set(kept.episodes), set(reserve)
     taking_part = [u for u in kept.unit_ids if u not in aside]

@@ -21,7 +21,7 @@ from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
 from .engine.steps import StageStep, run_steps
-from .engine.store import Store, code_key
+from .engine.store import Store
 from .learning import LEARNING
 from .metrics import collect_metrics
 from .stages import evaluate, left_out, read, report
@@ -206,9 +206,10 @@ def run_in(
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
     began = time.perf_counter()
-    context = Context(config, store, Work(executor, progress or Silent(), store.seen(code_key())), given)
+    context = Context(config, store, Work(executor, progress or Silent()), given)
     run_steps(context, STEPS, until)
     metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
+    store.sweep()
     return RunResult(store.folder, metrics, violations(config, metrics))
 
 

@@ -11,13 +11,14 @@ from typing import Any
 
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
+from ...core.store import digest_of
 from ...core.work import Progress
 from ...data import write_parquet, write_raw
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_run
-from ..engine.store import Store, code_key, hash_of
+from ..engine.store import Store, code_key
 from ..pipeline import RunResult, require_usable, run_in
 
 FORMATS = ("parquet", "raw")
@@ -111,13 +112,12 @@ def _simulate_in(
 ) -> None:
     """Simulate into a run folder, where the same simulation is not there already; workers get something to do meanwhile."""
     settings = ("harmonic-drive", units, episodes, seconds, seed, 1.0, "stiff", True, "parquet")
-    key = hash_of([code_key(), settings])
-    if store.is_current(_STAGE, key):
+    digest = digest_of(code_key(), settings)
+    if store.restore(_STAGE, digest) is not None:
         return
     meanwhile()
     progress.start(_STAGE, None)
     began = time.perf_counter()
     with store.drafting() as draft:
         simulate_to(draft.draft(_RECORDINGS), *settings)
-        store.clear(_STAGE)
-        draft.commit(_STAGE, key, time.perf_counter() - began)
+        draft.commit(_STAGE, digest, time.perf_counter() - began)

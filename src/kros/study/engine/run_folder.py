@@ -9,9 +9,10 @@ from typing import Any
 
 from ...core.artifacts import read_json
 from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.files import TEMPORARY
 from ...core.locks import locked
 from ..config import Stage, StudyConfig, stored_config
-from .store import BOOKKEEPING, Store
+from .store import Store
 
 STUDY = "study.json"
 
@@ -20,7 +21,7 @@ def require_own(out: Path, config: StudyConfig) -> bool:
     """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
-    if not out.exists() or not {p.name for p in out.iterdir()} - BOOKKEEPING:
+    if not out.exists() or all(path.name.startswith(TEMPORARY) for path in out.iterdir()):
         return True
     if not (out / STUDY).exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
@@ -41,12 +42,12 @@ def _identity(study: dict[str, Any]) -> tuple[str, str]:
 
 def _read_study(folder: Path) -> dict[str, Any]:
     try:
-        found = read_json(folder / STUDY)
+        content = read_json(folder / STUDY)
     except DataError as error:
         raise ConfigError(f"Run {folder}: its {STUDY} cannot be read ({error}); name another folder.") from error
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise ConfigError(f"Run {folder}: its {STUDY} holds no study; name another folder.")
-    return found
+    return content
 
 
 @contextmanager
@@ -66,8 +67,6 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
                 if fresh and store.record(Stage.READ) is None:
                     store.remove()
                 raise
-            finally:
-                store.tidy()
     finally:
         with suppress(OSError):  # it is not empty, as a rule
             for folder in above:

@@ -91,7 +91,6 @@ def run(context: Context) -> None:
         context.work,
         reserve,
         earlier,
-        context.store.told,
         FEWEST_SAMPLES + 1 + resolve_lifting(config.lifting, config.calibrate, population, config.split.test).history,
     )
     if in_place and facts.dropped:

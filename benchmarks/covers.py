@@ -23,7 +23,8 @@ import numpy.typing as npt
 from kros.core import StateSpace
 from kros.core.frequency import log_grid, nyquist_hz
 from kros.identify import ModelSet
-from kros.study import run_study, validate_config
+from kros.study import run as run_study
+from kros.study import validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
 from kros.uncertainty import Form, UncertainModel, quantify_systems

@@ -29,7 +29,8 @@ from typing import Any
 from kros.core.artifacts import write_json
 from kros.report.error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from kros.report.names import BASELINES, minus, number, split_observer
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage, SynthesisSettings
 from kros.study.engine.executors import available_cores

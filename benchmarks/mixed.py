@@ -27,7 +27,8 @@ from kros.core.work import Work
 from kros.design.methods.robust import design_mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
-from kros.study import run_study, validate_config
+from kros.study import run as run_study
+from kros.study import validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context

@@ -15,7 +15,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from kros.study import run_study, validate_config
+from kros.study import run as run_study
+from kros.study import validate_config
 from kros.study.commands.demo import simulate_to
 
 PLANTED = "000000"

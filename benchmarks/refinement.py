@@ -22,7 +22,8 @@ from kros.core.norms import hinf_norm
 from kros.core.work import Work
 from kros.identify import KoopmanMatrices, ModelSet, free_run
 from kros.identify.refine import RefinedModels
-from kros.study import run_study, validate_config
+from kros.study import run as run_study
+from kros.study import validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context

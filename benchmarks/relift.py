@@ -30,7 +30,8 @@ from kros.design.synthesize import tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
 from kros.observer.certificate.report import relift_report
 from kros.observer.residual.one_step import one_step_residual
-from kros.study import run_study, validate_config
+from kros.study import run as run_study
+from kros.study import validate_config
 from kros.study.commands.demo import simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context

@@ -20,7 +20,7 @@ from kros.data import EpisodeBatch, Population, write_parquet
 from kros.identify import PhaseCalibration
 from kros.observer import Observer
 from kros.plants import PLANTS
-from kros.study import run_study
+from kros.study import run as run_study
 from kros.study.config import Stage, validate_config
 
 LARGEST = 0.01  # relative deviation that is a failure

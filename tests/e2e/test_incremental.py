@@ -13,7 +13,8 @@ import pytest
 
 import kros
 from kros.core.work import Work
-from kros.study import Stage, run_study, validate_config
+from kros.study import Stage, validate_config
+from kros.study import run as run_study
 
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}
 
@@ -46,7 +47,7 @@ def study(source: Path, out: Path, **identify: Any) -> Path:
     """Run a study up to its models."""
     content = {"name": "grown", "data": {"source": str(source)}, "identify": {"refine": False, **identify}}
     content["data"]["reader"] = "motor-drive-raw"
-    return run_study(validate_config(content, source), out, Stage.IDENTIFY).folder
+    return run_study(validate_config(content, source), out, until=Stage.IDENTIFY).folder
 
 
 def results(run: Path) -> dict[str, Any]:
@@ -170,7 +171,7 @@ def test_another_regularisation_or_lifting_takes_from_earlier_runs_what_does_not
     }
     content |= {"lifting": {"functions": ["cos(100*position + phase)"]}}
     computed.clear()
-    run_study(validate_config(content, drives), run, Stage.IDENTIFY)
+    run_study(validate_config(content, drives), run, until=Stage.IDENTIFY)
     assert [len(units) for units in computed.values()] == [0, 5, 5]  # the phase is known, the factors are others
 
 

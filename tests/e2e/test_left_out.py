@@ -14,7 +14,8 @@ from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 from kros.study.commands.recordings import load_calibration, unit_parameters
 from kros.study.config import Stage
 from kros.study.engine.context import Context

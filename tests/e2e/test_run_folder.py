@@ -18,7 +18,8 @@ import pytest
 from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
 from kros.core.store import recorded_files
-from kros.study import Stage, load_config, run_study
+from kros.study import Stage, load_config
+from kros.study import run as run_study
 
 pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
@@ -405,5 +406,5 @@ def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast,
 
 def test_a_script_is_not_told_twice_who_owns_a_folder(fast, run):
     """From Python as from the command line: strings are paths."""
-    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), Stage.REPORT)  # type: ignore[arg-type]
+    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), until=Stage.REPORT)  # type: ignore[arg-type]
     assert found.metrics["study"]["units"] == 4

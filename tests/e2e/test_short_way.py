@@ -20,7 +20,8 @@ from kros.design.methods import predictor, table
 from kros.observer import Observer
 from kros.observer.residual import signal_bounds
 from kros.plants import PLANTS
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 from kros.uncertainty import UncertainModels
 
 ROOT = Path(__file__).parents[2]

@@ -134,6 +134,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "kros.observer.Dropped",
     ),
     (
+        "The function run_study is no longer part of kros; use kros.run, which takes a study too.",
+        "kros.study.run_study",
+    ),
+    (
         "The place of corrections is no longer chosen in a study: worst_case_h2 corrects the state, mixed the input; remove the "
         "key injection.",
         "synthesis.injection",

@@ -10,6 +10,6 @@ Examples
 """
 
 from .config import Stage, StudyConfig, load_config, validate_config
-from .pipeline import RunResult, run, run_study
+from .pipeline import RunResult, run
 
-__all__ = ["RunResult", "Stage", "StudyConfig", "load_config", "run", "run_study", "validate_config"]
+__all__ = ["RunResult", "Stage", "StudyConfig", "load_config", "run", "validate_config"]

@@ -62,22 +62,24 @@ class RunResult:
         return Observer.load(self.folder / "observers" / "deployed.json")
 
 
-def run_study(
-    config: StudyConfig,
+def run(
+    source: Population | StudyConfig | Path | str,
     out: Path | str,
+    *,
     until: Stage | str = Stage.REPORT,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
-    population: Population | None = None,
+    **sections: Any,
 ) -> RunResult:
-    """Run a study into a folder.
+    """Run a whole study into a folder, as ``kros run``.
 
     Parameters
     ----------
-    config : StudyConfig
+    source : Population, Path or StudyConfig
+        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what `load_config` returns.
     out : Path or str
-        Run folder; a stage that finds its own earlier result there is skipped.
+        Run folder; a stage whose result is there is skipped.
     until : Stage or str
         Last stage to run.
     workers : int
@@ -86,8 +88,8 @@ def run_study(
         Address of a Dask scheduler, instead of processes; `out` and the recordings are in a shared folder then.
     progress : Progress, optional
         Told which stage runs and how far it is.
-    population : Population, optional
-        Recordings in place of those that the study names.
+    **sections
+        Tables of a study, whose keys stand in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
 
     Returns
     -------
@@ -100,55 +102,6 @@ def run_study(
 
     Examples
     --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.plants import DcMotorPopulation
-    >>> from kros.study import run_study, validate_config
-    >>> motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> with TemporaryDirectory() as folder:
-    ...     study = validate_config({"data": {"source": "recordings"}, "identify": {"refine": False}}, Path(folder))
-    ...     result = run_study(study, f"{folder}/run", until="identify", population=motors)
-    >>> result.metrics["study"]["units"]
-    2
-    """
-    out, until = (
-        Path(out) if scheduler is None else Path(out).absolute(),
-        stage_of(until),
-    )  # workers elsewhere have a current folder of their own
-    require_own(out, config)
-    require_usable(config, until, population)
-    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, executor, progress, population)
-
-
-def run(
-    source: Population | StudyConfig | Path | str,
-    out: Path | str,
-    *,
-    until: Stage | str = Stage.REPORT,
-    workers: int = 1,
-    progress: Progress | None = None,
-    **sections: Any,
-) -> RunResult:
-    """Make a whole study into a folder, as ``kros run``.
-
-    Parameters
-    ----------
-    source : Population, Path or StudyConfig
-        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what `load_config` returns.
-    out : Path or str
-        Run folder; a stage that finds its own earlier result there is skipped.
-    until, workers, progress
-        As in `run_study`.
-    **sections
-        Tables of a study, whose keys stand in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
-
-    Returns
-    -------
-    RunResult
-
-    Examples
-    --------
     >>> from tempfile import TemporaryDirectory
     >>> import kros
     >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
@@ -157,35 +110,41 @@ def run(
     ...     result.metrics["study"]["units"]
     2
     """
-    tables: dict[str, Any] = dict(sections)
-    if isinstance(tables.get("lifting"), list | tuple):
-        tables["lifting"] = {"functions": tables["lifting"]}
-    if not isinstance(source, Population | StudyConfig | str | Path):
+    until, given = stage_of(until), source if isinstance(source, Population) else None
+    out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
+    config = study_of(source, out, sections)
+    require_own(out, config)
+    require_usable(config, until, given)
+    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
+        return run_in(store, config, until, executor, progress, given)
+
+
+def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: Mapping[str, Any]) -> StudyConfig:
+    """Return the study of some recordings, or a study, with keys of some tables changed."""
+    base, tables = Path(), dict(sections)
+    if isinstance(source, Population):
+        if set(tables.get("data", ())) & {"source", "reader"}:
+            raise ConfigError(
+                "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
+            )
+        raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
+        base = out
+    elif isinstance(source, StudyConfig):
+        raw = source.dump()
+    elif not isinstance(source, str | Path):
         raise ConfigError(
             f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays."
         )
-    raw: dict[str, Any]
-    if isinstance(source, Population):
-        raw, base = {"name": Path(out).name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}, Path(out)
-    elif isinstance(source, StudyConfig):
-        raw, base = source.dump(), Path()
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
-        raw, base = (
-            {"name": Path(out).name, "data": {"source": str(source), **({} if reader is None else {"reader": reader})}},
-            Path(),
-        )
+        raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}
     else:
-        raw, base = load_config(source).dump(), Path(source).parent
+        raw = load_config(source).dump()
+    if isinstance(tables.get("lifting"), list | tuple):
+        tables["lifting"] = {"functions": tables["lifting"]}
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
-    given = source if isinstance(source, Population) else None
-    if given is not None and set(tables.get("data", ())) & {"source", "reader"}:
-        raise ConfigError(
-            "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
-        )
-    origin = str(source) if given is None else "of arrays"
-    return run_study(validate_config(raw, base, origin), out, until, workers, None, progress, given)
+    return validate_config(raw, base, str(source) if isinstance(source, str | Path) else f"for {out}")
 
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:

@@ -28,13 +28,9 @@ def collect_metrics(context: Context, until: Stage, total_s: float | None) -> di
     done = list(Stage)[: list(Stage).index(until) + 1]
     metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done, total_s)}
     metrics["units"] = _units(context, done)
-    for stage, name, collect in _SECTIONS:
-        if stage in done:
-            metrics[name] = collect(context)
-    if Stage.LEFT_OUT in done:
-        metrics |= left_out.results(context)
-    if Stage.EVALUATE in done:
-        metrics |= _disturbed(context) | load_metrics(context) | _recorded(context)
+    for stage in done:
+        if stage in _OF_STAGES:
+            metrics |= _OF_STAGES[stage](context)
     clean: dict[str, Any] = plain(metrics)
     return clean
 
@@ -103,122 +99,87 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
 
 
 def _models(context: Context) -> dict[str, Any]:
-    return {
-        name: {"order": m.lifting.n_lifted, "spectral_radius_max": _pooled_radius(context, name)}
-        for name in context.identified.kinds
-        for m in [context.identified.models(name)]
-    }
-
-
-def _pooled_radius(context: Context, name: str) -> float:
-    models = context.identified.models(name)
-    rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
-    return float(models.spectral_radius()[rows].max())
+    """Models: order and largest spectral radius over the pooled units."""
+    entries = {}
+    for name in context.identified.kinds:
+        models = context.identified.models(name)
+        rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
+        radius = float(models.spectral_radius()[rows].max())
+        entries[name] = {"order": models.lifting.n_lifted, "spectral_radius_max": radius}
+    return {"models": entries}
 
 
 def _uncertainty(context: Context) -> dict[str, Any]:
+    """Uncertain models by kind, and the scores of all units."""
     store = context.store
-    found = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
+    names = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
+    scored = store.holds("outliers", "scores.json")
     return {
-        name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name)
-        for name in found
+        "uncertainty": {name: uncertainty_entry(store, name) for name in names},
+        "outliers": read_json(store.path("outliers", "scores.json"))["rows"] if scored else [],
     }
 
 
-def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
-    """Return the metrics of one uncertain model."""
-    weight = model.weight
+def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
+    """Return the metrics of one uncertain model, and the share of noise in it."""
+    model = UncertainModel.load(store.path("uncertainty", name))
     entry: dict[str, Any] = {
         "nominal": model.nominal_id,
         "form": model.form,
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
         "weight": {
-            "structure": weight.structure,
-            "orders": [weight.left_orders, weight.right_orders],
+            "structure": model.weight.structure,
+            "orders": [model.weight.left_orders, model.weight.right_orders],
             "cover_max": model.cover_max,
             "overbound_db_max": model.overbound_db_max,
         },
     }
-    return entry
-
-
-def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
-    """Return what was found out about one uncertain model beside its weights: the share of noise."""
-    entry: dict[str, Any] = {}
     if store.holds("uncertainty", name, "noise"):
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
-        shares = {
-            "median": np.median(noise.noise_share),
-            "at_peak": noise.noise_share[place],
+        share = noise.noise_share
+        entry["noise_share"] = {
+            "median": np.median(share),
+            "at_peak": share[place],
             "peak_hz": noise.freqs_hz[place],
         }
-        entry["noise_share"] = shares
     return entry
 
 
 def _observers(context: Context) -> dict[str, Any]:
+    """Observers with what their synthesis states."""
     entries: dict[str, Any] = {}
     written = context.store.files()
     for name, facts in context.observers_record["facts"].items():
         entry = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
-            entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
-            entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
-            if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
-                entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
+            bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
+            entry |= {key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)}
         entries[name] = entry
-    return entries
+    return {"observers": entries}
 
 
-def _observers_and_baselines(context: Context) -> dict[str, Any]:
-    return {**_observers(context), **context.evaluation["baselines"]}
+def _evaluation(context: Context) -> dict[str, Any]:
+    """Errors on held-out episodes, of disturbed measurements and of the load too, and of recorded states where the recordings say what these were."""
+    store, found = context.store, context.evaluation
+    free = {name: {"freerun_error_percent": errors} for name, errors in found["free_run"].items()}
+    entries: dict[str, Any] = {
+        "models": {name: entry | free[name] for name, entry in _models(context)["models"].items()},
+        "observers": _observers(context)["observers"] | found["baselines"],
+        "evaluation": found["rows"],
+        "intervals": interval_rows(found["rows"]),
+    }
+    if store.holds("disturbed", "disturbed.json"):
+        entries["robustness"] = load_artifact(store.path("disturbed"), "disturbed")[0]["robustness"]
+    return entries | load_metrics(context) | ({"recorded": found["recorded"]} if "recorded" in found else {})
 
 
-def _evaluation(context: Context) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = context.evaluation["rows"]
-    return rows
-
-
-def _intervals(context: Context) -> list[dict[str, Any]]:
-    return interval_rows(_evaluation(context))
-
-
-def _disturbed(context: Context) -> dict[str, Any]:
-    """Errors against severity, where the study asks for them."""
-    if not context.store.holds("disturbed", "disturbed.json"):
-        return {}
-    content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
-    return {key: content[key] for key in ("robustness",) if key in content}
-
-
-def _recorded(context: Context) -> dict[str, Any]:
-    """Errors of recorded states against what they really were; only where the recordings say so."""
-    found = context.evaluation
-    return {"recorded": found["recorded"]} if "recorded" in found else {}
-
-
-def _outliers(context: Context) -> list[dict[str, Any]]:
-    kept = context.store.holds("outliers", "scores.json")
-    rows: list[dict[str, Any]] = read_json(context.store.path("outliers", "scores.json"))["rows"] if kept else []
-    return rows
-
-
-def _free_run(context: Context) -> dict[str, Any]:
-    models = _models(context)
-    free = context.evaluation["free_run"]
-    return {name: entry | {"freerun_error_percent": free[name]} for name, entry in models.items()}
-
-
-_SECTIONS = (
-    (Stage.IDENTIFY, "models", _models),
-    (Stage.QUANTIFY, "uncertainty", _uncertainty),
-    (Stage.QUANTIFY, "outliers", _outliers),
-    (Stage.SYNTHESIZE, "observers", _observers),
-    (Stage.EVALUATE, "models", _free_run),
-    (Stage.EVALUATE, "observers", _observers_and_baselines),
-    (Stage.EVALUATE, "evaluation", _evaluation),
-    (Stage.EVALUATE, "intervals", _intervals),
-)
+_OF_STAGES = {
+    Stage.IDENTIFY: _models,
+    Stage.QUANTIFY: _uncertainty,
+    Stage.SYNTHESIZE: _observers,
+    Stage.EVALUATE: _evaluation,
+    Stage.LEFT_OUT: left_out.results,
+}

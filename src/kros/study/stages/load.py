@@ -61,9 +61,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     for kind, lifting in study.liftings().items():
         try:
             calibration = study.calibration(lifting)
-            observer = load_observer(
-                f"{kind}/load", calibration, study.context.population.inputs, context.config.load.memories
-            )
+            observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs)
             observer = replace(observer, seen=seen_by(context.identified, observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
@@ -161,7 +159,7 @@ class LoadStudy:
         """Return the declared load, in units of current, zero in other conditions."""
         config, angle = self.config, self.places[0]
         torque = known_load(
-            batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, config.angle_rad, REAL_HZ
+            batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, corner_hz=REAL_HZ
         )
         return np.where([k.condition == config.condition for k in batch.keys], torque, 0.0)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +20,7 @@ from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
 
-class Stage(str, Enum):
+class Stage(StrEnum):
     """Stages in the order in which data flow.
 
     Examples

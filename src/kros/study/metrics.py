@@ -23,10 +23,10 @@ from .stages import calibrate, left_out
 from .stages.load import load_metrics
 
 
-def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:
+def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
     """Collect the metrics of all stages up to one."""
     done = list(Stage)[: list(Stage).index(until) + 1]
-    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done, total_s)}
+    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
     metrics["units"] = _units(context, done)
     for stage in done:
         if stage in _OF_STAGES:
@@ -65,9 +65,10 @@ def _limit(limit: Limit, found: FoundLimit | None, declared: bool) -> dict[str, 
     return entry if found is None else entry | {"seen": asdict(found)}
 
 
-def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[str, float]:
-    timing = {stage.value: record.seconds for stage in done if (record := context.store.record(stage)) is not None}
-    return timing | ({"total": total_s} if total_s is not None else {})
+def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
+    manifest = context.store.manifest
+    timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
+    return timing | {"total": sum(timing.values())}
 
 
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:

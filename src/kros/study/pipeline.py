@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import read_json
+from ..core.choices import member
 from ..core.errors import ConfigError
 from ..core.work import Executor, Progress, Silent, Work
 from ..data import Population
@@ -110,7 +109,7 @@ def run(
     ...     result.metrics["study"]["units"]
     2
     """
-    until, given = stage_of(until), source if isinstance(source, Population) else None
+    until, given = member(Stage, until, "Stage"), source if isinstance(source, Population) else None
     out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
     config = study_of(source, out, sections)
     require_own(out, config)
@@ -164,33 +163,12 @@ def run_in(
     given: Population | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
-    began = time.perf_counter()
     context = Context(config, store, Work(executor, progress or Silent()), given)
     run_steps(context, STEPS, until)
-    metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
+    metrics = collect_metrics(context, until)
+    store.keep("metrics.json", metrics)
     store.sweep()
     return RunResult(store.folder, metrics, violations(config, metrics))
-
-
-def kept_metrics(store: Store, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Write the metrics where they are not those of an earlier run, with the time that took; return what is kept."""
-    earlier: dict[str, Any] = read_json(store.path("metrics.json")) if store.is_kept("metrics.json") else {}
-    total = earlier.get("timing_s", {}).get("total")
-    as_earlier = metrics | {"timing_s": metrics["timing_s"] | {"total": total}}
-    if as_earlier == earlier:
-        return earlier
-    store.keep("metrics.json", metrics)
-    return metrics
-
-
-def stage_of(name: Stage | str) -> Stage:
-    """Return a stage by its name."""
-    try:
-        return Stage(name)
-    except ValueError as error:
-        raise ConfigError(
-            f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}."
-        ) from error
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:

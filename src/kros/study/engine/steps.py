@@ -53,10 +53,10 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], s
     store, digest = context.store, digests[step.stage]
     artefact = store.restore(step.stage, digest)
     if artefact is not None:
-        context.work.progress.finish(step.stage.value, artefact.seconds, skipped=True)
+        context.work.progress.finish(step.stage, artefact.seconds, skipped=True)
         return
     began = time.perf_counter()
-    context.work.progress.start(step.stage.value, None)
+    context.work.progress.start(step.stage, None)
     with store.drafting() as draft:
         results = Results(store.artefacts.folder, code_key())
         step.run(replace(context, store=draft, work=replace(context.work, results=results)))
@@ -64,8 +64,8 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], s
         store.discard("metrics.json")
         _outdate(context, digests, stages)
         draft.commit(step.stage, digest, seconds, results.used)
-    context.work.progress.finish(step.stage.value, seconds, skipped=False)
-    log.info("%s: %.2f s", step.stage.value, seconds)
+    context.work.progress.finish(step.stage, seconds, skipped=False)
+    log.info("%s: %.2f s", step.stage, seconds)
 
 
 def _outdate(context: Context, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
@@ -87,7 +87,7 @@ def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, s
     for step in steps:
         if step.wanted(context.config):
             inputs = inputs_digest(context) if step.stage is Stage.READ else ""
-            digest = digest_of(digest, step.stage.value, inputs, [_part(tables, name) for name in step.sections])
+            digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
             digests[step.stage] = digest
     return digests
 

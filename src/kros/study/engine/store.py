@@ -15,7 +15,6 @@ import logging
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from enum import Enum
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
@@ -77,16 +76,16 @@ class Store:
 
     def nested(self, stage: str, name: str) -> Store:
         """Return the run folder of a study that a stage makes inside this one."""
-        return Store(self.path(_name(stage), name), shared=self.artefacts.folder)
+        return Store(self.path(stage, name), shared=self.artefacts.folder)
 
-    def runs(self, stage: str) -> list[Store]:
-        """Return the runs that a stage made, which are in a folder of its name."""
-        inside = sorted(path.parent for path in self.path(_name(stage)).glob(f"*/{MANIFEST}"))
-        return [self.nested(stage, folder.name) for folder in inside if not folder.is_symlink()]
+    def runs(self, stage: str = "*") -> list[Store]:
+        """Return the runs that a stage made, which are in a folder of its name, or all."""
+        inside = sorted(path.parent for path in self.folder.glob(f"{stage}/*/{MANIFEST}"))
+        return [self.nested(*folder.parts[-2:]) for folder in inside if not folder.is_symlink()]
 
     def record(self, stage: str) -> Artefact | None:
         """Return the artefact of a finished stage, or None."""
-        return self.manifest.get(_name(stage))
+        return self.manifest.get(stage)
 
     def files(self) -> frozenset[str]:
         """Return the names of all files that belong to the run."""
@@ -100,7 +99,7 @@ class Store:
     def verify(self, *stages: str) -> None:
         """Make sure that what finished stages wrote is as they left it, and the study and its metrics too."""
         manifest = read_manifest(self.folder)
-        for stage in (*map(_name, stages), OWN) if stages else manifest:
+        for stage in (*stages, OWN) if stages else manifest:
             if stage in manifest:
                 self._verify(stage, manifest[stage])
 
@@ -136,7 +135,7 @@ class Store:
 
     def commit(self, stage: str, digest: str, seconds: float, results: Collection[str] = ()) -> None:
         """Make an artefact of what the running stage drafted, name it in the manifest, and put its files into their places."""
-        draft, runs = self.draft(), tuple(f"{_name(stage)}/{run.folder.name}" for run in self.runs(stage))
+        draft, runs = self.draft(), tuple(f"{stage}/{run.folder.name}" for run in self.runs(stage))
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
         files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
@@ -149,14 +148,14 @@ class Store:
         if earlier != entry:
             if earlier is not None and earlier.digest != entry.digest:
                 self.drop(stage)
-            write_manifest(self.folder, self.manifest | {_name(stage): entry})
+            write_manifest(self.folder, self.manifest | {stage: entry})
         for name in artefact.files:
             self.artefacts.link(artefact, name, self.folder)
 
     def drop(self, *stages: str) -> None:
         """Forget stages: their files in the run folder, where they are as they were written; artefacts stay in the store, runs inside to be resumed."""
         manifest = self.manifest
-        for stage in map(_name, stages):
+        for stage in stages:
             artefact = manifest.pop(stage, Artefact(digest=""))
             for name in artefact.files:
                 self._unlink(artefact, name)
@@ -171,10 +170,9 @@ class Store:
 
     def remove(self) -> None:
         """Remove a run as far as its manifest lists it, and its folder where nothing else is in it."""
-        manifest = self.manifest
-        for run in (run for stage in manifest for run in self.runs(stage)):
+        for run in self.runs():
             run.remove()
-        self.drop(*manifest)
+        self.drop(*self.manifest)
         self.path(MANIFEST).unlink(missing_ok=True)
         if self.shared is None:
             self.artefacts.sweep(())
@@ -194,10 +192,9 @@ class Store:
 
     def _named(self) -> set[str]:
         """Digests of all artefacts of this run and of those inside, and of results that they were computed from."""
-        manifest = self.manifest
-        stored = [self.artefacts.load(artefact.digest) for artefact in manifest.values()]
+        stored = [self.artefacts.load(artefact.digest) for artefact in self.manifest.values()]
         named = {digest for artefact in stored if artefact for digest in (artefact.digest, *artefact.results)}
-        return named.union(*(run._named() for stage in manifest for run in self.runs(stage)))
+        return named.union(*(run._named() for run in self.runs()))
 
     def keep(self, name: str, content: Any) -> None:
         """Write a file of the run that is of no stage as JSON, where it is not there already."""
@@ -221,10 +218,6 @@ class Store:
 
     def _write_own(self, files: dict[str, Described]) -> None:
         write_manifest(self.folder, self.manifest | {OWN: Artefact(digest="", files=files)})
-
-
-def _name(stage: str) -> str:
-    return str(stage.value) if isinstance(stage, Enum) else stage
 
 
 def _prune(folder: Path, root: Path) -> None:

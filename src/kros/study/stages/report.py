@@ -23,7 +23,7 @@ def run(context: Context) -> None:
     from ...report import render
     from ..metrics import collect_metrics
 
-    metrics = collect_metrics(context, Stage.LEFT_OUT, None)
+    metrics = collect_metrics(context, Stage.LEFT_OUT)
     render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
 
 

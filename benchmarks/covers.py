@@ -25,7 +25,7 @@ from kros.core.frequency import log_grid, nyquist_hz
 from kros.identify import ModelSet
 from kros.study import run as run_study
 from kros.study import validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.uncertainty import Form, UncertainModel, quantify_systems
 from kros.uncertainty.weights.weight import Weight
@@ -66,7 +66,8 @@ def models_of(place: Path, population: str, units: int) -> Path:
     folder = place / f"pop_{loop}_{seed}_{spread}"
     if not (folder / "run" / "models").exists():
         simulate_to(
-            folder / "recordings", "harmonic-drive", units, 10, 20.0, int(seed), float(spread), loop, False, "parquet"
+            folder / "recordings",
+            Simulation(units, 10, 20.0, int(seed), spread=float(spread), outlier=False, loop=loop),
         )
         raw = {"data": {"source": str(folder / "recordings"), "reader": "parquet"}, "identify": {"refine": True}}
         run_study(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)

@@ -31,7 +31,7 @@ from kros.report.error_tables import PAPER, ErrorCell, ErrorTable, left_out_tabl
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config
 from kros.study import run as run_study
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage, SynthesisSettings
 from kros.study.engine.executors import available_cores
 from kros.study.engine.progress import Lines
@@ -105,15 +105,9 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
         shutil.rmtree(recordings, ignore_errors=True)
         simulate_to(
             recordings,
-            "harmonic-drive",
-            options.units,
-            options.episodes,
-            options.seconds,
-            options.seed,
-            spread,
-            loop,
-            False,
-            "parquet",
+            Simulation(
+                options.units, options.episodes, options.seconds, options.seed, spread=spread, outlier=False, loop=loop
+            ),
         )
     study = folder / "study.toml"
     methods = json.dumps(["paper", *SynthesisSettings().methods])

@@ -29,7 +29,7 @@ from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
 from kros.study import run as run_study
 from kros.study import validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -72,9 +72,7 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
         label = f"{loop}-{seed}" + ("-refined" if options.refine else "")
         out, recordings = root / label, root / label / "recordings"
         if not (out / "run" / "metrics.json").exists():
-            simulate_to(
-                recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, 1.0, loop, True, "parquet"
-            )
+            simulate_to(recordings, Simulation(options.units, options.episodes, 20.0, seed, loop=loop))
             config = validate_config(
                 {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": options.refine}}, root
             )

@@ -17,7 +17,7 @@ from typing import Any
 
 from kros.study import run as run_study
 from kros.study import validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 
 PLANTED = "000000"
 
@@ -44,7 +44,7 @@ def main() -> None:
 def study(folder: Path, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate one population, run the study, return the facts."""
     recordings = folder / "recordings"
-    simulate_to(recordings, "harmonic-drive", 12, 10, 20.0, seed, options.spread, options.loop, True, "parquet")
+    simulate_to(recordings, Simulation(12, 10, 20.0, seed, spread=options.spread, loop=options.loop))
     if options.hide:
         hide(recordings)
     config = validate_config({"name": "population", "data": {"source": str(recordings), "reader": "parquet"}}, folder)

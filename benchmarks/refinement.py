@@ -24,7 +24,7 @@ from kros.identify import KoopmanMatrices, ModelSet, free_run
 from kros.identify.refine import RefinedModels
 from kros.study import run as run_study
 from kros.study import validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -53,7 +53,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     """Simulate one population, identify and quantify it, return the facts."""
     recordings, out = folder / "recordings", folder / "run"
     simulate_to(
-        recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, spread, loop, False, "parquet"
+        recordings, Simulation(options.units, options.episodes, 20.0, seed, spread=spread, outlier=False, loop=loop)
     )
     raw = {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": True}}
     config = validate_config(raw, folder)

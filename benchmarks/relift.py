@@ -32,7 +32,7 @@ from kros.observer.certificate.report import relift_report
 from kros.observer.residual.one_step import one_step_residual
 from kros.study import run as run_study
 from kros.study import validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -93,15 +93,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
         shutil.rmtree(folder, ignore_errors=True)
         simulate_to(
             recordings,
-            "harmonic-drive",
-            options.units,
-            options.episodes,
-            options.seconds,
-            seed,
-            spread,
-            loop,
-            False,
-            "parquet",
+            Simulation(options.units, options.episodes, options.seconds, seed, spread=spread, outlier=False, loop=loop),
         )
         config = validate_config({**STUDY, "data": {"source": str(recordings.absolute()), "reader": "parquet"}}, folder)
         run_study(config, run, until=Stage.QUANTIFY, workers=options.workers)

@@ -12,32 +12,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_SUBPACKAGES = (
-    "core",
-    "data",
-    "design",
-    "evaluate",
-    "export",
-    "identify",
-    "interop",
-    "lifting",
-    "motor_drive",
-    "observer",
-    "plants",
-    "report",
-    "study",
-    "synthesis",
-    "uncertainty",
-)
-
-_VERBS = {
-    "read": "data",
-    "from_arrays": "data",
-    "from_frame": "data",
-    "quantify": "uncertainty",
-    "synthesize": "design",
-    "run": "study",
-}  # beside `identify`, a subpackage that can be called
+_FLOW = ("core", "data", "plants", "lifting", "identify", "uncertainty", "synthesis", "design", "observer")
+_SUBPACKAGES = tuple(sorted((*_FLOW, "motor_drive", "evaluate", "export", "interop", "report", "study")))
+_VERBS = {"read": "data", "from_arrays": "data", "from_frame": "data"}
+_VERBS |= {"quantify": "uncertainty", "synthesize": "design", "run": "study"}  # and `identify`, which can be called
 
 __all__ = ["__version__", *_SUBPACKAGES, *_VERBS]
 

@@ -139,11 +139,11 @@ def demo(
     quiet: Quiet = False,
 ) -> None:
     """Simulate a population with one badly assembled drive and run the whole study on it."""
-    from .study.commands.demo import run_demo
+    from .study.commands.demo import Simulation, run_demo
     from .study.engine.progress import make_progress
 
     with make_progress(quiet) as progress:
-        result = run_demo(out, units, episodes, seconds, seed, _count(workers), progress, set_ or ())
+        result = run_demo(out, Simulation(units, episodes, seconds, seed), _count(workers), progress, set_ or ())
     if not quiet and any(o.get("memory", {}).get("effort") == "quick" for o in result.metrics["observers"].values()):
         _say(["Predictors: quick effort; --set predictor.effort=full makes them more accurate and takes longer."])
     _finish(result, quiet)
@@ -165,9 +165,9 @@ def simulate(
     format_: Annotated[str, _option("parquet or raw, the paper's layout.", "--format")] = "parquet",
 ) -> None:
     """Simulate a population with known truth."""
-    from .study.commands.demo import simulate_to
+    from .study.commands.demo import Simulation, simulate_to
 
-    simulate_to(out, plant, units, episodes, seconds, seed, spread, loop, outlier, format_)
+    simulate_to(out, Simulation(units, episodes, seconds, seed, spread, outlier, plant, loop, format_))
     _say([f"recordings in {out}"])
 
 

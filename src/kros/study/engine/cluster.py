@@ -17,14 +17,21 @@ from threading import Lock
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from .executors import single_threaded
 from .store import code_key
-from .threads import single_threaded
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_BATCHES = 1024  # of a map, and
-_LARGEST = 1000  # tasks in one of them: the scheduler spends about a millisecond on a batch, whatever is in it
+_BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
 _ALONE = Lock()
+_LOST = (
+    "the connection was lost, and what was not finished there is gone. Start a scheduler and workers again; the same "
+    "command goes on where this one ended."
+)
+_GIVEN_UP = (
+    "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. Give workers more "
+    "memory, see their logs, and run the same command again: it goes on where this one ended."
+)
 
 
 class DaskExecutor:
@@ -43,7 +50,7 @@ class DaskExecutor:
         try:
             futures = self._client.map(partial(run_batch, code_key(), function), batches, pure=False)
         except ClosedClientError as error:
-            raise self._lost() from error
+            raise self._error(_LOST) from error
         return self._results(deque(futures))
 
     def _results(self, futures: deque[Any]) -> Iterator[Any]:
@@ -54,25 +61,19 @@ class DaskExecutor:
             while futures:
                 yield from futures.popleft().result()
         except KilledWorker as error:
-            raise KrosError(
-                f"Dask scheduler {self._address}: one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
-                "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
-            ) from error
+            raise self._error(_GIVEN_UP) from error
         except CancelledError as error:
-            raise self._lost() from error
+            raise self._error(_LOST) from error
         except (ImportError, RuntimeError) as error:
             missing = error if isinstance(error, ImportError) else error.__cause__
             if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
                 raise
-            raise KrosError(
-                f"Dask scheduler {self._address}: there or on a worker a package is not installed ({missing}); install the same kros[dask] on all of them."
+            raise self._error(
+                f"there or on a worker a package is not installed ({missing}); install the same kros[dask] on all of them."
             ) from error
 
-    def _lost(self) -> KrosError:
-        return KrosError(
-            f"Dask scheduler {self._address}: the connection was lost, and what was not finished there is gone. "
-            "Start a scheduler and workers again; the same command goes on where this one ended."
-        )
+    def _error(self, text: str) -> KrosError:
+        return KrosError(f"Dask scheduler {self._address}: {text}")
 
 
 def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:

@@ -11,13 +11,11 @@ from typing import Any
 
 from ...core.work import Progress, Silent
 
-EVERY_S = 10.0  # without a line, after which people wonder whether anything happens
-
 
 class Lines:
     """One line a finished stage, and one every ten seconds where nothing else is said."""
 
-    def __init__(self, every_s: float = EVERY_S) -> None:
+    def __init__(self, every_s: float = 10.0) -> None:
         self._every_s, self._lock, self._over = every_s, Lock(), Event()
         self._stage, self._done, self._began = "", 0, 0.0
         self._total: int | None = None

@@ -22,19 +22,14 @@ from .store import code_key
 log = logging.getLogger(__name__)
 
 
-def always(config: StudyConfig) -> bool:
-    """Tell that a stage is part of every study."""
-    return True
-
-
 @dataclass(frozen=True)
 class StageStep:
-    """One stage: what it does, which sections of the study, or ``section.key``, it depends on beside the stages before it, and which studies have it."""
+    """One stage: what it does, which sections of the study, or ``section.key``, it follows from, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
     sections: tuple[str, ...]
-    wanted: Callable[[StudyConfig], bool] = always
+    wanted: Callable[[StudyConfig], bool] = lambda config: True
 
 
 def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> None:

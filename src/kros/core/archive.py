@@ -15,20 +15,8 @@ import numpy as np
 from .errors import DataError
 
 _ENDING = ".npy"
-_DAMAGED = (  # what zipfile, the header of .npy and NumPy raise on bytes that somebody changed
-    zipfile.BadZipFile,
-    ValueError,
-    LookupError,
-    TypeError,
-    EOFError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-    ArithmeticError,
-    SyntaxError,
-    struct.error,
-    tokenize.TokenError,
-)
+_DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
+_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError)  # of bytes that were changed
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:

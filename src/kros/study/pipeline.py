@@ -109,7 +109,7 @@ def run(
     ...     result.metrics["study"]["units"]
     2
     """
-    until, given = member(Stage, until, "Stage"), source if isinstance(source, Population) else None
+    until, given = member(Stage, until, "--until"), source if isinstance(source, Population) else None
     out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
     config = study_of(source, out, sections)
     require_own(out, config)

@@ -37,9 +37,9 @@ class Results:
     def digests(self, function: Callable[[Any], Any], of_tasks: Iterable[str | None]) -> list[str | None]:
         """Return the digests of results from those of all that tasks hold; none where that is not known."""
         name = f"{function.__module__}.{function.__qualname__}"
-        found = [None if known is None else digest_of(self.source, name, known) for known in of_tasks]
-        self.used.update(digest for digest in found if digest is not None)
-        return found
+        digests = [None if digest is None else digest_of(self.source, name, digest) for digest in of_tasks]
+        self.used.update(digest for digest in digests if digest is not None)
+        return digests
 
     def read(self, digest: str | None, kinds: Iterable[type]) -> Any:
         """Return a result, or None."""

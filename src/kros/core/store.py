@@ -143,6 +143,7 @@ class ArtefactStore:
         """Give a folder that is nobody's; it goes where it was not put into its place."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=self.folder, ignore_cleanup_errors=True) as folder:
+            Path(folder).chmod(0o755)  # workers of a cluster may be other users
             yield Path(folder, "draft")
 
     def put(self, draft: Path, artefact: Artefact) -> None:

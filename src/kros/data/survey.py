@@ -9,7 +9,6 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from ..core.artifacts import load_artifact
 from ..core.errors import DataError
 from ..core.files import is_file
 from ..core.loading import loader
+from ..core.store import file_digest, link_or_copy
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, scan_digests
@@ -28,7 +28,6 @@ from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
 from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .recording import some, title
-from .writers.folders import same_file
 from .writers.parquet import GroupRecord, write_group, write_index
 
 log = logging.getLogger(__name__)
@@ -268,12 +267,8 @@ def _read_group(task: _Group) -> _Found:
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)
-    written = None if record is None or task.folder is None else _digest(task.folder / record.file)
+    written = None if record is None or task.folder is None else file_digest(task.folder / record.file)
     return _Found(record, written, episodes, steps, digests, alerts, ends, reach, sizes)
-
-
-def _digest(path: Path) -> str:
-    return sha256(path.read_bytes()).hexdigest()
 
 
 def _taken(known: _Found, earlier: Path | None, folder: Path) -> bool:
@@ -281,9 +276,9 @@ def _taken(known: _Found, earlier: Path | None, folder: Path) -> bool:
     if earlier is None or known.record is None:
         return False
     path = earlier / known.record.file
-    if not is_file(path) or _digest(path) != known.written:
+    if not is_file(path) or file_digest(path) != known.written:
         return False
-    same_file(path, folder / known.record.file)
+    link_or_copy(path, folder / known.record.file)
     return True
 
 

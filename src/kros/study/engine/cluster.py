@@ -24,10 +24,7 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 _BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
 _ALONE = Lock()
-_LOST = (
-    "the connection was lost, and what was not finished there is gone. Start a scheduler and workers again; the same "
-    "command goes on where this one ended."
-)
+_LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
 _GIVEN_UP = (
     "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. Give workers more "
     "memory, see their logs, and run the same command again: it goes on where this one ended."

@@ -21,7 +21,8 @@ from typer.core import TyperGroup
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
-_USAGE = tuple(kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException")  # perhaps typer's own
+_USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # perhaps typer's own
+_PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
 _BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
 
 
@@ -50,7 +51,7 @@ def edge(ctx: Any = None) -> Iterator[None]:
         again = "the same command goes on where this one ended." if resumes else again
         typer.echo(f"kros: stopped by {name}; {again}", err=True)
         raise typer.Exit(SIGNALLED + number) from stopped
-    except (typer.Exit, typer.Abort, *_USAGE):
+    except _PASSED:
         raise
     except BrokenPipeError:
         _silence()

@@ -184,7 +184,7 @@ def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
     manifest = {key: about for key, about in json.loads(path.read_text()).items() if key != "checksum"}
     content = hashlib.sha256(matching.read_bytes()).hexdigest() if matching else "0" * 64
     manifest["synthesize"]["files"] |= dict.fromkeys(names, (content, 0, 0))
-    manifest["synthesize"]["digest"] = "changed"
+    manifest["synthesize"]["digest"] = "0" * 64
     path.write_text(json.dumps(manifest))
 
 
@@ -208,6 +208,20 @@ def test_a_manifest_cannot_reach_out_of_its_folder(kros, fast, run, tmp_path, wa
     assert victim.read_text() == "years of work"
     assert (run / "linked").is_symlink()
     assert (run / "link").is_symlink()
+
+
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_a_digest_cannot_reach_out_of_the_store(kros, fast, run, tmp_path, command):
+    victim = tmp_path / "victim" / "thesis.tex"
+    victim.parent.mkdir()
+    victim.write_text("years of work")
+    manifest = {
+        key: about for key, about in json.loads((run / "manifest.json").read_text()).items() if key != "checksum"
+    }
+    manifest["report"]["digest"] = "../../victim"
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    assert (kros("report", run) if command == "report" else again(kros, fast, run)).exit_code in (0, 2)
+    assert victim.read_text() == "years of work"
 
 
 def test_files_of_others_in_a_run_folder_stay(kros, fast, run):

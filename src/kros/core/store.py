@@ -27,15 +27,13 @@ from .files import TEMPORARY, is_file
 from .settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
-
-
 Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
 
 
 class Artefact(Settings):
     """Files that follow from what `digest` is of."""
 
-    digest: str
+    digest: str = Field(pattern="^([0-9a-f]{64})?$")  # none for files that are of no stage
     seconds: NonNegativeFloat = 0.0  # that it took
     files: dict[str, Described] = Field(default_factory=dict)  # by name
     runs: tuple[str, ...] = ()  # folders below the run folder that are runs, made with it
@@ -158,14 +156,10 @@ class ArtefactStore:
         """Let a file of an artefact be in a folder too, where it is not: the same file where the file system can, else a copy."""
         if artefact.matches(folder, name):
             return
-        source, target, beside = (
-            self.folder / artefact.digest / name,
-            place(folder, name),
-            self.folder / f"{TEMPORARY}link",
-        )
+        target, beside = place(folder, name), self.folder / f"{TEMPORARY}link"
         try:
             target.parent.mkdir(parents=True, exist_ok=True)
-            link_or_copy(source, beside)
+            link_or_copy(self.folder / artefact.digest / name, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
             raise ConfigError(

@@ -50,10 +50,7 @@ IN_A_ROW, PATIENCE = (
     4,
     10,
 )  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
-_TIMED_TABLE = re.compile(
-    r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL
-)
-_LAST_CELL = re.compile(r"<td[^>]*>[^<]*</td>(?=\s*</tr>)")
+_TIMED_CELL = re.compile(r'<td data-label="(?:seconds|solved in \(s\))"[^>]*>[^<]*</td>')
 
 
 @dataclass
@@ -169,7 +166,7 @@ def content(path: Path, name: str) -> Any:
     if path.suffix == ".json":
         return timeless(json.loads(path.read_text()))
     if path.suffix == ".html":
-        return _TIMED_TABLE.sub(lambda table: _LAST_CELL.sub("", table.group()), path.read_text())
+        return _TIMED_CELL.sub("", path.read_text())
     return path.read_bytes()
 
 

@@ -1,7 +1,8 @@
 """The command line: a thin face of `kros.study`.
 
-Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not met;
-4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it, 143 for SIGTERM. Errors become messages in `kros.edge`.
+Exit codes: 0 done; 1 failed; 2 wrong usage or bad input, and then nothing was written; 3 done, but a requirement is not
+met; 4 `kros check` cannot decide on a unit; 128 and the number of a signal that stopped it, 143 for SIGTERM. Errors
+become messages in `kros.edge`.
 """
 
 from __future__ import annotations
@@ -236,7 +237,7 @@ def check(
         _option("A unit named as one of the study is that machine: compare it with the others alone.", "--same-unit"),
     ] = False,
 ) -> None:
-    """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 0 all pass, 3 a unit fails, 4 a unit is undecided."""
+    """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 3 if one fails, 4 undecided."""
     from .study.commands.check import check_units
     from .study.commands.verdict import Verdict, junit_text, require_folder, verdict_lines, worst
 

@@ -1,7 +1,7 @@
 """The edge of the command line: whatever goes wrong below becomes one message on standard error and an exit code.
 
-In the library exceptions stay exceptions. Here each class of them gets its words; what is not expected at all is a defect of kros and says so,
-with the way to its traceback (``kros --debug``).
+In the library exceptions stay exceptions. Here each class of them gets its words; what is not expected at all is a
+defect of kros and says so, with the way to its traceback (``kros --debug``).
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class OnceHandler(logging.StreamHandler[TextIO]):
 def log_to_stderr(verbose: bool) -> None:
     """Send log and warnings to standard error, a line each; warnings and errors alone unless `verbose`."""
     if logging.getLogger().handlers:
-        return  # somebody else listens
+        return  # the log is read elsewhere
     handler = OnceHandler()
     handler.addFilter(lambda record: verbose or record.name != "kros.data.survey")  # alerts stand behind the run
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
@@ -114,7 +114,7 @@ def message(error: Exception) -> str:
 
 
 def _silence_if_broken() -> None:
-    """Where standard output cannot be written any more, say nothing more on it: Python would fail once more when it ends."""
+    """Write nothing more on standard output that is broken: Python would fail once more when it ends."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):

@@ -1,8 +1,8 @@
 """The one reader and writer behind every `save` and `load`.
 
-An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum of both).
-Files appear whole or not at all: they are written beside their place and moved there. What was changed since is not read: a file that
-was edited on purpose is accepted once its key ``checksum`` is removed, with what its reader checks of the content.
+An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum
+of both). Files appear whole or not at all: they are written beside their place and moved there. What was changed since
+is not read: a file that was edited on purpose is accepted once its key ``checksum`` is removed, and its reader checks it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ CHECKSUM = "checksum"
 
 
 class LoadedContent(dict[Any, Any]):
-    """A JSON object or a set of arrays as read from a file; asking for a key that is not there says so, with the file."""
+    """A JSON object or a set of arrays as read from a file; a key that is missing is an error that names the file."""
 
     def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
         super().__init__(content)
@@ -39,7 +39,8 @@ class LoadedContent(dict[Any, Any]):
 
     def __missing__(self, key: Any) -> Any:
         raise DataError(
-            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with this version."
+            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with "
+            "this version."
         )
 
 
@@ -116,8 +117,8 @@ def _finite(text: str) -> float:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    kept = {key: value for key, value in content.items() if key != CHECKSUM}
-    return "sha256:" + hashlib.sha256(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    content = {key: value for key, value in content.items() if key != CHECKSUM}
+    return "sha256:" + hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -132,7 +133,8 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
         return False
     if content[CHECKSUM] != _digest(content):
         raise DataError(
-            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was written; write it again, or "
+            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was "
+            "written; write it again, or "
             f'remove the key "{CHECKSUM}" where it was edited on purpose.'
         )
     return True
@@ -168,10 +170,11 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     folder = Path(folder)
     path, archive = folder / f"{kind}.json", folder / "arrays.npz"
     content = read_json(path)
-    found = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
-    if found != (SCHEMA, kind):
+    about = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
+    if about != (SCHEMA, kind):
         raise DataError(
-            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {found}; write it again with this version of kros."
+            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {about}; write it again "
+            "with this version of kros."
         )
     check_checksum(content, path)
     content.pop(CHECKSUM, None)
@@ -181,6 +184,7 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     packed = _read(archive, limits.MAX_ARRAYS_BYTES)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
         raise DataError(
-            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step that made them."
+            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step "
+            "that made them."
         )
     return content, LoadedContent(unpack_arrays(packed, archive), archive)

@@ -1,4 +1,4 @@
-"""A folder that one process works in: a lock that the operating system lets go however its process ends; the file that is left blocks nobody."""
+"""A lock on a folder, which the system releases however the process ends; a file that is left locks nothing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
 if sys.platform == "win32":
 
     def _take(handle: int, shared: bool) -> None:
-        """Windows locks bytes that nobody else may read then."""
+        """On Windows a locked file cannot be read."""
         raise OSError(errno.ENOLCK, "none on Windows")
 
 else:
@@ -36,7 +36,7 @@ else:
 
 @contextmanager
 def locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder: for writing alone, or for reading together with other readers; one that may only be read is read."""
+    """Hold a folder for writing alone, or for reading together with other readers, where it may be locked at all."""
     path = folder / NAME
     try:
         handle = _open(path, shared)

@@ -1,7 +1,7 @@
-"""Results of maps in a store, by the digest of all that they follow from: what is new or changed is computed, the rest is read.
+"""Results of maps in a store, by the digest of all that they follow from: what is new is computed, the rest is read.
 
-Whoever computes a result writes it, a worker elsewhere too. Numbers come back bit by bit, so results do not depend on how they were obtained; what
-cannot be read back whole is as good as none.
+The process that computes a result writes it, on a cluster too. Numbers come back bit by bit, so results do not depend
+on how they were obtained; what cannot be read back whole is computed again.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Results:
-    """Results in a folder, computed with a source of kros that has a digest; `used` are those that were asked for."""
+    """Results in a folder, computed with the `source` of kros; `used` are those of the maps so far."""
 
     folder: Path
     source: str
     used: set[str] = field(default_factory=set)
 
     def digests(self, function: Callable[[Any], Any], of_tasks: Iterable[str | None]) -> list[str | None]:
-        """Return the digests of results from those of all that tasks hold; none where that is not known."""
+        """Return the digests of results from those of what the tasks hold; None where a task has none."""
         name = f"{function.__module__}.{function.__qualname__}"
         digests = [None if digest is None else digest_of(self.source, name, digest) for digest in of_tasks]
         self.used.update(digest for digest in digests if digest is not None)

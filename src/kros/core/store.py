@@ -4,8 +4,9 @@
     <run>/store/<digest>.npz    the result of one task of a map; see `results`
     <run>/manifest.json         the artefacts of a run; their files are at their places in the run folder too
 
-A digest is of settings, inputs and source. So what is there need not be computed, and what is computed twice is the same. Nothing is believed
-further than it can be checked: a file counts where it is as it was written, and no name leads out of its folder.
+A digest is of settings, inputs and source. So what is there need not be computed, and what is computed twice is the
+same. Nothing is believed further than it can be checked: a file counts where it is as it was written, and no name leads
+out of its folder.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class Artefact(Settings):
         return cls.of(_checked(path), f"Artefact {path}")
 
     def matches(self, folder: Path, name: str) -> bool:
-        """Tell whether one of its files is in a folder as it was written; of the size and time that it had, it is not read."""
+        """Return whether a file is in a folder as it was written; one with its size and time is not read."""
         path, (content, *stamp) = place(folder, name), self.files[name]
         return is_file(path) and (_stamp(path) == tuple(stamp) or file_digest(path) == content)
 
@@ -138,7 +139,7 @@ class ArtefactStore:
 
     @contextmanager
     def draft(self) -> Iterator[Path]:
-        """Give a folder that is nobody's; it goes where it was not put into its place."""
+        """Give the path of a draft beside the artefacts; it goes where it was not put into its place."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=self.folder, ignore_cleanup_errors=True) as folder:
             Path(folder).chmod(0o755)  # workers of a cluster may be other users
@@ -153,7 +154,7 @@ class ArtefactStore:
         draft.replace(target)
 
     def link(self, artefact: Artefact, name: str, folder: Path) -> None:
-        """Let a file of an artefact be in a folder too, where it is not: the same file where the file system can, else a copy."""
+        """Put a file of an artefact into a folder too: the same file where the file system can, else a copy."""
         if artefact.matches(folder, name):
             return
         target, beside = place(folder, name), self.folder / f"{TEMPORARY}link"
@@ -169,8 +170,8 @@ class ArtefactStore:
     def sweep(self, named: Collection[str]) -> None:
         """Remove what is not named: artefacts, results, drafts of processes that were killed."""
         for path in self.folder.iterdir() if self.folder.is_dir() else ():
-            known = len(path.stem) == hashlib.sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
-            if known and path.stem not in named:
+            ours = len(path.stem) == hashlib.sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
+            if ours and path.stem not in named:
                 remove(path)
 
 

@@ -1,4 +1,4 @@
-"""Independent pieces of work, in order: where they run, what is known of them, and who is told how far they are."""
+"""Independent pieces of work, in order: where they run, which results are there, and who listens to their progress."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Progress(Protocol):
         """One of its steps is done."""
 
     def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """A stage is done, or was found done."""
+        """A stage is done, or was skipped."""
 
 
 class Silent:
@@ -57,7 +57,7 @@ class Silent:
 
 @dataclass(frozen=True)
 class Work:
-    """An executor, a progress listener and results that are there; by default everything runs here, in silence, and nothing is known."""
+    """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
     executor: Executor = field(default_factory=SerialExecutor)
     progress: Progress = field(default_factory=Silent)
@@ -80,40 +80,40 @@ class Work:
         kinds: Iterable[type] = (),
         usable: Callable[[Any, Any], bool] = lambda task, result: True,
     ) -> Iterator[T]:
-        """Map a function over tasks, in order; what is in the store by the digest (`marks`) of all that a task holds, and is usable, is not computed."""
+        """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`."""
         if self.results is None:
             yield from self.map(title, function, tasks)
             return
         tasks, kinds, digests = list(tasks), tuple(kinds), self.results.digests(function, marks)
-        known = [self.results.read(digest, kinds) for digest in digests]
-        known = [
+        earlier = [self.results.read(digest, kinds) for digest in digests]
+        earlier = [
             None if result is None or not usable(task, result) else result
-            for task, result in zip(tasks, known, strict=True)
+            for task, result in zip(tasks, earlier, strict=True)
         ]
-        new = [row for row, result in zip(zip(digests, tasks, strict=True), known, strict=True) if result is None]
+        new = [row for row, result in zip(zip(digests, tasks, strict=True), earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
         computed = self.map(title, Storing(function, self.results.folder), new)
-        for result in known:
+        for result in earlier:
             yield next(computed) if result is None else result
-        next(computed, None)  # its progress is told to the end
+        next(computed, None)  # its progress ends
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""
         return list(self.map(title, _call, work))
 
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
-        """Begin independent pieces of work, and return what waits for their results, in order: work that is asked for meanwhile runs beside them."""
+        """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         pieces = list(work)
         running = self.executor.map(_call, pieces)
 
         def results() -> list[T]:
             self.progress.start(title, len(pieces))
-            found = []
+            computed = []
             for result in running:
                 self.progress.advance()
-                found.append(result)
-            return found
+                computed.append(result)
+            return computed
 
         return results
 

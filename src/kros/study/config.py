@@ -92,7 +92,7 @@ class EvaluateConfig(Settings):
 
 
 class LoadConfig(Settings):
-    """Load torque ``moment sin(angle) + inertia angle''``, over the torque constant, of what is mounted in a condition."""
+    """Load torque ``moment sin(angle) + inertia angle''``, over the torque constant, of a mounted mass."""
 
     moment: float | None = Field(
         None, description="of the mounted mass, in units of current; without it nothing is done about load"
@@ -176,13 +176,14 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
 def validate_config(
     raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()
 ) -> StudyConfig:
-    """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`.
+    """Validate a study given as tables; a relative source is relative to `base`, overrides are as in `load_config`.
 
     Examples
     --------
     >>> from pathlib import Path
     >>> from kros.study import validate_config
-    >>> study = validate_config({"data": {"source": "recordings", "reader": "parquet"}}, Path(), overrides=["identify.alpha=90"])
+    >>> tables = {"data": {"source": "recordings", "reader": "parquet"}}
+    >>> study = validate_config(tables, Path(), overrides=["identify.alpha=90"])
     >>> study.identify.alpha
     90.0
     """

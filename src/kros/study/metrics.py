@@ -45,10 +45,10 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "channels": {c.name: c.unit for c in context.population.channels},
     }
     if context.config.sensor:
-        study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
+        study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
     if limits := limits_of(context.config.limits, facts.limits, context.population.states):
         study["limits"] = {
-            name: _limit(own, facts.limits.get(name), name in context.config.limits) for name, own in limits.items()
+            name: _limit(limit, facts.limits.get(name), name in context.config.limits) for name, limit in limits.items()
         }
     if facts.alerts:
         study["alerts"] = facts.alerts
@@ -59,10 +59,10 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     return study
 
 
-def _limit(limit: Limit, found: FoundLimit | None, declared: bool) -> dict[str, Any]:
+def _limit(limit: Limit, seen: FoundLimit | None, declared: bool) -> dict[str, Any]:
     """Return a limit that counts, and where recordings were seen at one."""
     entry: dict[str, Any] = limit.model_dump() | {"declared": declared}
-    return entry if found is None else entry | {"seen": asdict(found)}
+    return entry if seen is None else entry | {"seen": asdict(seen)}
 
 
 def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
@@ -163,18 +163,18 @@ def _observers(context: Context) -> dict[str, Any]:
 
 
 def _evaluation(context: Context) -> dict[str, Any]:
-    """Errors on held-out episodes, of disturbed measurements and of the load too, and of recorded states where the recordings say what these were."""
-    store, found = context.store, context.evaluation
-    free = {name: {"freerun_error_percent": errors} for name, errors in found["free_run"].items()}
+    """Errors on held-out episodes, disturbed or not, of the load, and of recorded states where truth is recorded."""
+    store, evaluated = context.store, context.evaluation
+    free = {name: {"freerun_error_percent": errors} for name, errors in evaluated["free_run"].items()}
     entries: dict[str, Any] = {
         "models": {name: entry | free[name] for name, entry in _models(context)["models"].items()},
-        "observers": _observers(context)["observers"] | found["baselines"],
-        "evaluation": found["rows"],
-        "intervals": interval_rows(found["rows"]),
+        "observers": _observers(context)["observers"] | evaluated["baselines"],
+        "evaluation": evaluated["rows"],
+        "intervals": interval_rows(evaluated["rows"]),
     }
     if store.holds("disturbed", "disturbed.json"):
         entries["robustness"] = load_artifact(store.path("disturbed"), "disturbed")[0]["robustness"]
-    return entries | load_metrics(context) | ({"recorded": found["recorded"]} if "recorded" in found else {})
+    return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if "recorded" in evaluated else {})
 
 
 _OF_STAGES = {

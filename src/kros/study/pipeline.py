@@ -53,7 +53,8 @@ class RunResult:
     violations: tuple[str, ...]
 
     def __repr__(self) -> str:
-        return f"<RunResult {self.folder}: {self.metrics['study']['units']} units, deployed is {self.metrics['study'].get('deployed')}>"
+        study = self.metrics["study"]
+        return f"<RunResult {self.folder}: {study['units']} units, deployed is {study.get('deployed')}>"
 
     @property
     def observer(self) -> Observer:
@@ -76,7 +77,8 @@ def run(
     Parameters
     ----------
     source : Population, Path or StudyConfig
-        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what `load_config` returns.
+        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what
+        `load_config` returns.
     out : Path or str
         Run folder; a stage whose result is there is skipped.
     until : Stage or str
@@ -88,7 +90,8 @@ def run(
     progress : Progress, optional
         Told which stage runs and how far it is.
     **sections
-        Tables of a study, whose keys stand in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
+        Tables of a study that replace keys of the study, for example ``identify={"alpha": 90}``; ``lifting`` may be a
+        list of functions.
 
     Returns
     -------
@@ -97,7 +100,8 @@ def run(
     Raises
     ------
     KrosError
-        Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
+        Bad input leaves no folder behind that was not there before; so does a folder of another study, or one in which
+        another run is at work.
 
     Examples
     --------
@@ -132,7 +136,8 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
         raw = source.dump()
     elif not isinstance(source, str | Path):
         raise ConfigError(
-            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays."
+            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with "
+            "kros.from_arrays."
         )
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
@@ -173,14 +178,14 @@ def run_in(
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     """Return the requirements of the study that its result does not meet."""
-    found = []
+    unmet = []
     deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
     if config.require.robust and (deployed.get("status") == "failed" or not is_robust(deployed)):
         reason = deployed.get("reason", "none was computed")
-        found.append(
+        unmet.append(
             f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})"
         )
     flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]
     if config.require.no_outliers and flagged:
-        found.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
-    return tuple(found)
+        unmet.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
+    return tuple(unmet)

@@ -65,7 +65,7 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
 def run_demo(
     out: Path, simulation: Simulation, workers: int, progress: Progress, overrides: Sequence[str] = ()
 ) -> RunResult:
-    """Simulate a population and run the study on it, all below one folder; a simulation that is there is not run again."""
+    """Simulate a population and run the study on it, all below one folder; what is there is not simulated again."""
     out = Path(out).absolute()
     data = {"source": str(out / _RECORDINGS), "reader": "parquet"}
     config = validate_config({"name": "demo", "data": data, "predictor": {"effort": "quick"}}, out, overrides=overrides)

@@ -1,7 +1,8 @@
-"""Maps over units on a Dask cluster: the same code as here, one task at a time in a worker process, with one thread for linear algebra.
+"""Maps over units on a Dask cluster: the same code, one task at a time in a worker, one thread for linear algebra.
 
-Sums of a matrix product are ordered by the number of its threads, so that results have the same bytes only where all workers use the same number. A
-worker's environment is its own, and was read when its libraries were loaded: threads are set in the running process, around every task.
+The order of the sums in a matrix product depends on the number of threads, so results have the same bytes only where
+all workers use the same number. Libraries read the environment when they are loaded: threads are set in the running
+process, around every task.
 """
 
 from __future__ import annotations
@@ -26,8 +27,8 @@ _BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the sched
 _ALONE = Lock()
 _LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
 _GIVEN_UP = (
-    "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. Give workers more "
-    "memory, see their logs, and run the same command again: it goes on where this one ended."
+    "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
+    "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
 )
 
 
@@ -66,7 +67,7 @@ class DaskExecutor:
             if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
                 raise
             raise self._error(
-                f"there or on a worker a package is not installed ({missing}); install the same kros[dask] on all of them."
+                f"there or on a worker a package is not installed ({missing}); install kros[dask]."
             ) from error
 
     def _error(self, text: str) -> KrosError:
@@ -77,17 +78,16 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
     """In a worker: run a batch of tasks, while no other one runs in this process."""
     from threadpoolctl import threadpool_limits
 
+    worker = f"Dask worker on {socket.gethostname()}"
     if code_key() != key:
-        raise KrosError(
-            f"Dask worker on {socket.gethostname()}: its kros is not the one that runs the study; install the same version on every worker."
-        )
+        raise KrosError(f"{worker}: its kros is not that of the study; install the same version on every worker.")
     with _ALONE, single_threaded(), threadpool_limits(1):
         try:
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
             raise KrosError(
-                f"Dask worker on {socket.gethostname()}: finds no {error.filename}; recordings and run folder must be in a "
-                "shared folder, which has the same path on every worker."
+                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, which has the "
+                "same path on every worker."
             ) from error
 
 
@@ -107,21 +107,18 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); start one, or name its address."
+            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); correct the address."
         ) from error
     threads = client.nthreads()
     if not threads:
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
     if any(n > 1 for n in threads.values()):
-        log.warning(
-            "Dask scheduler %s: workers of several threads run one task at a time; start them with --nthreads 1.",
-            address,
-        )
-    told = logging.getLogger("distributed.client")
-    level = told.level
-    told.setLevel(logging.CRITICAL)  # what it says of a lost connection is said by an error here
+        log.warning("Dask scheduler %s: workers run one task at a time; start them with --nthreads 1.", address)
+    messages = logging.getLogger("distributed.client")
+    level = messages.level
+    messages.setLevel(logging.CRITICAL)  # a lost connection is an error here
     try:
         with client:
             yield DaskExecutor(client, address)
     finally:
-        told.setLevel(level)
+        messages.setLevel(level)

@@ -1,6 +1,7 @@
 """Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes.
 
-Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, by whatever ended this process too.
+Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, however
+this process ended.
 """
 
 from __future__ import annotations
@@ -80,7 +81,7 @@ def _pool(workers: int) -> Iterator[Any]:
 
 
 def _begin(pipe: Any) -> None:
-    """In a worker: end as soon as the other end of a pipe is closed; an interrupt from the keyboard is the parent's to handle."""
+    """In a worker: end when the other end of a pipe is closed; the parent handles interrupts from the keyboard."""
     import signal
     from threading import Thread
 

@@ -13,7 +13,7 @@ from ...core.work import Progress, Silent
 
 
 class Lines:
-    """One line a finished stage, and one every ten seconds where nothing else is said."""
+    """One line a finished stage, and one every ten seconds where there is no other."""
 
     def __init__(self, every_s: float = 10.0) -> None:
         self._every_s, self._lock, self._over = every_s, Lock(), Event()
@@ -57,7 +57,7 @@ class Lines:
 
     def _say(self, line: str) -> None:
         self._said = time.monotonic()
-        with suppress(OSError, ValueError):  # nobody may be listening any more
+        with suppress(OSError, ValueError):  # the reader may be gone
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
 

@@ -18,17 +18,17 @@ STUDY = "study.json"
 
 
 def require_own(out: Path, config: StudyConfig) -> bool:
-    """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty."""
+    """Refuse a folder of another study, by name and recordings; return whether the folder is new or empty."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
     if not out.exists() or all(path.name.startswith(TEMPORARY) for path in out.iterdir()):
         return True
     if not (out / STUDY).exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
-    found, own = _identity(_read_study(out)), _identity(config.dump())
-    if found != own:
+    there, this = _identity(_read_study(out)), _identity(config.dump())
+    if there != this:
         raise ConfigError(
-            f"Output {out}: holds the study {found[0]!r} of {found[1]}, and this is {own[0]!r} of {own[1]}; "
+            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; "
             "name another folder, or remove this one if it is not needed any more."
         )
     return False
@@ -75,7 +75,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 
 @contextmanager
 def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
-    """Open a run for reading while no other process writes there, and make sure that some stages' files are as they left them."""
+    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
     folder = Path(folder)
     load_run(folder)
     with locked(folder, shared=not alone):

@@ -1,4 +1,4 @@
-"""Steps of a study: run in order, skipped where the store has what they would make, so a run that was interrupted resumes."""
+"""Steps of a study: run in order, skipped where the store has their artefact, so an interrupted run resumes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class StageStep:
-    """One stage: what it does, which sections of the study, or ``section.key``, it follows from, and which studies have it."""
+    """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
@@ -64,7 +64,7 @@ def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], s
 
 
 def _outdate(context: Context, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
-    """Remove what does not follow from the study any more; from here on the run folder is that of the study as it is now."""
+    """Remove what does not follow from the study any more; the run folder is that of the study as it is now."""
     store, manifest = context.store, context.store.manifest
     outdated = [stage for stage in stages if stage in manifest and manifest[stage].digest != digests.get(stage)]
     unwanted = [run for stage in stages if stage not in digests for run in store.runs(stage)]
@@ -77,7 +77,7 @@ def _outdate(context: Context, digests: Mapping[Stage, str], stages: Sequence[St
 
 
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
-    """Return digests of all that the stages of a study follow from: kros itself, the stages before, recordings, and their part of the study."""
+    """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
     tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
     for step in steps:
         if step.wanted(context.config):
@@ -104,7 +104,7 @@ def inputs_digest(context: Context) -> str:
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:
-    """Return a digest of an episode; of one that is not finite, what is said of it: it is dropped, or an error."""
+    """Return a digest of an episode; of one that is not finite, the message: it is dropped, or an error."""
     try:
         return sha256(np.ascontiguousarray(given.source(key)).tobytes()).hexdigest()
     except NonFiniteError as error:

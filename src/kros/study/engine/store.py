@@ -1,12 +1,12 @@
-"""The run folder: a manifest of artefacts, which are in its store; their files are at their places in the run folder too.
+"""The run folder: a manifest of artefacts, which are in its store; their files are in the run folder too.
 
     <run>/manifest.json          which artefact every stage has, with digests of all files
     <run>/store/<digest>/        artefacts, and results of single units; see `core.store`
     <run>/models/ ...            the files of the artefacts, for people and for all that reads a run
-    <run>/<stage>/<name>/        a run that a stage made, with a manifest of its own and the same store
+    <run>/<stage>/<name>/        a run that a stage made, with another manifest and the same store
 
-A stage writes a draft, which becomes an artefact, which the manifest names. So an interrupted stage leaves nothing that counts, and nothing is
-ever removed from the run folder that the manifest does not list with the content it has.
+A stage writes a draft, which becomes an artefact, which the manifest names. So an interrupted stage leaves nothing that
+counts, and nothing is removed from the run folder that the manifest does not list with the content it has.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ STORE, OWN = "store", "run"
 
 @dataclass(frozen=True)
 class Store:
-    """A run folder; with a `place`, also the draft of the stage that runs; `shared` is the store of the run that this one is inside of."""
+    """A run folder; `place` is the draft of the stage that runs, `shared` the store of the run around this one."""
 
     folder: Path
     place: Path | None = None
@@ -79,7 +79,7 @@ class Store:
         return Store(self.path(stage, name), shared=self.artefacts.folder)
 
     def runs(self, stage: str = "*") -> list[Store]:
-        """Return the runs that a stage made, which are in a folder of its name, or all."""
+        """Return the runs in the folder of a stage, or all."""
         inside = sorted(path.parent for path in self.folder.glob(f"{stage}/*/{MANIFEST}"))
         return [self.nested(*folder.parts[-2:]) for folder in inside if not folder.is_symlink()]
 
@@ -134,7 +134,7 @@ class Store:
             yield replace(self, place=draft)
 
     def commit(self, stage: str, digest: str, seconds: float, results: Collection[str] = ()) -> None:
-        """Make an artefact of what the running stage drafted, name it in the manifest, and put its files into their places."""
+        """Make an artefact of the draft of the running stage, name it in the manifest, and put its files into place."""
         draft, runs = self.draft(), tuple(f"{stage}/{run.folder.name}" for run in self.runs(stage))
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
@@ -153,7 +153,7 @@ class Store:
             self.artefacts.link(artefact, name, self.folder)
 
     def drop(self, *stages: str) -> None:
-        """Forget stages: their files in the run folder, where they are as they were written; artefacts stay in the store, runs inside to be resumed."""
+        """Forget stages and their files in the run folder that are as written; artefacts and runs inside stay."""
         manifest = self.manifest
         for stage in stages:
             artefact = manifest.pop(stage, Artefact(digest=""))
@@ -198,22 +198,22 @@ class Store:
 
     def keep(self, name: str, content: Any) -> None:
         """Write a file of the run that is of no stage as JSON, where it is not there already."""
-        text, own = json_bytes(content), self.record(OWN) or Artefact(digest="")
-        if self.is_kept(name) and own.files[name][0] == sha256(text).hexdigest():
+        text, free = json_bytes(content), self.record(OWN) or Artefact(digest="")
+        if self.is_kept(name) and free.files[name][0] == sha256(text).hexdigest():
             return
         write_bytes(place(self.folder, name), text)
-        self._write_own(own.files | {name: describe(self.path(name))})
+        self._write_own(free.files | {name: describe(self.path(name))})
 
     def is_kept(self, name: str) -> bool:
         """Tell whether a file of the run that is of no stage is there as it was written."""
-        own = self.record(OWN)
-        return own is not None and name in own.files and own.matches(self.folder, name)
+        free = self.record(OWN)
+        return free is not None and name in free.files and free.matches(self.folder, name)
 
     def discard(self, name: str) -> None:
         """Remove a file of the run that is of no stage."""
-        own = self.record(OWN)
-        if own is not None and name in own.files:
-            self._write_own({n: about for n, about in own.files.items() if n != name})
+        free = self.record(OWN)
+        if free is not None and name in free.files:
+            self._write_own({n: about for n, about in free.files.items() if n != name})
         place(self.folder, name).unlink(missing_ok=True)
 
     def _write_own(self, files: dict[str, Described]) -> None:

@@ -35,6 +35,7 @@ def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> 
     return typer.Option(*names, metavar=metavar, help=text, **rest)
 
 
+Text, Names = str | None, list[str] | None
 Run = Annotated[Path, typer.Argument(metavar="RUN")]
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]
@@ -86,16 +87,10 @@ def main(
 @app.command()
 def init(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV or Parquet files.")],
-    measured: Annotated[
-        list[str] | None, _option("State that is available at run time; may be given several times.", metavar="NAME")
-    ] = None,
-    input_: Annotated[
-        list[str] | None, _option("Input; may be given several times.", "--input", metavar="NAME")
-    ] = None,
+    measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
+    input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),
-    files: Annotated[
-        str | None, _option("What a file is, in place of what its name seems to say.", metavar="REGEX")
-    ] = None,
+    files: Annotated[Text, _option("What a file is, in place of what its name seems to say.", metavar="REGEX")] = None,
     period: Annotated[float | None, _option("Sampling period, where no column holds time.", metavar="SECONDS")] = None,
 ) -> None:
     """Look at a folder of recordings and write a study for it."""
@@ -158,9 +153,7 @@ def simulate(
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,
     seed: Seed = 0,
-    spread: Annotated[
-        float, _option("Manufacturing spread; 1 means 5 to 15 % on every physical parameter.", min=0)
-    ] = 1.0,
+    spread: Annotated[float, _option("Manufacturing spread; 1 is 5 to 15 % on every parameter.", min=0)] = 1.0,
     loop: Annotated[str, _option("Velocity loop: stiff or soft.")] = "stiff",
     outlier: Annotated[bool, _option("Add one badly assembled unit.", "--outlier")] = False,
     format_: Annotated[str, _option("parquet or raw, the paper's layout.", "--format")] = "parquet",
@@ -232,10 +225,7 @@ def check(
     workers: Workers = None,
     quiet: Quiet = False,
     junit: Annotated[Path | None, _option("Write verdicts as JUnit XML.", metavar="FILE")] = None,
-    same_unit: Annotated[
-        bool,
-        _option("A unit named as one of the study is that machine: compare it with the others alone.", "--same-unit"),
-    ] = False,
+    same_unit: Annotated[bool, _option("Compare a unit of the study with the others alone.", "--same-unit")] = False,
 ) -> None:
     """Score new units against a finished study: PASS, FAIL or UNDECIDED; exit code 3 if one fails, 4 undecided."""
     from .study.commands.check import check_units
@@ -261,7 +251,7 @@ def estimate(
     data: Data,
     out: Annotated[Path, typer.Argument(metavar="OUT", help="New file, .parquet or .csv")],
     parameter: Annotated[
-        list[str] | None, _option("A unit's lifting parameter, such as its phase.", metavar="UNIT.NAME=VALUE")
+        Names, _option("Lifting parameter of a unit, as its phase.", metavar="UNIT.NAME=VALUE")
     ] = None,
     track: Track = None,
 ) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import kros
+from kros.core.errors import ConfigError
 from kros.core.results import Results, packed, unpacked
 from kros.core.store import digest_of
 from kros.core.work import Work
@@ -70,6 +71,28 @@ def test_files_of_others_stay(tmp_path):
     assert [path.name for path in (tmp_path / "store").iterdir()] == ["notes.txt"]
 
 
+def test_where_files_cannot_be_linked_they_are_copied_with_their_times(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError("no links here")
+
+    monkeypatch.setattr("os.link", refuse)
+    store = written(tmp_path, "one")
+    file = tmp_path / "deep" / "a.txt"
+    assert file.stat().st_nlink == 1
+    assert file.stat().st_mtime_ns == store.record("read").files["deep/a.txt"][2]
+    monkeypatch.setattr("kros.core.store.file_digest", lambda path: pytest.fail("was read again"))
+    assert store.restore("read", digest_of("a")) is not None
+
+
+@pytest.mark.parametrize("name", ["deep", "deep/a.txt/b"])
+def test_what_is_in_the_place_of_a_result_is_named(tmp_path, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ConfigError, match="is in the place of a result; move it away"):
+        written(tmp_path, "one")
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_recordings_are_listed_with_the_digests_of_their_files(tmp_path):
     motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     kros.run(motors, tmp_path / "run", until="read")
@@ -101,6 +124,12 @@ def test_results_come_back_bit_by_bit(tmp_path, value):
 def test_a_result_of_another_kind_is_refused():
     with pytest.raises(TypeError, match="object is of no kind"):
         packed([object()])
+
+
+def test_results_of_a_map_that_was_interrupted_are_there(tmp_path):
+    work = Work(results=Results(tmp_path, "source"))
+    assert next(work.recall("square", square, [2.0, 3.0], ["a", "b"])) == 4.0
+    assert list(work.recall("square", square, [0.0, 3.0], ["a", "b"])) == [4.0, 9.0]
 
 
 def test_results_are_computed_once_and_what_is_damaged_again(tmp_path):

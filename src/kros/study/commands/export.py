@@ -49,7 +49,8 @@ def export_run(
         known = (*names, *loads)
         if observer not in known:
             raise ConfigError(
-                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, known) or ';'} known are {', '.join(known)}."
+                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, known) or ';'} "
+                f"known are {', '.join(known)}."
             )
         path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
         chosen, name = Observer.load(path), name or identifier(config.name)

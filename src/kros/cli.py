@@ -35,7 +35,8 @@ def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> 
     return typer.Option(*names, metavar=metavar, help=text, **rest)
 
 
-Text, Names = str | None, list[str] | None
+Text = str | None
+Names = list[str] | None
 Run = Annotated[Path, typer.Argument(metavar="RUN")]
 Data = Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]

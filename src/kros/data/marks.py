@@ -6,15 +6,20 @@ An episode follows from its file, known by path, size and time as whole runs are
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from collections.abc import Iterable, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
-from ..core.store import digest_of
 from .population import EpisodeKey
 from .prepare import EvenRecordings, PreparedSource
 from .recording import Recordings
+
+
+def mark_of(*content: Any) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`."""
+    return hashlib.sha256(repr(content).encode()).hexdigest()
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
@@ -34,7 +39,7 @@ def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declar
             [(f.name, getattr(source, f.name)) for f in dataclasses.fields(source) if f.name != "places"],
         )
     )
-    stamp, how = lru_cache(maxsize=64)(_stamp), digest_of(about, declared)
+    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, declared)
     return [_mark(source, keys, how, stamp) for keys in groups]
 
 
@@ -46,7 +51,7 @@ def _mark(source: Recordings, keys: Sequence[EpisodeKey], how: str, stamp: Any) 
         if file is None:
             return None
         rows.append((key, place, stamp(file)))
-    return digest_of(how, rows)
+    return mark_of(how, rows)
 
 
 def _stamp(file: Path) -> tuple[int, int]:

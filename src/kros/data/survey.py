@@ -6,9 +6,10 @@ Population --survey--> Population that can be used, RecordingFacts
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from ..core.artifacts import load_artifact
 from ..core.errors import DataError
 from ..core.files import is_file
 from ..core.loading import loader
-from ..core.store import file_digest, link_or_copy
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, scan_digests
@@ -28,6 +28,7 @@ from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
 from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .recording import some, title
+from .writers.folders import same_file
 from .writers.parquet import GroupRecord, write_group, write_index
 
 log = logging.getLogger(__name__)
@@ -155,6 +156,7 @@ def survey(
     work: Work | None = None,
     reserve: Sequence[str] = (),
     earlier: Path | None = None,
+    wrote: Callable[[Path, str], None] | None = None,
     fewest: int = 0,
 ) -> tuple[Population, RecordingFacts]:
     """Read all recordings once, without those that `work` knows from earlier; refuse episodes of less than `fewest` samples."""
@@ -167,6 +169,10 @@ def survey(
         return folder is None or _taken(known, earlier, folder)
 
     found = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
+    if wrote is not None and folder is not None:
+        for group in found:
+            if group.record is not None and group.written is not None:
+                wrote(folder / group.record.file, group.written)
     kept = _kept(population, found, folder)
     left, aside = set(kept.episodes), set(reserve)
     taking_part = [u for u in kept.unit_ids if u not in aside]
@@ -267,8 +273,12 @@ def _read_group(task: _Group) -> _Found:
     names = population.states + population.inputs
     steps = {m: resolution(first[:, names.index(m)]) for m in population.measured}
     alerts = period_alerts(first, population.channels, population.sample_period_s)
-    written = None if record is None or task.folder is None else file_digest(task.folder / record.file)
+    written = None if record is None or task.folder is None else _digest(task.folder / record.file)
     return _Found(record, written, episodes, steps, digests, alerts, ends, reach, sizes)
+
+
+def _digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
 
 
 def _taken(known: _Found, earlier: Path | None, folder: Path) -> bool:
@@ -276,9 +286,9 @@ def _taken(known: _Found, earlier: Path | None, folder: Path) -> bool:
     if earlier is None or known.record is None:
         return False
     path = earlier / known.record.file
-    if not is_file(path) or file_digest(path) != known.written:
+    if not is_file(path) or _digest(path) != known.written:
         return False
-    link_or_copy(path, folder / known.record.file)
+    same_file(path, folder / known.record.file)
     return True
 
 

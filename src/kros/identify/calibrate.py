@@ -7,8 +7,8 @@ import logging
 import numpy as np
 
 from ..core.errors import IdentificationError
-from ..core.store import digest_of
 from ..core.work import Work
+from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
@@ -24,7 +24,7 @@ def calibrate(
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
     units: dict[str, UnitPhase] = {}
     marks = [
-        None if (known := facts.marks(keys)) is None else digest_of(own.columns, own.sample_period_s, spec, keys, known)
+        None if (known := facts.marks(keys)) is None else mark_of(own.columns, own.sample_period_s, spec, keys, known)
         for own, keys, _ in tasks
     ]
     found = (work or Work()).recall("calibrate", segments_of, tasks, marks, (Segment,))

@@ -19,8 +19,8 @@ import numpy.typing as npt
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
-from ..core.store import digest_of
 from ..core.work import Work
+from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
@@ -176,7 +176,7 @@ def factor_marks(facts: RecordingFacts, tasks: Iterable[Task]) -> list[str | Non
     """Return what the factors of each task follow from: samples, what they are of, and the lifting but for its parameters' values."""
     found = [(facts.marks(keys), population, keys, lifting) for population, keys, lifting in tasks]
     return [
-        None if known is None else digest_of(known, keys, own.channels, repr(lifting))
+        None if known is None else mark_of(known, keys, own.channels, repr(lifting))
         for known, own, keys, lifting in found
     ]
 

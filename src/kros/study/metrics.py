@@ -13,6 +13,7 @@ import numpy as np
 from ..core.artifacts import load_artifact, plain, read_json
 from ..data.flat_tops import FoundLimit
 from ..evaluate.intervals import interval_rows
+from ..observer import Observer
 from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
@@ -43,6 +44,11 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "identify_on": facts.identify_on,
         "sample_period_s": context.population.sample_period_s,
         "channels": {c.name: c.unit for c in context.population.channels},
+        "measured": [c.name for c in context.population.channels if c.measured],
+        "inputs": list(context.population.inputs),
+        "episodes": _episodes(context),
+        "resolution": facts.resolution,
+        "dropped": facts.dropped,
     }
     if context.config.sensor:
         study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
@@ -57,6 +63,13 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     if Stage.SYNTHESIZE in done:
         study["deployed"] = context.observers_record["deployed"]
     return study
+
+
+def _episodes(context: Context) -> dict[str, dict[str, int]]:
+    """Count episodes by condition, those for training and those held out."""
+    parts = {"train": context.facts.train, "held_out": context.facts.test}
+    conditions = context.population.conditions
+    return {c: {part: sum(key.condition == c for key in keys) for part, keys in parts.items()} for c in conditions}
 
 
 def _limit(limit: Limit, seen: FoundLimit | None, declared: bool) -> dict[str, Any]:
@@ -99,14 +112,25 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     return rows
 
 
+def _calibration(context: Context) -> dict[str, Any]:
+    """What the phase of every unit belongs to; empty for a study without one."""
+    calibration = calibrate.load(context)
+    if calibration is None:
+        return {}
+    spec = calibration.spec
+    names = ("ratio", "angle", "parameter")
+    return {"calibration": {name: getattr(spec, name) for name in names} | {"lag_rad": calibration.lag_rad}}
+
+
 def _models(context: Context) -> dict[str, Any]:
-    """Models: order and largest spectral radius over the pooled units."""
+    """Models: order, functions and largest spectral radius over the pooled units."""
     entries = {}
     for name in context.identified.kinds:
         models = context.identified.models(name)
         rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
         radius = float(models.spectral_radius()[rows].max())
-        entries[name] = {"order": models.lifting.n_lifted, "spectral_radius_max": radius}
+        lifting = {"order": models.lifting.n_lifted, "functions": list(models.lifting.functions)}
+        entries[name] = lifting | {"spectral_radius_max": radius}
     return {"models": entries}
 
 
@@ -149,17 +173,49 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
 
 
 def _observers(context: Context) -> dict[str, Any]:
-    """Observers with what their synthesis states."""
+    """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     entries: dict[str, Any] = {}
-    written = context.store.files()
+    written, certified = context.store.files(), _certified(context)
     for name, facts in context.observers_record["facts"].items():
         entry = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
             entry |= {key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)}
-        entries[name] = entry
-    return {"observers": entries}
+        entries[name] = entry | certified.get(name, {})
+    return {"observers": entries} | _deployment(context)
+
+
+def _certified(context: Context) -> dict[str, dict[str, Any]]:
+    """Return assumptions of certificates, and bounds for recorded signals in the channels' units of measure."""
+    if not context.store.holds("observers", "relift.json"):
+        return {}
+    record = load_artifact(context.store.path("observers"), "relift")[0]
+    signals, proofs = record.get("signals", {}), record.get("certificates", {})
+    bounds = {n: {"set_bound": dict(zip(s["states"], s["cover"], strict=True))} for n, s in signals.items()}
+    return {n: {"assumptions": proof.get("assumptions", [])} | bounds.get(n, {}) for n, proof in proofs.items()}
+
+
+def _deployment(context: Context) -> dict[str, Any]:
+    """Return what the deployed observer reads, estimates and needs."""
+    if not context.store.holds("observers", "deployed.json"):
+        return {}
+    observer = Observer.load(context.store.path("observers", "deployed.json"))
+    measured = [observer.lifting.states[i] for i in observer.measured]
+    sizes = observer.seen
+    ranges = [] if sizes is None else zip([*measured, *observer.inputs], [*sizes.measured, *sizes.inputs], strict=True)
+    content = {
+        "measured": measured,
+        "inputs": list(observer.inputs),
+        "estimates": list(observer.recorded),
+        "largest": dict(ranges),
+        "delay_samples": observer.runtime.delay,
+        "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
+        "functions": list(observer.lifting.functions),
+        "states": observer.lifting.n_states + observer.controller.n_states,
+        "sensor": observer.about.get("sensor", {}),
+    }
+    return {"deployment": content}
 
 
 def _evaluation(context: Context) -> dict[str, Any]:
@@ -178,6 +234,7 @@ def _evaluation(context: Context) -> dict[str, Any]:
 
 
 _OF_STAGES = {
+    Stage.CALIBRATE: _calibration,
     Stage.IDENTIFY: _models,
     Stage.QUANTIFY: _uncertainty,
     Stage.SYNTHESIZE: _observers,

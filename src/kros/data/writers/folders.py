@@ -26,6 +26,14 @@ def in_threads(work: Sequence[Callable[[], T]]) -> list[T]:
             pool.shutdown(wait=True, cancel_futures=True)
 
 
+def same_file(path: Path, target: Path) -> None:
+    """Put a file in a second place: the same one where the file system can, else a copy."""
+    try:
+        os.link(path, target)
+    except OSError:
+        shutil.copyfile(path, target)
+
+
 @contextmanager
 def whole_folder(out: Path) -> Iterator[Path]:
     """Give a folder beside `out` to fill; it is moved there at the end, or removed when anything fails."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import kros
-from kros.core.errors import ConfigError
+from kros.core.errors import ConfigError, DataError
 from kros.core.results import Results, packed, unpacked
 from kros.core.store import digest_of
 from kros.core.work import Work
@@ -38,8 +38,8 @@ def test_what_a_stage_drafts_is_at_its_place_and_in_the_store(tmp_path):
     store = written(tmp_path, "one")
     assert (tmp_path / "deep" / "a.txt").read_text() == "one"
     assert store.files() == {"deep/a.txt"}
-    assert store.record("read") == store.restore("read", digest_of("a"))
-    assert store.restore("read", digest_of("b")) is None
+    assert store.record("read") == store.stored(digest_of("a"))
+    assert store.stored(digest_of("b")) is None
 
 
 def test_what_is_not_committed_leaves_nothing(tmp_path):
@@ -54,10 +54,29 @@ def test_another_artefact_of_a_stage_takes_the_place_of_the_first_which_can_come
     written(tmp_path, "one")
     store = written(tmp_path, "two", digest_of("b"))
     assert (tmp_path / "deep" / "a.txt").read_text() == "two"
-    assert store.restore("read", digest_of("a")) is not None
+    store.add("read", store.stored(digest_of("a")))
     assert (tmp_path / "deep" / "a.txt").read_text() == "one"
     store.sweep()
-    assert store.restore("read", digest_of("b")) is None
+    assert store.stored(digest_of("b")) is None
+
+
+def test_runs_inside_are_those_that_an_artefact_was_made_with(tmp_path):
+    store, first, second = Store(tmp_path), digest_of("first"), digest_of("second")
+    for text, digest in (("one", first), ("two", second)):
+        inside = store.nested("left_out", "0")
+        with inside.drafting() as draft:
+            draft.draft().mkdir()
+            draft.draft("b.txt").write_text(text)
+            draft.commit("identify", digest_of(text), 0.0)
+        with store.drafting() as draft:
+            draft.commit("left_out", digest, 0.0)
+    assert store.files() == {"left_out/0/b.txt"}
+    assert store.stored(second) is not None
+    assert store.stored(first) is None
+    inside.add("identify", inside.stored(digest_of("one")))
+    assert store.stored(first) is not None
+    with pytest.raises(DataError, match="is missing or another one"):
+        store.verify("left_out")
 
 
 def test_files_of_others_stay(tmp_path):
@@ -81,7 +100,7 @@ def test_where_files_cannot_be_linked_they_are_copied_with_their_times(tmp_path,
     assert file.stat().st_nlink == 1
     assert file.stat().st_mtime_ns == store.record("read").files["deep/a.txt"][2]
     monkeypatch.setattr("kros.core.store.file_digest", lambda path: pytest.fail("was read again"))
-    assert store.restore("read", digest_of("a")) is not None
+    store.add("read", store.stored(digest_of("a")))
 
 
 @pytest.mark.parametrize("name", ["deep", "deep/a.txt/b"])

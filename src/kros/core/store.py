@@ -37,7 +37,7 @@ class Artefact(Settings):
     digest: str = Field(pattern="^([0-9a-f]{64})?$")  # none for files that are of no stage
     seconds: NonNegativeFloat = 0.0  # that it took
     files: dict[str, Described] = Field(default_factory=dict)  # by name
-    runs: tuple[str, ...] = ()  # folders below the run folder that are runs, made with it
+    runs: dict[str, str] = Field(default_factory=dict)  # digests of runs that were made with it, by folder
     results: tuple[str, ...] = ()  # digests of the results that it was computed from
 
     @classmethod

@@ -71,7 +71,9 @@ def run_demo(
     config = validate_config({"name": "demo", "data": data, "predictor": {"effort": "quick"}}, out, overrides=overrides)
     digest = digest_of(code_key(), simulation)
     with open_run(out, config) as store, open_executor(workers) as executor:
-        if store.restore(_STAGE, digest) is None:
+        if (artefact := store.stored(digest)) is not None:
+            store.add(_STAGE, artefact)
+        else:
             executor.map(_load, range(workers))  # worker processes begin with it meanwhile
             progress.start(_STAGE, None)
             began = time.perf_counter()

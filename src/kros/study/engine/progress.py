@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from threading import Event, Lock, Thread
 from typing import Any
 
@@ -95,11 +95,8 @@ def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     if quiet or asks:
         yield Silent()
     elif not sys.stderr.isatty():
-        lines = Lines()
-        try:
+        with closing(Lines()) as lines:
             yield lines
-        finally:
-            lines.close()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn

@@ -46,8 +46,11 @@ def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> Non
 def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
     """Run a step, or find it done."""
     store, digest = context.store, digests[step.stage]
-    artefact = store.restore(step.stage, digest)
+    artefact, record = store.stored(digest), store.record(step.stage)
     if artefact is not None:
+        if record is None or record.digest != digest:
+            _outdate(context, digests, stages)
+        store.add(step.stage, artefact)
         context.work.progress.finish(step.stage, artefact.seconds, skipped=True)
         return
     began = time.perf_counter()

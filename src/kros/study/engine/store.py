@@ -66,6 +66,11 @@ class Store:
             log.warning("%s", error)
             return {}
 
+    @property
+    def digest(self) -> str:
+        """A digest of all stages of this run."""
+        return digest_of(sorted((str(stage), artefact.digest) for stage, artefact in self.manifest.items()))
+
     def path(self, *parts: str) -> Path:
         """Return where something that earlier stages wrote is read from."""
         return self.folder.joinpath(*parts)
@@ -110,21 +115,19 @@ class Store:
         self._verify_runs(artefact)
 
     def _verify_runs(self, artefact: Artefact) -> None:
-        for run in artefact.runs:
-            if not is_file(self.path(run, MANIFEST)):
-                raise DataError(f"Run {self.folder}: {run}/{MANIFEST} is missing; run the study again.")
-            Store(self.path(run)).verify()
+        for name, digest in artefact.runs.items():
+            run = Store(place(self.folder, name))
+            run.verify()
+            if run.digest != digest:
+                raise DataError(f"Run {run.folder}: is missing or another one; run the study again.")
 
-    def restore(self, stage: str, digest: str) -> Artefact | None:
-        """Return the artefact of a digest where the store has it; its files are in their places then."""
+    def stored(self, digest: str) -> Artefact | None:
+        """Return an artefact that is in the store, whole, as are the runs that were made with it."""
         artefact = self.artefacts.load(digest)
-        if artefact is None:
-            return None
         try:
-            self._verify_runs(artefact)
+            self._verify_runs(artefact or Artefact(digest=""))
         except DataError:
             return None
-        self._add(stage, artefact)
         return artefact
 
     @contextmanager
@@ -134,16 +137,17 @@ class Store:
             yield replace(self, place=draft)
 
     def commit(self, stage: str, digest: str, seconds: float, results: Collection[str] = ()) -> None:
-        """Make an artefact of the draft of the running stage, name it in the manifest, and put its files into place."""
-        draft, runs = self.draft(), tuple(f"{stage}/{run.folder.name}" for run in self.runs(stage))
+        """Make an artefact of the draft of the running stage, and add it."""
+        draft, runs = self.draft(), {f"{stage}/{run.folder.name}": run.digest for run in self.runs(stage)}
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
         files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
         artefact = Artefact(digest=digest, seconds=seconds, files=files, runs=runs, results=tuple(sorted(results)))
         self.artefacts.put(draft, artefact)
-        self._add(stage, artefact)
+        self.add(stage, artefact)
 
-    def _add(self, stage: str, artefact: Artefact) -> None:
+    def add(self, stage: str, artefact: Artefact) -> None:
+        """Name an artefact of the store in the manifest, in place of an earlier one, and put its files into place."""
         entry, earlier = artefact.model_copy(update={"results": ()}), self.record(stage)
         if earlier != entry:
             if earlier is not None and earlier.digest != entry.digest:
@@ -158,15 +162,12 @@ class Store:
         for stage in stages:
             artefact = manifest.pop(stage, Artefact(digest=""))
             for name in artefact.files:
-                self._unlink(artefact, name)
+                if artefact.matches(self.folder, name):
+                    self.path(name).unlink()
+                    _prune(self.path(name).parent, self.folder)
+                else:
+                    log.info("%s: is not as kros wrote it, and stays", self.path(name))
         write_manifest(self.folder, manifest)
-
-    def _unlink(self, artefact: Artefact, name: str) -> None:
-        if artefact.matches(self.folder, name):
-            self.path(name).unlink()
-            _prune(self.path(name).parent, self.folder)
-        else:
-            log.info("%s: is not as kros wrote it, and stays", self.path(name))
 
     def remove(self) -> None:
         """Remove a run as far as its manifest lists it, and its folder where nothing else is in it."""

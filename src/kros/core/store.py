@@ -114,7 +114,10 @@ def recorded_files(folder: Path) -> frozenset[str]:
     """Return the names of all files that belong to a run."""
     artefacts = read_manifest(folder).values()
     inside = (
-        f"{run}/{name}" for artefact in artefacts for run in artefact.runs for name in recorded_files(folder / run)
+        f"{run}/{name}"
+        for artefact in artefacts
+        for run in artefact.runs
+        for name in recorded_files(place(folder, run))
     )
     return frozenset(inside).union(*(artefact.files for artefact in artefacts))
 

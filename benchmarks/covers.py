@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import kros
 from kros.core import StateSpace
 from kros.core.frequency import log_grid, nyquist_hz
 from kros.identify import ModelSet
-from kros.study import run as run_study
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -70,7 +70,7 @@ def models_of(place: Path, population: str, units: int) -> Path:
             Simulation(units, 10, 20.0, int(seed), spread=float(spread), outlier=False, loop=loop),
         )
         raw = {"data": {"source": str(folder / "recordings"), "reader": "parquet"}, "identify": {"refine": True}}
-        run_study(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
+        kros.run(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
     return folder / "run" / "models"
 
 

@@ -26,11 +26,11 @@ from math import inf, sqrt
 from pathlib import Path
 from typing import Any
 
+import kros
 from kros.core.artifacts import write_json
 from kros.report.error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config
-from kros.study import run as run_study
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage, SynthesisSettings
 from kros.study.engine.executors import available_cores
@@ -117,7 +117,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
         f"[evaluate]\nfolds = {options.folds}\nrobustness = false\n"
     )
     config = load_config(study, options.set)
-    result = run_study(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
+    result = kros.run(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
     left_out: dict[str, Any] = result.metrics["left_out"]
     for fold, reason in left_out["failed"].items():
         say(f"fold {fold} failed: {reason}")

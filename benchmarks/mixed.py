@@ -21,13 +21,13 @@ from pathlib import Path
 
 import numpy as np
 
+import kros
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
 from kros.design.methods.robust import design_mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
-from kros.study import run as run_study
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -76,7 +76,7 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
             config = validate_config(
                 {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": options.refine}}, root
             )
-            run_study(config, out / "run", until=Stage.QUANTIFY, workers=options.workers)
+            kros.run(config, out / "run", until=Stage.QUANTIFY, workers=options.workers)
         yield label, out / "run"
 
 

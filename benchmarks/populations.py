@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from kros.study import run as run_study
+import kros
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 
@@ -48,7 +48,7 @@ def study(folder: Path, seed: int, options: argparse.Namespace) -> dict[str, Any
     if options.hide:
         hide(recordings)
     config = validate_config({"name": "population", "data": {"source": str(recordings), "reader": "parquet"}}, folder)
-    metrics = run_study(config, folder / "run", workers=options.workers).metrics
+    metrics = kros.run(config, folder / "run", workers=options.workers).metrics
     shutil.rmtree(recordings)
     return facts(metrics)
 

@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+import kros
 from kros.core.norms import hinf_norm
 from kros.core.work import Work
 from kros.identify import KoopmanMatrices, ModelSet, free_run
 from kros.identify.refine import RefinedModels
-from kros.study import run as run_study
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -57,7 +57,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     )
     raw = {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": True}}
     config = validate_config(raw, folder)
-    metrics = run_study(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
+    metrics = kros.run(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
     with open_executor(1) as executor:
         return facts(Context(config, Store(out), Work(executor)), metrics)
 

@@ -8,6 +8,7 @@ process, around every task.
 from __future__ import annotations
 
 import logging
+import os
 import socket
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,12 +19,12 @@ from threading import Lock
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError, MissingDependencyError
-from .executors import single_threaded
 from .store import code_key
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
 _BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
 _ALONE = Lock()
 _LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
 _GIVEN_UP = (
@@ -89,6 +90,19 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
                 f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, which has the "
                 "same path on every worker."
             ) from error
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let processes that start now, and libraries for linear algebra that are loaded now, use one thread."""
+    saved = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
 
 
 @contextmanager

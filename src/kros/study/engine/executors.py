@@ -15,10 +15,10 @@ from typing import Any, TypeVar
 from ...core.errors import ConfigError, KrosError
 from ...core.memory import keep_freed_memory
 from ...core.work import Executor, SerialExecutor
+from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")
 _CHUNKS = 128  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -51,8 +51,6 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
     if workers < 1:
         raise ConfigError(f"--workers {workers}: at least 1 is needed.")
     if scheduler is not None:
-        from .cluster import open_dask
-
         with open_dask(scheduler) as executor:
             yield executor
     elif workers == 1:
@@ -94,19 +92,6 @@ def _begin(pipe: Any) -> None:
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     Thread(target=watch, name="ends with its parent", daemon=True).start()
-
-
-@contextmanager
-def single_threaded() -> Iterator[None]:
-    """Let processes that start now, and libraries for linear algebra that are loaded now, use one thread."""
-    saved = {name: os.environ.get(name) for name in _THREADS}
-    os.environ.update(dict.fromkeys(_THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in saved.items():
-            os.environ.pop(name, None)
-            os.environ.update({} if value is None else {name: value})
 
 
 def available_cores() -> int:

@@ -20,11 +20,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+import kros
 from kros.core import StateSpace
 from kros.core.frequency import log_grid, nyquist_hz
 from kros.identify import ModelSet
-from kros.study import run_study, validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study import validate_config
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.uncertainty import Form, UncertainModel, quantify_systems
 from kros.uncertainty.weights.weight import Weight
@@ -65,10 +66,11 @@ def models_of(place: Path, population: str, units: int) -> Path:
     folder = place / f"pop_{loop}_{seed}_{spread}"
     if not (folder / "run" / "models").exists():
         simulate_to(
-            folder / "recordings", "harmonic-drive", units, 10, 20.0, int(seed), float(spread), loop, False, "parquet"
+            folder / "recordings",
+            Simulation(units, 10, 20.0, int(seed), spread=float(spread), outlier=False, loop=loop),
         )
         raw = {"data": {"source": str(folder / "recordings"), "reader": "parquet"}, "identify": {"refine": True}}
-        run_study(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
+        kros.run(validate_config(raw, folder), folder / "run", until=Stage.IDENTIFY, workers=2)
     return folder / "run" / "models"
 
 

@@ -26,11 +26,12 @@ from math import inf, sqrt
 from pathlib import Path
 from typing import Any
 
+import kros
 from kros.core.artifacts import write_json
 from kros.report.error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
 from kros.report.names import BASELINES, minus, number, split_observer
-from kros.study import load_config, run_study
-from kros.study.commands.demo import simulate_to
+from kros.study import load_config
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage, SynthesisSettings
 from kros.study.engine.executors import available_cores
 from kros.study.engine.progress import Lines
@@ -104,15 +105,9 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
         shutil.rmtree(recordings, ignore_errors=True)
         simulate_to(
             recordings,
-            "harmonic-drive",
-            options.units,
-            options.episodes,
-            options.seconds,
-            options.seed,
-            spread,
-            loop,
-            False,
-            "parquet",
+            Simulation(
+                options.units, options.episodes, options.seconds, options.seed, spread=spread, outlier=False, loop=loop
+            ),
         )
     study = folder / "study.toml"
     methods = json.dumps(["paper", *SynthesisSettings().methods])
@@ -122,7 +117,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
         f"[evaluate]\nfolds = {options.folds}\nrobustness = false\n"
     )
     config = load_config(study, options.set)
-    result = run_study(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
+    result = kros.run(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())
     left_out: dict[str, Any] = result.metrics["left_out"]
     for fold, reason in left_out["failed"].items():
         say(f"fold {fold} failed: {reason}")

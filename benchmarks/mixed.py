@@ -21,14 +21,15 @@ from pathlib import Path
 
 import numpy as np
 
+import kros
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
 from kros.design.methods.robust import design_mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
-from kros.study import run_study, validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study import validate_config
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -71,13 +72,11 @@ def populations(root: Path, options: argparse.Namespace) -> Iterator[tuple[str, 
         label = f"{loop}-{seed}" + ("-refined" if options.refine else "")
         out, recordings = root / label, root / label / "recordings"
         if not (out / "run" / "metrics.json").exists():
-            simulate_to(
-                recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, 1.0, loop, True, "parquet"
-            )
+            simulate_to(recordings, Simulation(options.units, options.episodes, 20.0, seed, loop=loop))
             config = validate_config(
                 {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": options.refine}}, root
             )
-            run_study(config, out / "run", until=Stage.QUANTIFY, workers=options.workers)
+            kros.run(config, out / "run", until=Stage.QUANTIFY, workers=options.workers)
         yield label, out / "run"
 
 

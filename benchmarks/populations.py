@@ -15,8 +15,9 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from kros.study import run_study, validate_config
-from kros.study.commands.demo import simulate_to
+import kros
+from kros.study import validate_config
+from kros.study.commands.demo import Simulation, simulate_to
 
 PLANTED = "000000"
 
@@ -43,11 +44,11 @@ def main() -> None:
 def study(folder: Path, seed: int, options: argparse.Namespace) -> dict[str, Any]:
     """Simulate one population, run the study, return the facts."""
     recordings = folder / "recordings"
-    simulate_to(recordings, "harmonic-drive", 12, 10, 20.0, seed, options.spread, options.loop, True, "parquet")
+    simulate_to(recordings, Simulation(12, 10, 20.0, seed, spread=options.spread, loop=options.loop))
     if options.hide:
         hide(recordings)
     config = validate_config({"name": "population", "data": {"source": str(recordings), "reader": "parquet"}}, folder)
-    metrics = run_study(config, folder / "run", workers=options.workers).metrics
+    metrics = kros.run(config, folder / "run", workers=options.workers).metrics
     shutil.rmtree(recordings)
     return facts(metrics)
 

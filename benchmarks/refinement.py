@@ -18,11 +18,13 @@ from typing import Any
 
 import numpy as np
 
+import kros
 from kros.core.norms import hinf_norm
 from kros.core.work import Work
 from kros.identify import KoopmanMatrices, ModelSet, free_run
-from kros.study import run_study, validate_config
-from kros.study.commands.demo import simulate_to
+from kros.identify.refine import RefinedModels
+from kros.study import validate_config
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -51,11 +53,11 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
     """Simulate one population, identify and quantify it, return the facts."""
     recordings, out = folder / "recordings", folder / "run"
     simulate_to(
-        recordings, "harmonic-drive", options.units, options.episodes, 20.0, seed, spread, loop, False, "parquet"
+        recordings, Simulation(options.units, options.episodes, 20.0, seed, spread=spread, outlier=False, loop=loop)
     )
     raw = {"data": {"source": str(recordings), "reader": "parquet"}, "identify": {"refine": True}}
     config = validate_config(raw, folder)
-    metrics = run_study(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
+    metrics = kros.run(config, out, until=Stage.QUANTIFY, workers=options.workers).metrics
     with open_executor(1) as executor:
         return facts(Context(config, Store(out), Work(executor)), metrics)
 
@@ -64,7 +66,7 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     """Return errors, ratios and weights of one study."""
     sets = {name: context.identified.models(name) for name in context.identified.kinds}
     errors = {name: percent(context, models) for name, models in sets.items()}
-    refined = context.identified.refined
+    refined = {name: RefinedModels.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
     pooled = {name: percent(context, sets[name], found.pooled) for name, found in refined.items()}
     middle = {name: np.median(e, axis=0) for name, e in errors.items()}
     found: dict[str, Any] = {

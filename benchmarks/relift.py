@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+import kros
 from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch
@@ -30,8 +31,8 @@ from kros.design.synthesize import tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
 from kros.observer.certificate.report import relift_report
 from kros.observer.residual.one_step import one_step_residual
-from kros.study import run_study, validate_config
-from kros.study.commands.demo import simulate_to
+from kros.study import validate_config
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
@@ -92,18 +93,10 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
         shutil.rmtree(folder, ignore_errors=True)
         simulate_to(
             recordings,
-            "harmonic-drive",
-            options.units,
-            options.episodes,
-            options.seconds,
-            seed,
-            spread,
-            loop,
-            False,
-            "parquet",
+            Simulation(options.units, options.episodes, options.seconds, seed, spread=spread, outlier=False, loop=loop),
         )
         config = validate_config({**STUDY, "data": {"source": str(recordings.absolute()), "reader": "parquet"}}, folder)
-        run_study(config, run, until=Stage.QUANTIFY, workers=options.workers)
+        kros.run(config, run, until=Stage.QUANTIFY, workers=options.workers)
         with open_executor(options.workers) as executor:
             context = Context(config, Store(run), Work(executor))
             wanted = {*config.observer.baselines, *config.synthesis.methods}

@@ -28,7 +28,7 @@ from kros.evaluate.sensor import as_shown
 from kros.identify.calibrate import segments_of
 from kros.observer import Sensor, run_observer
 from kros.observer.units import in_sizes
-from kros.study.commands.demo import simulate_to
+from kros.study.commands.demo import Simulation, simulate_to
 from kros.uncertainty.quantify import UncertainModels
 
 HIDDEN = (1, 2)
@@ -48,7 +48,7 @@ def sensors(size: float, step: float) -> dict[str, dict[str, float]]:
 def prepared(folder: Path, loop: str, seed: int) -> tuple[UncertainModels, Any, list[str]]:
     """Return the uncertain models of eight units, the recordings of all and the names of the others."""
     if not (folder / "recordings").exists():
-        simulate_to(folder / "recordings", "harmonic-drive", 12, 6, 12.0, seed, 3.0, loop, False, "parquet")
+        simulate_to(folder / "recordings", Simulation(12, 6, 12.0, seed, spread=3.0, outlier=False, loop=loop))
     population = kros.read(folder / "recordings")
     units = [u.id for u in population.units]
     if not (folder / "uncertain").exists():

@@ -27,7 +27,7 @@ from campaign import Tally, main
 from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_artifact
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
-from kros.core.records import read_record
+from kros.core.store import Artefact, read_manifest, write_manifest
 from kros.data import Channel, Role, from_arrays, from_frame, from_pykoop, read, write_parquet
 from kros.data.checks import check_population, scan_digests
 from kros.identify import ModelSet
@@ -493,26 +493,22 @@ def artifact_targets(root: Path) -> list[Target]:
 
 def study_targets(root: Path) -> list[Target]:
     """The files of a study."""
-    (root / "run" / "stages").mkdir(parents=True)
+    (root / "run").mkdir(parents=True)
     toml = root / "study.toml"
     toml.write_bytes(toml_file(STUDY))
     config = load_config(toml)
     (root / "run" / "study.json").write_text(json.dumps(config.dump()))
-    record = {"schema": 1, "stage": "read", "key": "0" * 64, "seconds": 0.5, "files": {"study.json": "1" * 64}}
-    (root / "record" / "stages").mkdir(parents=True)
-    (root / "record" / "stages" / "read.json").write_text(json.dumps(record))
+    (root / "manifest").mkdir()
+    files = {"study.json": ("1" * 64, 100, 10**18)}
+    write_manifest(root / "manifest", {"read": Artefact(digest="0" * 64, seconds=0.5, files=files)})
 
     def stored(folder: Path) -> Any:
         return stored_config(read_json(folder / "study.json"), folder / "study.json").dump()
 
-    def stage(folder: Path) -> Any:
-        found = read_record(folder, "read")
-        return None if found is None else found.content()
-
     return [
         toml_target("study TOML", toml, STUDY, lambda p: load_config(p).dump()),
         folder_target("study.json", root / "run", stored, mutate_file, False),
-        folder_target("stage record", root / "record", stage, mutate_file, False),
+        folder_target("manifest", root / "manifest", read_manifest, mutate_file, True),
     ]
 
 

@@ -9,6 +9,7 @@ its files are compared one by one. Moments are drawn over the measured time of t
 from __future__ import annotations
 
 import argparse
+import glob
 import json
 import random
 import re
@@ -49,10 +50,7 @@ IN_A_ROW, PATIENCE = (
     4,
     10,
 )  # kills before a run is let finish; times that a run nobody killed takes, after which one hangs
-_TIMED_TABLE = re.compile(
-    r"<table>(?:(?!</table>).)*?(?:>seconds<|solved in \(s\))(?:(?!</table>).)*?</table>", re.DOTALL
-)
-_LAST_CELL = re.compile(r"<td[^>]*>[^<]*</td>(?=\s*</tr>)")
+_TIMED_CELL = re.compile(r'<td data-label="(?:seconds|solved in \(s\))"[^>]*>[^<]*</td>')
 
 
 @dataclass
@@ -72,7 +70,7 @@ class Campaign:
         subprocess.run(self.command, check=True, capture_output=True)
         self.seconds = time.perf_counter() - began
         self.expected = results(self.folder)
-        self.files = sorted(name for name in self.expected if not name.startswith("stages/"))
+        self.files = sorted(name for name in self.expected if not name.startswith("store/"))
 
     def kills(self, count: int, tally: Tally) -> None:
         """Kill so many times, in rows of some kills each."""
@@ -103,7 +101,7 @@ class Campaign:
         deadline = time.monotonic() + 30
         while any(map(lives, workers)) and time.monotonic() < deadline:
             time.sleep(0.05)
-        done = [stage for stage in STAGES if (self.folder / "stages" / f"{stage}.json").exists()]
+        done = manifest(self.folder)
         following = [stage for stage in STAGES if stage not in done and (stage != "simulate" or "demo" in self.command)]
         return (following[0] if following else "the end"), sum(map(lives, workers))
 
@@ -114,18 +112,14 @@ class Campaign:
             return lambda: time.perf_counter() > end
         missing = [name for name in self.files if not (self.folder / name).exists()] or self.files
         name = self.draw.choice(missing)
-        places = (
-            [self.folder / name]
-            if self.draw.random() < 0.5
-            else [self.folder / name, self.folder / ".kros.partial" / "draft" / name]
-        )
+        pattern = glob.escape(name) if self.draw.random() < 0.5 else f"store/.kros.*/draft/{glob.escape(name)}"
         end = time.perf_counter() + PATIENCE * self.seconds
-        return lambda: any(place.exists() for place in places) or time.perf_counter() > end
+        return lambda: (self.folder / name).exists() or any(self.folder.glob(pattern)) or time.perf_counter() > end
 
     def done(self) -> float:
         """Return the seconds that finished stages took, at most nine tenths of all."""
-        taken = sum(json.loads(path.read_text())["seconds"] for path in (self.folder / "stages").glob("*.json"))
-        return min(float(taken), 0.9 * self.seconds)
+        taken = sum(float(about["seconds"]) for about in manifest(self.folder).values())
+        return min(taken, 0.9 * self.seconds)
 
     def finish(self) -> str:
         """Let the run finish; return what is wrong with it, if anything."""
@@ -148,8 +142,15 @@ class Campaign:
         return f"silent change: {changed[:3]}" if changed else ""
 
 
+def manifest(folder: Path) -> dict[str, Any]:
+    """Return what a run's manifest says of its stages."""
+    path = folder / "manifest.json"
+    found = json.loads(path.read_text()) if path.exists() else {}
+    return {stage: found[stage] for stage in STAGES if stage in found}
+
+
 def results(folder: Path) -> dict[str, Any]:
-    """Return all files of a run with what does not depend on the time that something took; of records the names that they list."""
+    """Return all files of a run with what does not depend on the time that something took; of manifests the names that they list."""
     return {
         name: content(folder / name, name)
         for name in sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
@@ -158,12 +159,14 @@ def results(folder: Path) -> dict[str, Any]:
 
 def content(path: Path, name: str) -> Any:
     """Return a file without times."""
-    if name.startswith("stages/"):
+    if path.name == "artefact.json":
         return sorted(json.loads(path.read_text())["files"])
+    if path.name == "manifest.json":
+        return {stage: sorted(about["files"]) for stage, about in manifest(path.parent).items()}
     if path.suffix == ".json":
         return timeless(json.loads(path.read_text()))
     if path.suffix == ".html":
-        return _TIMED_TABLE.sub(lambda table: _LAST_CELL.sub("", table.group()), path.read_text())
+        return _TIMED_CELL.sub("", path.read_text())
     return path.read_bytes()
 
 

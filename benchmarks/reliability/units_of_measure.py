@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from campaign import Tally, main
 
+import kros
 from kros.data import EpisodeBatch, Population, write_parquet
 from kros.identify import PhaseCalibration
 from kros.observer import Observer
 from kros.plants import PLANTS
-from kros.study import run_study
 from kros.study.config import Stage, validate_config
 
 LARGEST = 0.01  # relative deviation that is a failure
@@ -95,7 +95,7 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
     }
     if plant == "harmonic-drive":
         raw["calibrate"] = {"ratio": RATIO / factors.get("position", 1.0)}
-    metrics = run_study(validate_config(raw, folder), folder / "run", until=Stage.EVALUATE, workers=1).metrics
+    metrics = kros.run(validate_config(raw, folder), folder / "run", until=Stage.EVALUATE, workers=1).metrics
     deployed = Observer.load(folder / "run" / "observers" / "deployed.json")
     return Found(
         numbers_of(metrics), metrics["study"]["deployed"], estimates(deployed, population, factors, folder / "run")

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+import kros
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read, split_episodes
 from kros.design.estimators import make_difference, make_extended, make_learned
@@ -27,7 +28,7 @@ from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
-from kros.study import Stage, StudyConfig, load_config, run_study
+from kros.study import Stage, StudyConfig, load_config
 
 HERE = Path(__file__).parent
 STILL_RAD = 0.05  # a drive that moves less stands still, and percent of its noise say nothing
@@ -67,13 +68,15 @@ def main() -> None:
     settings = [f"data.source={Path(os.environ['KROS_DATA']) / 'dfki_double_pendulum'}", *options.settings]
     config = load_config(HERE / "study.toml", settings)
     config = without_other_joint(config) if options.alone else config
-    run_study(config, options.out / "all", Stage.READ)
+    kros.run(config, options.out / "all", until=Stage.READ)
     source = next((options.out / "all").glob("*/population.json")).parent
     recordings, table = read(source), dict[str, list[Row]]()
     for held in folds(recordings.unit_ids, options.builds, options.drives):
         changes = {"source": source.absolute(), "reader": "parquet", "prepare": (), "csv": None, "exclude": held}
         folder = options.out / "+".join(held)
-        run_study(config.model_copy(update={"data": config.data.model_copy(update=changes)}), folder, Stage.SYNTHESIZE)
+        kros.run(
+            config.model_copy(update={"data": config.data.model_copy(update=changes)}), folder, until=Stage.SYNTHESIZE
+        )
         for name, rows in judged(recordings, held, folder, options.memories).items():
             table.setdefault(name, []).extend(rows)
     sys.stdout.write(json.dumps(summary(table)) + "\n" if options.json else text(summary(table)))

@@ -1,10 +1,11 @@
 """Koopman robust observer synthesis.
 
-Recordings of nominally identical machines go in; one observer that works on all of them comes out, with a statement of how well and why.
+Recordings of nominally identical machines go in; one observer that works on all of them comes out, with a statement of
+how well and why.
 
-    recordings --kros.read--> population --kros.identify--> models --kros.quantify--> uncertain models --kros.synthesize--> observer
+    recordings --read--> population --identify--> models --quantify--> uncertain models --synthesize--> observer
 
-Importing this package imports nothing else: ``kros.synthesis``, ``kros.uncertainty`` and the others load when first used.
+Importing this package imports nothing else: ``kros.synthesis``, ``kros.data`` and the others load when first used.
 """
 
 from __future__ import annotations
@@ -12,32 +13,10 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_SUBPACKAGES = (
-    "core",
-    "data",
-    "design",
-    "evaluate",
-    "export",
-    "identify",
-    "interop",
-    "lifting",
-    "motor_drive",
-    "observer",
-    "plants",
-    "report",
-    "study",
-    "synthesis",
-    "uncertainty",
-)
-
-_VERBS = {
-    "read": "data",
-    "from_arrays": "data",
-    "from_frame": "data",
-    "quantify": "uncertainty",
-    "synthesize": "design",
-    "run": "study",
-}  # beside `identify`, a subpackage that can be called
+_FLOW = ("core", "data", "plants", "lifting", "identify", "uncertainty", "synthesis", "design", "observer")
+_SUBPACKAGES = tuple(sorted((*_FLOW, "motor_drive", "evaluate", "export", "interop", "report", "study")))
+_VERBS = {"read": "data", "from_arrays": "data", "from_frame": "data"}
+_VERBS |= {"quantify": "uncertainty", "synthesize": "design", "run": "study"}  # and `identify`, which can be called
 
 __all__ = ["__version__", *_SUBPACKAGES, *_VERBS]
 
@@ -53,7 +32,8 @@ def __getattr__(name: str) -> Any:
 
         return version(__name__)
     raise AttributeError(
-        f"Asked for kros.{name}; there are the functions identify, {', '.join(_VERBS)}, and the packages {', '.join(_SUBPACKAGES)}."
+        f"Asked for kros.{name}; there are the functions identify, {', '.join(_VERBS)}, and the packages "
+        f"{', '.join(_SUBPACKAGES)}."
     )
 
 

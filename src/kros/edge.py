@@ -1,7 +1,7 @@
 """The edge of the command line: whatever goes wrong below becomes one message on standard error and an exit code.
 
-In the library exceptions stay exceptions. Here each class of them gets its words; what is not expected at all is a defect of kros and says so,
-with the way to its traceback (``kros --debug``).
+In the library exceptions stay exceptions. Here each class of them gets its words; what is not expected at all is a
+defect of kros and says so, with the way to its traceback (``kros --debug``).
 """
 
 from __future__ import annotations
@@ -21,9 +21,7 @@ from typer.core import TyperGroup
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
-_USAGE = [
-    kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"
-]  # typer may carry its own click
+_USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # perhaps typer's own
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
 _BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
 
@@ -33,9 +31,7 @@ class EdgeGroup(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Run a command."""
-        if ctx.params.get("debug"):
-            return super().invoke(ctx)
-        with edge(ctx):
+        with contextlib.nullcontext() if ctx.params.get("debug") else edge(ctx):
             return super().invoke(ctx)
 
 
@@ -47,12 +43,14 @@ def edge(ctx: Any = None) -> Iterator[None]:
     try:
         with stoppable():
             yield
-    except Stopped as stopped:
-        typer.echo(f"kros: stopped by {stopped}; {_afterwards(ctx)}", err=True)
-        raise typer.Exit(SIGNALLED + stopped.signal) from stopped
     except KeyboardInterrupt as stopped:
-        typer.echo(f"\nkros: stopped by Ctrl-C; {_afterwards(ctx)}", err=True)
-        raise typer.Exit(SIGNALLED + signal.SIGINT) from stopped
+        number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
+        name = number.name if isinstance(stopped, Stopped) else "Ctrl-C"
+        resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
+        again = "nothing half done is left; run the same command again."
+        again = "the same command goes on where this one ended." if resumes else again
+        typer.echo(f"kros: stopped by {name}; {again}", err=True)
+        raise typer.Exit(SIGNALLED + number) from stopped
     except _PASSED:
         raise
     except BrokenPipeError:
@@ -64,21 +62,12 @@ def edge(ctx: Any = None) -> Iterator[None]:
         raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from error
 
 
-def _afterwards(ctx: Any) -> str:
-    resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
-    return (
-        "the same command goes on where this one ended."
-        if resumes
-        else "nothing half done is left; run the same command again."
-    )
-
-
 class OnceHandler(logging.StreamHandler[TextIO]):
     """Writes every message in one line, and once."""
 
     def __init__(self) -> None:
         super().__init__(sys.stderr)
-        self._said: set[str] = set()
+        self._written: set[str] = set()
 
     def format(self, record: logging.LogRecord) -> str:
         """Return one line."""
@@ -90,15 +79,15 @@ class OnceHandler(logging.StreamHandler[TextIO]):
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record that was not written before."""
         line = self.format(record)
-        if record.levelno < logging.WARNING or line not in self._said:
-            self._said.add(line)
+        if record.levelno < logging.WARNING or line not in self._written:
+            self._written.add(line)
             super().emit(record)
 
 
 def log_to_stderr(verbose: bool) -> None:
     """Send log and warnings to standard error, a line each; warnings and errors alone unless `verbose`."""
     if logging.getLogger().handlers:
-        return  # somebody else listens
+        return  # the log is read elsewhere
     handler = OnceHandler()
     handler.addFilter(lambda record: verbose or record.name != "kros.data.survey")  # alerts stand behind the run
     logging.basicConfig(level=logging.INFO if verbose else logging.WARNING, handlers=[handler])
@@ -110,20 +99,22 @@ def message(error: Exception) -> str:
     if isinstance(error, KrosError):
         return str(error)
     if isinstance(error, MemoryError):
-        return f"Memory: there is not enough of it ({str(error) or 'no details'}); use fewer --workers, shorter episodes or fewer units."
+        reason = str(error) or "no details"
+        return f"Memory: there is not enough of it ({reason}); use fewer --workers, shorter episodes or fewer units."
     if isinstance(error, OSError):
-        place = " -> ".join(
-            repr(os.fspath(name))
-            for name in (error.filename, error.filename2)
-            if name is not None and not isinstance(name, int)
-        )
-        return f"Files: {error.strerror or error}{f': {place}' if place else ''}; check the path, its permissions and the space that is left."
-    kind = type(error).__name__
-    return f"Internal error, a defect of kros: {kind}: {error}; run the command again as kros --debug ... for its traceback, and report it."
+        names = [
+            repr(os.fspath(n)) for n in (error.filename, error.filename2) if isinstance(n, str | bytes | os.PathLike)
+        ]
+        place = f": {' -> '.join(names)}" if names else ""
+        return f"Files: {error.strerror or error}{place}; check the path, its permissions and the space that is left."
+    return (
+        f"Internal error, a defect of kros: {type(error).__name__}: {error}; run the command again as kros --debug ... "
+        "for its traceback, and report it."
+    )
 
 
 def _silence_if_broken() -> None:
-    """Where standard output cannot be written any more, say nothing more on it: Python would fail once more when it ends."""
+    """Write nothing more on standard output that is broken: Python would fail once more when it ends."""
     try:
         sys.stdout.flush()
     except (OSError, ValueError):

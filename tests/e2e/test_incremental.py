@@ -13,7 +13,8 @@ import pytest
 
 import kros
 from kros.core.work import Work
-from kros.study import Stage, run_study, validate_config
+from kros.study import Stage, validate_config
+from kros.study import run as run_study
 
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}
 
@@ -34,7 +35,7 @@ def computed(monkeypatch) -> dict[str, list[str]]:
 
     def counted(self: Work, title: str, function: Callable[..., Any], tasks: Sequence[Any]) -> Any:
         tasks = list(tasks)
-        own = [task for _, task in tasks]  # behind its mark
+        own = [task for _, task in tasks]  # behind its digest
         found.setdefault(title, []).extend(task.unit if hasattr(task, "unit") else task[0].unit_ids[0] for task in own)
         return map(function, tasks)
 
@@ -46,7 +47,7 @@ def study(source: Path, out: Path, **identify: Any) -> Path:
     """Run a study up to its models."""
     content = {"name": "grown", "data": {"source": str(source)}, "identify": {"refine": False, **identify}}
     content["data"]["reader"] = "motor-drive-raw"
-    return run_study(validate_config(content, source), out, Stage.IDENTIFY).folder
+    return run_study(validate_config(content, source), out, until=Stage.IDENTIFY).folder
 
 
 def results(run: Path) -> dict[str, Any]:
@@ -58,7 +59,9 @@ def results(run: Path) -> dict[str, Any]:
         return [cleaned(v) for v in value] if isinstance(value, list) else value
 
     files = [
-        p for p in sorted(run.rglob("*")) if p.is_file() and p.relative_to(run).parts[0] not in ("stages", ".kros.lock")
+        p
+        for p in sorted(run.rglob("*"))
+        if p.is_file() and p.relative_to(run).parts[0] not in ("store", "manifest.json")
     ]
     return {
         p.relative_to(run).as_posix(): cleaned(json.loads(p.read_text())) if p.suffix == ".json" else p.read_bytes()
@@ -168,7 +171,7 @@ def test_another_regularisation_or_lifting_takes_from_earlier_runs_what_does_not
     }
     content |= {"lifting": {"functions": ["cos(100*position + phase)"]}}
     computed.clear()
-    run_study(validate_config(content, drives), run, Stage.IDENTIFY)
+    run_study(validate_config(content, drives), run, until=Stage.IDENTIFY)
     assert [len(units) for units in computed.values()] == [0, 5, 5]  # the phase is known, the factors are others
 
 
@@ -177,7 +180,8 @@ def test_what_is_damaged_is_computed_again(drives, tmp_path, computed, damage):
     source = without(drives, tmp_path / "raw", folders(drives)[0])
     run = study(source, tmp_path / "run")
     put_back(drives, source)
-    kept, copies = run / "seen" / "read.gz", sorted((run / "recordings").glob("*.parquet"))
+    copies = sorted((run / "recordings").glob("*.parquet"))
+    kept = next(path for path in (run / "store").glob("*.npz") if b"GroupRecord" in path.read_bytes())
     if damage == "recordings":
         copies[0].write_bytes(b"something else")
         copies[1].unlink()
@@ -188,5 +192,5 @@ def test_what_is_damaged_is_computed_again(drives, tmp_path, computed, damage):
         kept.write_bytes(whole[: len(whole) // 2] if damage == "cut" else whole[:200] + bytes(200) + whole[400:])
     computed.clear()
     study(source, run)
-    assert len(computed["read"]) == (3 if damage == "recordings" else 10)
+    assert len(computed["read"]) == (3 if damage == "recordings" else 2)
     assert results(run) == fresh(source, tmp_path)

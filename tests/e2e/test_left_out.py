@@ -14,7 +14,8 @@ from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
 from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 from kros.study.commands.recordings import load_calibration, unit_parameters
 from kros.study.config import Stage
 from kros.study.engine.context import Context
@@ -103,7 +104,7 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     assert all(
         line.endswith("unchanged") for line in again.stderr.splitlines() if line[:1].islower() or line[:1].isdigit()
     )
-    made = json.loads((folder / "left_out" / "1" / "stages" / "synthesize.json").read_text())
+    made = json.loads((folder / "left_out" / "1" / "manifest.json").read_text())
     shutil.copytree(folder, folder.parent / "copy")
     off = kros(
         "run",
@@ -118,7 +119,7 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     )
     assert "left_out" not in json.loads(off.stdout)
     assert not (folder.parent / "copy" / "left_out" / "left_out.json").exists()
-    assert read_json(folder / "left_out" / "1" / "stages" / "synthesize.json") == made
+    assert read_json(folder / "left_out" / "1" / "manifest.json") == made
 
 
 @pytest.mark.parametrize(

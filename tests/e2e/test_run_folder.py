@@ -1,4 +1,4 @@
-"""The run folder: what records list, what a run may remove, who may work in it, and what an interrupted run leaves."""
+"""The run folder: what its manifest lists, what a run may remove, who may work in it, and what an interrupted run leaves."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ import pytest
 
 from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
-from kros.study import Stage, load_config, run_study
+from kros.core.store import recorded_files
+from kros.study import Stage, load_config
+from kros.study import run as run_study
 
 pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
@@ -69,13 +71,13 @@ def files(folder: Path) -> set[str]:
 
 
 def results(folder: Path) -> dict[str, Any]:
-    """Contents of all files but records; without times, and without the keys that depend on them."""
+    """Contents of all files but manifests and the store; without times."""
     return {
         name: timeless(json.loads((folder / name).read_text()))
         if name.endswith(".json")
         else (folder / name).read_bytes()
         for name in files(folder)
-        if "stages/" not in name
+        if not name.startswith("store/") and not name.endswith("manifest.json")
     }
 
 
@@ -85,15 +87,29 @@ def timeless(content: Any) -> Any:
     return [timeless(v) for v in content] if isinstance(content, list) else content
 
 
-def recorded(folder: Path) -> set[str]:
-    return {name for path in (folder / "stages").glob("*.json") for name in json.loads(path.read_text())["files"]}
+def digest(run: Path, stage: str) -> str:
+    return json.loads((run / "manifest.json").read_text())[stage]["digest"]
 
 
-def test_records_list_every_file_of_a_run_and_no_other(finished):
-    own = {name for name in files(finished) if name.startswith("stages/")} | {"study.json", "metrics.json"}
-    assert recorded(finished) == files(finished) - own
-    assert any(name.startswith("observers/relift/") for name in recorded(finished))
-    assert any(name.startswith("left_out/1/observers/relift/") for name in recorded(finished))
+def test_manifests_list_every_file_of_a_run_and_no_other(finished):
+    assert recorded_files(finished) == {name for name in files(finished) if not name.startswith("store/")} - {
+        f"{folder}manifest.json" for folder in ("", "left_out/0/", "left_out/1/")
+    }
+    assert any(name.startswith("observers/relift/") for name in recorded_files(finished))
+    assert any(name.startswith("left_out/1/observers/relift/") for name in recorded_files(finished))
+
+
+def test_the_store_holds_what_manifests_name_and_no_other(finished):
+    manifests = [json.loads(path.read_text()) for path in finished.rglob("manifest.json")]
+    named = {about["digest"] for manifest in manifests for key, about in manifest.items() if key != "checksum"}
+    folders = {path.name for path in (finished / "store").iterdir() if path.is_dir()}
+    assert folders == named - {""}
+    results = {
+        name
+        for folder in folders
+        for name in json.loads((finished / "store" / folder / "artefact.json").read_text())["results"]
+    }
+    assert results == {path.stem for path in (finished / "store").glob("*.npz")} != set()
 
 
 @pytest.mark.parametrize("pattern", ["observers/relift/*/*/relift.json", "left_out/1/models/*/arrays.npz"])
@@ -115,10 +131,9 @@ def test_any_file_that_was_changed_is_made_again(kros, fast, run, finished, patt
 )
 def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     for _ in range(2):
-        (run / "stages" / "quantify.json").unlink(missing_ok=True)  # as if it had been killed
+        shutil.rmtree(run / "store" / digest(run, "quantify"))
         assert again(kros, fast, run, "--until", "quantify", *settings).exit_code == 0
-    own = {name for name in files(run) if name.startswith("stages/")} | {"study.json", "metrics.json"}
-    assert recorded(run) >= {name for name in files(run) - own if name.startswith(("uncertainty/", "outliers/"))}
+    assert recorded_files(run) >= {name for name in files(run) if name.startswith(("uncertainty/", "outliers/"))}
 
 
 def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished):
@@ -162,19 +177,19 @@ def test_a_folder_that_looks_like_a_demo_is_left_alone(kros, tmp_path):
 
 
 def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
-    """Let the record of a stage claim other files, with the right digest where one is given."""
+    """Let the manifest claim other files of a stage, with the right digest where one is given."""
     import hashlib
 
-    path = run / "stages" / "synthesize.json"
-    record = json.loads(path.read_text())
-    digest = hashlib.sha256(matching.read_bytes()).hexdigest() if matching else "0" * 64
-    record["files"] |= dict.fromkeys(names, digest)
-    record["key"] = "changed"
-    path.write_text(json.dumps(record))
+    path = run / "manifest.json"
+    manifest = {key: about for key, about in json.loads(path.read_text()).items() if key != "checksum"}
+    content = hashlib.sha256(matching.read_bytes()).hexdigest() if matching else "0" * 64
+    manifest["synthesize"]["files"] |= dict.fromkeys(names, (content, 0, 0))
+    manifest["synthesize"]["digest"] = "0" * 64
+    path.write_text(json.dumps(manifest))
 
 
 @pytest.mark.parametrize("way", ["absolute", "above", "link to a folder", "link", "above in the middle"])
-def test_a_record_cannot_reach_out_of_its_folder(kros, fast, run, tmp_path, way):
+def test_a_manifest_cannot_reach_out_of_its_folder(kros, fast, run, tmp_path, way):
     victim = tmp_path / "victim" / "thesis.tex"
     victim.parent.mkdir()
     victim.write_text("years of work")
@@ -195,6 +210,20 @@ def test_a_record_cannot_reach_out_of_its_folder(kros, fast, run, tmp_path, way)
     assert (run / "link").is_symlink()
 
 
+@pytest.mark.parametrize("command", ["run", "report"])
+def test_a_digest_cannot_reach_out_of_the_store(kros, fast, run, tmp_path, command):
+    victim = tmp_path / "victim" / "thesis.tex"
+    victim.parent.mkdir()
+    victim.write_text("years of work")
+    manifest = {
+        key: about for key, about in json.loads((run / "manifest.json").read_text()).items() if key != "checksum"
+    }
+    manifest["report"]["digest"] = "../../victim"
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    assert (kros("report", run) if command == "report" else again(kros, fast, run)).exit_code in (0, 2)
+    assert victim.read_text() == "years of work"
+
+
 def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
     for name in ("notes.txt", "observers/notes.txt", "left_out/0/notes.txt"):
         (run / name).write_text("remember")
@@ -209,12 +238,33 @@ def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
     assert not any(name.startswith("left_out/") for name in files(run) - {"left_out/0/notes.txt"})
 
 
-@pytest.mark.parametrize("content", ["{", "[]", '{"files": 3}', '{"schema": 1, "stage": "identify"}', "null", ""])
-def test_a_damaged_record_is_a_stage_to_be_run_again(kros, fast, run, content):
-    (run / "stages" / "identify.json").write_text(content)
+@pytest.mark.parametrize("content", ["{", "[]", '{"read": 3}', '{"read": {"digest": 5}}', "null", ""])
+def test_a_damaged_manifest_is_written_again_from_the_store(kros, fast, run, finished, content):
+    (run / "manifest.json").write_text(content)
     assert kros("report", run).exit_code == 2
-    assert again(kros, fast, run, "--until", "identify").exit_code == 0
-    assert json.loads((run / "stages" / "identify.json").read_text())["stage"] == "identify"
+    found = again(kros, fast, run)
+    assert found.exit_code == 0
+    assert found.stderr.count("unchanged") >= 8
+    assert recorded_files(run) == recorded_files(finished)
+
+
+@pytest.mark.parametrize("name", ["artefact.json", "models/models.json"])
+def test_a_damaged_artefact_is_computed_again_and_no_other(kros, fast, run, finished, name):
+    place = run / "store" / digest(run, "identify")
+    (place / name).write_text("{")
+    found = again(kros, fast, run)
+    assert found.exit_code == 0
+    assert found.stderr.count("unchanged") >= 7
+    assert results(run) == results(finished)
+
+
+def test_what_is_gone_from_its_place_comes_from_the_store(kros, fast, run, finished):
+    shutil.rmtree(run / "models")
+    (run / "observers" / "deployed.json").write_text("{}")
+    found = again(kros, fast, run, "--set", "uncertainty.n_freqs=60")
+    assert found.exit_code == 0
+    assert "identify" in found.stderr
+    assert results(run) == results(finished)
 
 
 def test_a_link_in_the_place_of_a_folder_of_results_is_not_followed(kros, fast, run, tmp_path):
@@ -332,7 +382,7 @@ def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finishe
     run = tmp_path / "run"
     process = start(fast, run, "--workers", "2", "--until", "synthesize")
     wait_for(
-        lambda: (run / "stages" / "read.json").exists() or process.poll() is not None
+        lambda: "population/facts.json" in (recorded_files(run) if run.exists() else ()) or process.poll() is not None
     )  # early: a busy machine may be late
     workers = children(process.pid)
     assert len(workers) >= 2
@@ -358,7 +408,7 @@ def test_a_run_that_is_stopped_leaves_no_workers_and_resumes(kros, fast, finishe
 def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast, finished, tmp_path):
     run = tmp_path / "run"
     process = start(fast, run, "--workers", "1", "--until", "quantify")
-    wait_for(lambda: (run / ".kros.partial" / "draft" / "uncertainty").exists() or process.poll() is not None)
+    wait_for(lambda: list(run.glob("store/.kros.*/draft/uncertainty")) or process.poll() is not None)
     process.kill()
     process.communicate()
     assert not (run / "uncertainty").exists()
@@ -370,5 +420,5 @@ def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast,
 
 def test_a_script_is_not_told_twice_who_owns_a_folder(fast, run):
     """From Python as from the command line: strings are paths."""
-    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), Stage.REPORT)  # type: ignore[arg-type]
+    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), until=Stage.REPORT)  # type: ignore[arg-type]
     assert found.metrics["study"]["units"] == 4

@@ -9,7 +9,8 @@ import pytest
 
 from kros import from_arrays
 from kros.data import write_parquet
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 
 PERIODS_S = (10.0, 1.0, 5e-5)
 

@@ -19,7 +19,8 @@ from kros.design import Design
 from kros.design.methods import table
 from kros.observer import Observer
 from kros.plants import PLANTS
-from kros.study import load_config, run_study
+from kros.study import load_config
+from kros.study import run as run_study
 from kros.uncertainty import UncertainModels
 
 ROOT = Path(__file__).parents[2]

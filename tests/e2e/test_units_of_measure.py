@@ -12,7 +12,7 @@ from kros.data import write_parquet
 from kros.identify import ModelSet
 from kros.observer import Observer
 from kros.plants import DcMotorPopulation
-from kros.study import run_study
+from kros.study import run as run_study
 from kros.study.config import Stage, validate_config
 
 CHANNELS = ("position", "velocity", "current", "voltage")

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from kros.core import limits, records
+from kros.core import limits
 from kros.core.archive import pack_arrays
 from kros.core.artifacts import (
     json_bytes,
@@ -26,6 +26,7 @@ from kros.core.artifacts import (
 )
 from kros.core.errors import ConfigError, DataError
 from kros.core.files import read_bytes, read_toml
+from kros.core.store import place
 
 
 @pytest.fixture
@@ -219,9 +220,9 @@ def test_json_is_laid_out_as_the_library_does_it() -> None:
 @pytest.mark.parametrize("name", ["..", ".", "a/../b", "./a", "a//b", "/a", "a/", "c:/x", "c:x", "a\0b", ""])
 def test_names_that_are_not_those_of_files_inside_are_refused(name: str, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is not the name of a file inside it"):
-        records.place(tmp_path, name)
+        place(tmp_path, name)
 
 
 @pytest.mark.parametrize("name", ["a", "a/b.json", ".hidden", "..a/b", "a/...", "a b/ü.json", "a\\b"])
 def test_names_of_files_inside_are_taken(name: str, tmp_path: Path) -> None:
-    assert records.place(tmp_path, name) == tmp_path / name
+    assert place(tmp_path, name) == tmp_path / name

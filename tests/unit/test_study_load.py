@@ -42,7 +42,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
 
 
 def test_a_declared_load_is_found_on_the_other_units(tmp_path: Path) -> None:
-    study = context(tmp_path, moment=0.2, inertia=0.01, units=("001002",), memories=2)
+    study = context(tmp_path, moment=0.2, inertia=0.01, units=("001002",))
     run_load(study, {})
     told = load_metrics(study)["load_torque"]
     assert told["known"] == ["001002"]

@@ -1,36 +1,164 @@
-"""What a stage is recorded to have written."""
+"""Artefacts and results: what is in its place is whole, and as it was written."""
 
 import hashlib
+from dataclasses import dataclass
 
+import numpy as np
+import pytest
+
+import kros
+from kros.core.errors import ConfigError, DataError
+from kros.core.results import Results, packed, unpacked
+from kros.core.store import digest_of
+from kros.core.work import Work
 from kros.study.engine.store import Store
 
 
-def written(folder, told, afterwards=None):
-    with Store(folder).drafting() as draft:
-        path = draft.draft("a.txt")
+@dataclass(frozen=True)
+class Pair:
+    name: str
+    values: np.ndarray
+
+
+def square(x: float) -> float:
+    return x * x
+
+
+def written(folder, text: str, digest: str = digest_of("a")) -> Store:
+    store = Store(folder)
+    with store.drafting() as draft:
+        path = draft.draft("deep", "a.txt")
         path.parent.mkdir(parents=True)
-        path.write_text("one")
-        draft.told(path, told)
-        if afterwards is not None:
-            path.write_text(afterwards)
-        draft.commit("read", "key", 0.0)
-    return Store(folder).record("read").files["a.txt"]
+        path.write_text(text)
+        draft.commit("read", digest, 0.0)
+    return store
 
 
-def test_a_digest_is_taken_from_who_wrote_a_file(tmp_path):
-    assert written(tmp_path, "told") == "told"
+def test_what_a_stage_drafts_is_at_its_place_and_in_the_store(tmp_path):
+    store = written(tmp_path, "one")
+    assert (tmp_path / "deep" / "a.txt").read_text() == "one"
+    assert store.files() == {"deep/a.txt"}
+    assert store.record("read") == store.stored(digest_of("a"))
+    assert store.stored(digest_of("b")) is None
 
 
-def test_a_file_that_changed_since_is_read(tmp_path):
-    assert written(tmp_path, "told", "other") == hashlib.sha256(b"other").hexdigest()
+def test_what_is_not_committed_leaves_nothing(tmp_path):
+    store = Store(tmp_path)
+    with pytest.raises(RuntimeError), store.drafting() as draft:  # noqa: PT012
+        draft.draft().mkdir()
+        raise RuntimeError
+    assert not list((tmp_path / "store").iterdir())
 
 
-def test_recordings_are_recorded_with_the_digests_of_their_files(tmp_path):
-    import kros
+def test_another_artefact_of_a_stage_takes_the_place_of_the_first_which_can_come_back(tmp_path):
+    written(tmp_path, "one")
+    store = written(tmp_path, "two", digest_of("b"))
+    assert (tmp_path / "deep" / "a.txt").read_text() == "two"
+    store.add("read", store.stored(digest_of("a")))
+    assert (tmp_path / "deep" / "a.txt").read_text() == "one"
+    store.sweep()
+    assert store.stored(digest_of("b")) is None
 
+
+def test_runs_inside_are_those_that_an_artefact_was_made_with(tmp_path):
+    store, first, second = Store(tmp_path), digest_of("first"), digest_of("second")
+    for text, digest in (("one", first), ("two", second)):
+        inside = store.nested("left_out", "0")
+        with inside.drafting() as draft:
+            draft.draft().mkdir()
+            draft.draft("b.txt").write_text(text)
+            draft.commit("identify", digest_of(text), 0.0)
+        with store.drafting() as draft:
+            draft.commit("left_out", digest, 0.0)
+    assert store.files() == {"left_out/0/b.txt"}
+    assert store.stored(second) is not None
+    assert store.stored(first) is None
+    inside.add("identify", inside.stored(digest_of("one")))
+    assert store.stored(first) is not None
+    with pytest.raises(DataError, match="is missing or another one"):
+        store.verify("left_out")
+
+
+def test_files_of_others_stay(tmp_path):
+    store = written(tmp_path, "one")
+    for path in (tmp_path / "deep" / "notes.txt", tmp_path / "store" / "notes.txt"):
+        path.write_text("mine")
+    store.drop("read")
+    store.sweep()
+    assert not (tmp_path / "deep" / "a.txt").exists()
+    assert (tmp_path / "deep" / "notes.txt").exists()
+    assert [path.name for path in (tmp_path / "store").iterdir()] == ["notes.txt"]
+
+
+def test_where_files_cannot_be_linked_they_are_copied_with_their_times(tmp_path, monkeypatch):
+    def refuse(*_: object) -> None:
+        raise OSError("no links here")
+
+    monkeypatch.setattr("os.link", refuse)
+    store = written(tmp_path, "one")
+    file = tmp_path / "deep" / "a.txt"
+    assert file.stat().st_nlink == 1
+    assert file.stat().st_mtime_ns == store.record("read").files["deep/a.txt"][2]
+    monkeypatch.setattr("kros.core.store.file_digest", lambda path: pytest.fail("was read again"))
+    store.add("read", store.stored(digest_of("a")))
+
+
+@pytest.mark.parametrize("name", ["deep", "deep/a.txt/b"])
+def test_what_is_in_the_place_of_a_result_is_named(tmp_path, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(ConfigError, match="is in the place of a result; move it away"):
+        written(tmp_path, "one")
+    assert (tmp_path / name).read_text() == "mine"
+
+
+def test_recordings_are_listed_with_the_digests_of_their_files(tmp_path):
     motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     kros.run(motors, tmp_path / "run", until="read")
-    record = Store(tmp_path / "run").record("read")
-    assert sum(name.endswith(".parquet") for name in record.files) == 2
-    for name, digest in record.files.items():
-        assert hashlib.sha256((tmp_path / "run" / name).read_bytes()).hexdigest() == digest, name
+    artefact = Store(tmp_path / "run").record("read")
+    assert sum(name.endswith(".parquet") for name in artefact.files) == 2
+    for name, (content, size, _) in artefact.files.items():
+        path = tmp_path / "run" / name
+        assert (hashlib.sha256(path.read_bytes()).hexdigest(), path.stat().st_size) == (content, size), name
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        [1, 2.5, "text", True, float("inf"), 1e-300],
+        (1, [2, ()], {"a": {"is": 3, "shape": None}}),
+        {"x": np.float64(0.1), "y": np.int64(3), "z": np.array(2.0)},
+        [np.arange(6.0).reshape(2, 3), np.zeros((0, 2)), np.array([True, False])],
+        Pair("a", np.array([[0.1, -0.0], [np.nan, np.inf]])),
+    ],
+    ids=range(6),
+)
+def test_results_come_back_bit_by_bit(tmp_path, value):
+    again = unpacked(packed(value), tmp_path, {"Pair": Pair})
+    assert packed(again) == packed(value)
+    assert repr(again) == repr(value)
+
+
+def test_a_result_of_another_kind_is_refused():
+    with pytest.raises(TypeError, match="object is of no kind"):
+        packed([object()])
+
+
+def test_results_of_a_map_that_was_interrupted_are_there(tmp_path):
+    work = Work(results=Results(tmp_path, "source"))
+    assert next(work.recall("square", square, [2.0, 3.0], ["a", "b"])) == 4.0
+    assert list(work.recall("square", square, [0.0, 3.0], ["a", "b"])) == [4.0, 9.0]
+
+
+def test_results_are_computed_once_and_what_is_damaged_again(tmp_path):
+    results = Results(tmp_path, "source")
+    work = Work(results=results)
+    known = ["a", None, "b"]
+    assert list(work.recall("square", square, [2.0, 3.0, 4.0], known)) == [4.0, 9.0, 16.0]
+    assert {path.stem for path in tmp_path.iterdir()} == results.used
+    assert list(work.recall("square", square, [0.0, 3.0, 0.0], known)) == [4.0, 9.0, 16.0]
+    assert list(Work(results=Results(tmp_path, "other")).recall("square", square, [5.0], ["a"])) == [25.0]
+    for path in tmp_path.iterdir():
+        path.write_bytes(path.read_bytes()[:-9])
+    assert list(work.recall("square", square, [5.0, 3.0, 6.0], known)) == [25.0, 9.0, 36.0]

@@ -1,4 +1,4 @@
-"""Arrays in an .npz: bytes that depend on the content alone, read back without trusting any size that the file states."""
+"""Arrays in an .npz: bytes that depend on the content alone, read without trusting any size that the file states."""
 
 from __future__ import annotations
 
@@ -15,20 +15,8 @@ import numpy as np
 from .errors import DataError
 
 _ENDING = ".npy"
-_DAMAGED = (  # what zipfile, the header of .npy and NumPy raise on bytes that somebody changed
-    zipfile.BadZipFile,
-    ValueError,
-    LookupError,
-    TypeError,
-    EOFError,
-    OSError,
-    NotImplementedError,
-    RuntimeError,
-    ArithmeticError,
-    SyntaxError,
-    struct.error,
-    tokenize.TokenError,
-)
+_DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
+_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError)  # of bytes that were changed
 
 
 def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -49,7 +37,8 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
             return {_array_name(info): _array(info, archive) for info in archive.infolist()}
     except _DAMAGED as error:
         raise DataError(
-            f"Reading {path}: not a valid archive of arrays ({error or type(error).__name__}); write it again with the step that made it."
+            f"Reading {path}: not a valid archive of arrays ({error or type(error).__name__}); write it again with "
+            "the step that made it."
         ) from error
 
 

@@ -1,8 +1,8 @@
 """The one reader and writer behind every `save` and `load`.
 
-An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum of both).
-Files appear whole or not at all: they are written beside their place and moved there. What was changed since is not read: a file that
-was edited on purpose is accepted once its key ``checksum`` is removed, with what its reader checks of the content.
+An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum
+of both). Files appear whole or not at all: they are written beside their place and moved there. What was changed since
+is not read: a file that was edited on purpose is accepted once its key ``checksum`` is removed, and its reader checks it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping
-from json.encoder import encode_basestring
 from pathlib import Path
 from typing import Any
 
@@ -25,14 +24,14 @@ import numpy as np
 from . import limits
 from .archive import pack_arrays, unpack_arrays
 from .errors import DataError
-from .files import read_bytes, shortened
+from .files import TEMPORARY, read_bytes, shortened
 
 SCHEMA = 1
 CHECKSUM = "checksum"
 
 
 class LoadedContent(dict[Any, Any]):
-    """A JSON object or a set of arrays as read from a file; asking for a key that is not there says so, with the file."""
+    """A JSON object or a set of arrays as read from a file; a key that is missing is an error that names the file."""
 
     def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
         super().__init__(content)
@@ -40,18 +39,15 @@ class LoadedContent(dict[Any, Any]):
 
     def __missing__(self, key: Any) -> Any:
         raise DataError(
-            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with this version."
+            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with "
+            "this version."
         )
-
-
-_AS_IT_IS = frozenset({str, int, bool, type(None)})
-_OBJECTS, _LISTS = frozenset({dict, LoadedContent}), frozenset({list, tuple})
 
 
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old content or the new, never half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
     try:
         with os.fdopen(handle, "wb") as file:
             file.write(content)
@@ -64,63 +60,28 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def plain(value: Any) -> Any:
     """Turn dataclasses, enums, NumPy scalars and arrays into JSON's own types; NaN and infinity become null."""
-    kind = type(value)
-    if kind is float:
-        return value if math.isfinite(value) else None
-    if kind in _AS_IT_IS:
-        return value
-    if kind in _OBJECTS:
-        return {_name(k): v if type(v) in _AS_IT_IS else plain(v) for k, v in value.items()}
-    if kind in _LISTS:
-        return [v if type(v) in _AS_IT_IS else plain(v) for v in value]
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
     if isinstance(value, enum.Enum):
         return plain(value.value)
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, str | int):
+        return value
     if isinstance(value, Mapping):
-        return {_name(k): plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(v) for v in value]
-    if isinstance(value, np.ndarray):
+        return {key if type(key) is str else str(plain(key)): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
         return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, (datetime.date, datetime.time)):  # of TOML
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
+    if isinstance(value, datetime.date | datetime.time):  # of TOML
         return value.isoformat()
-    return value
-
-
-def _name(key: Any) -> str:
-    return key if type(key) is str else str(plain(key))
+    return str(value) if isinstance(value, Path) else value
 
 
 def json_bytes(content: Any) -> bytes:
-    """Return JSON with a stable layout: that of ``json.dumps(..., indent=1)``, which takes several times as long."""
-    return (_laid_out(content, "\n") + "\n").encode()
-
-
-def _laid_out(value: Any, margin: str) -> str:
-    """JSON of a value; its further lines begin with the margin, a line's end and blanks."""
-    kind = type(value)
-    if kind is str:
-        return encode_basestring(value)
-    if kind is float:
-        return float.__repr__(value) if math.isfinite(value) else "null"
-    inner = margin + " "
-    if kind in _OBJECTS:
-        parts = [f"{encode_basestring(_name(k))}: {_laid_out(v, inner)}" for k, v in value.items()]
-        return f"{{{inner}{f',{inner}'.join(parts)}{margin}}}" if parts else "{}"
-    if kind in _LISTS:
-        parts = [_laid_out(v, inner) for v in value]
-        return f"[{inner}{f',{inner}'.join(parts)}{margin}]" if parts else "[]"
-    if kind in _AS_IT_IS:
-        return json.dumps(value)
-    found = plain(value)
-    return json.dumps(found, ensure_ascii=False, allow_nan=False) if type(found) is kind else _laid_out(found, margin)
+    """Return JSON with a stable layout."""
+    return (json.dumps(plain(content), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -131,16 +92,14 @@ def write_json(path: Path, content: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file, or say which file is missing or broken; its objects are `LoadedContent`."""
     path = Path(path)
-    if not path.exists():
-        raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
+    text = _read(path, limits.MAX_JSON_BYTES)
+
+    def loaded(content: dict[str, Any]) -> LoadedContent:
+        return LoadedContent(content, path)
+
     try:
-        text = read_bytes(path, limits.MAX_JSON_BYTES).decode("utf-8")
-        return json.loads(
-            text, object_hook=lambda found: LoadedContent(found, path), parse_constant=_refuse, parse_float=_finite
-        )
+        return json.loads(text.decode(), object_hook=loaded, parse_constant=_refuse, parse_float=_finite)
     except (ValueError, RecursionError) as error:
-        if isinstance(error, DataError):
-            raise
         raise DataError(
             f"Reading {path}: not valid JSON ({shortened(str(error))}); write it again with the step that made it."
         ) from error
@@ -158,8 +117,8 @@ def _finite(text: str) -> float:
 
 
 def _digest(content: Mapping[str, Any]) -> str:
-    kept = {key: value for key, value in content.items() if key != CHECKSUM}
-    return "sha256:" + hashlib.sha256(json.dumps(kept, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    content = {key: value for key, value in content.items() if key != CHECKSUM}
+    return "sha256:" + hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
@@ -174,7 +133,8 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
         return False
     if content[CHECKSUM] != _digest(content):
         raise DataError(
-            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was written; write it again, or "
+            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was "
+            "written; write it again, or "
             f'remove the key "{CHECKSUM}" where it was edited on purpose.'
         )
     return True
@@ -183,13 +143,13 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an .npz; pickled objects and packed archives are refused."""
     path = Path(path)
-    return LoadedContent(unpack_arrays(_read_archive(path), path), path)
+    return LoadedContent(unpack_arrays(_read(path, limits.MAX_ARRAYS_BYTES), path), path)
 
 
-def _read_archive(path: Path) -> bytes:
+def _read(path: Path, limit: int) -> bytes:
     if not path.exists():
         raise DataError(f"Reading {path.name}: there is no file {path}; is this the folder that an earlier step wrote?")
-    return read_bytes(path, limits.MAX_ARRAYS_BYTES)
+    return read_bytes(path, limit)
 
 
 def save_artifact(
@@ -210,19 +170,21 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     folder = Path(folder)
     path, archive = folder / f"{kind}.json", folder / "arrays.npz"
     content = read_json(path)
-    found = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
-    if found != (SCHEMA, kind):
+    about = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
+    if about != (SCHEMA, kind):
         raise DataError(
-            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {found}; write it again with this version of kros."
+            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {about}; write it again "
+            "with this version of kros."
         )
     check_checksum(content, path)
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
     if digest is None and not archive.exists():
         return content, LoadedContent({}, archive)
-    packed = _read_archive(archive)
+    packed = _read(archive, limits.MAX_ARRAYS_BYTES)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
         raise DataError(
-            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step that made them."
+            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step "
+            "that made them."
         )
     return content, LoadedContent(unpack_arrays(packed, archive), archive)

@@ -1,4 +1,4 @@
-"""Files that others wrote: opened only when they are regular files, read up to a limit, parsed with one kind of error."""
+"""Files from outside: opened only when they are regular files, read up to a limit, parsed with one kind of error."""
 
 from __future__ import annotations
 
@@ -21,7 +21,17 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
+TEMPORARY = ".kros."
+"""How names begin of what is beside its place until it is whole."""
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
+
+
+def is_file(path: Path) -> bool:
+    """Tell whether there is a regular file, not a link to one."""
+    try:
+        return stat.S_ISREG(path.lstat().st_mode)
+    except (OSError, ValueError):
+        return False
 
 
 def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:
@@ -37,7 +47,8 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
         raise error(f"Reading {path}: a regular file is needed, found {kind}; copy its content to a file first.")
     if status.st_size > limit:
         raise error(
-            f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; split it, or raise the limit in kros.core.limits."
+            f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; split it, or raise the "
+            "limit in kros.core.limits."
         )
 
 
@@ -63,12 +74,12 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML; tables within tables are refused below `limits.MAX_TOML_DEPTH`, since everything that walks them recurses."""
+    """Parse TOML; tables deeper than `limits.MAX_TOML_DEPTH` are refused, since everything that walks them recurses."""
     dots = rf"(?<![\w-]){_NAME}(?:[ \t]*\.[ \t]*{_NAME}){{{limits.MAX_TOML_DEPTH}}}"
     if re.search(dots, text):  # before parsing, whose time grows with the square of their number
         raise ValueError(f"a key of more than {limits.MAX_TOML_DEPTH} names")
-    found = tomllib.loads(text)
-    level: list[Any] = [found]
+    tables = tomllib.loads(text)
+    level: list[Any] = [tables]
     for _ in range(limits.MAX_TOML_DEPTH):
         level = [
             v
@@ -78,7 +89,7 @@ def parse_toml(text: str) -> dict[str, Any]:
         ]
     if level:
         raise ValueError(f"tables or lists are nested more than {limits.MAX_TOML_DEPTH} deep")
-    return found
+    return tables
 
 
 def _said(error: BaseException) -> str:

@@ -25,7 +25,8 @@ def as_written(what: str, path: Path) -> Iterator[None]:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, np.linalg.LinAlgError) as error:
         raise DataError(
-            f"Loading {what} from {path}: not as kros writes it ({type(error).__name__}: {shortened(str(error))}); write it again with the step "
+            f"Loading {what} from {path}: not as kros writes it ({type(error).__name__}: {shortened(str(error))}); "
+            "write it again with the step "
             "that made it."
         ) from error
 
@@ -54,5 +55,6 @@ def check_shapes(
         if kind not in "biufc" or shape != tuple(known[letter] for letter in letters if letter in known):
             expected = tuple(known.get(letter, letter) for letter in letters)
             raise DataError(
-                f"Reading {path}: {name} should hold numbers of shape {expected}, found {arrays[name].dtype} of shape {shape}."
+                f"Reading {path}: {name} should hold numbers of shape {expected}, found {arrays[name].dtype} of shape "
+                f"{shape}."
             )

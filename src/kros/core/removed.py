@@ -138,6 +138,15 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "kros.observer.Dropped",
     ),
     (
+        "The function run_study is no longer part of kros; use kros.run, which takes a study too.",
+        "kros.study.run_study",
+    ),
+    (
+        "The load's angle and the size of its observer are no longer settings; remove the keys, and let the step offset make the angle "
+        "zero where the moment is.",
+        "load.angle_rad load.memories",
+    ),
+    (
         "The place of corrections is no longer chosen in a study: worst_case_h2 corrects the state, mixed the input; remove the "
         "key injection.",
         "synthesis.injection",

@@ -11,6 +11,7 @@ from .files import did_you_mean, shortened
 from .removed import instead_of
 
 T = TypeVar("T")
+_OF_FAMILIES = (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError)  # their arguments
 
 
 class Settings(BaseModel):
@@ -26,32 +27,20 @@ class Settings(BaseModel):
         except ValidationError as error:
             problems = "; ".join(f"{'.'.join(str(p) for p in e['loc'])}: {cls._explain(e)}" for e in error.errors())
             raise ConfigError(f"{asked}: {shortened(problems, 2000)}.") from error
-        except (
-            TypeError,
-            LookupError,
-            AttributeError,
-            ArithmeticError,
-            MemoryError,
-            RecursionError,
-        ) as error:  # of a family's arguments
-            found = f"{type(error).__name__}: {shortened(str(error))}"
-            raise ConfigError(f"{asked}: {found}; check the values of [[lifting.families]].") from error
+        except _OF_FAMILIES as error:
+            reason = f"{type(error).__name__}: {shortened(str(error))}"
+            raise ConfigError(f"{asked}: {reason}; check the values of [[lifting.families]].") from error
 
     @classmethod
     def _explain(cls, error: Any) -> str:
-        key, found = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
-        if reason := instead_of(
-            f"{key}={found}" if isinstance(found, str) and error["type"] != "extra_forbidden" else key
-        ):
+        key, value = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
+        unknown, text = error["type"] == "extra_forbidden", str(error["msg"]).lower()
+        if reason := instead_of(f"{key}={value}" if isinstance(value, str) and not unknown else key):
             return reason
-        if error["type"] == "extra_forbidden":
+        if unknown:
             known = cls._names_in(error["loc"][:-1])
             return f"unknown key{did_you_mean(error['loc'][-1], known) or ';'} known are {', '.join(known)}"
-        return (
-            f"{error['msg'].lower()}, found {shortened(repr(found))}"
-            if not isinstance(found, dict)
-            else str(error["msg"]).lower()
-        )
+        return text if isinstance(value, dict) else f"{text}, found {shortened(repr(value))}"
 
     @classmethod
     def _names_in(cls, place: tuple[Any, ...]) -> list[str]:

@@ -1,13 +1,16 @@
-"""Independent pieces of work, in order: where they run, and who is told how far they are."""
+"""Independent pieces of work, in order: where they run, which results are there, and who listens to their progress."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import logging
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol, TypeVar
 
+from .results import Results, Storing
+
 T = TypeVar("T")
-Usable = Callable[[Any, Any], bool]  # of a task and its result
+log = logging.getLogger(__name__)
 
 
 class Executor(Protocol):
@@ -36,7 +39,7 @@ class Progress(Protocol):
         """One of its steps is done."""
 
     def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """A stage is done, or was found done."""
+        """A stage is done, or was skipped."""
 
 
 class Silent:
@@ -52,30 +55,13 @@ class Silent:
         """Ignore."""
 
 
-class Recalls(Protocol):
-    """Knows results of earlier maps."""
-
-    def recall(
-        self,
-        work: Work,
-        title: str,
-        function: Callable[[Any], T],
-        tasks: Sequence[Any],
-        marks: Sequence[str | None],
-        kinds: Iterable[type] = (),
-        usable: Usable | None = None,
-    ) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        ...
-
-
 @dataclass(frozen=True)
 class Work:
-    """An executor, a progress listener and what is known from earlier; by default everything runs here, in silence, and nothing is known."""
+    """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
     executor: Executor = field(default_factory=SerialExecutor)
     progress: Progress = field(default_factory=Silent)
-    seen: Recalls | None = None
+    results: Results | None = None
 
     def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Map a function over tasks, in order."""
@@ -92,29 +78,42 @@ class Work:
         tasks: Iterable[Any],
         marks: Iterable[str | None],
         kinds: Iterable[type] = (),
-        usable: Usable | None = None,
+        usable: Callable[[Any, Any], bool] = lambda task, result: True,
     ) -> Iterator[T]:
-        """Map a function over tasks, in order, without those whose results are known from earlier."""
-        if self.seen is None:
-            return self.map(title, function, tasks)
-        return self.seen.recall(self, title, function, list(tasks), list(marks), kinds, usable)
+        """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`."""
+        if self.results is None:
+            yield from self.map(title, function, tasks)
+            return
+        tasks, kinds, digests = list(tasks), tuple(kinds), self.results.digests(function, marks)
+        earlier = [self.results.read(digest, kinds) for digest in digests]
+        earlier = [
+            None if result is None or not usable(task, result) else result
+            for task, result in zip(tasks, earlier, strict=True)
+        ]
+        new = [row for row, result in zip(zip(digests, tasks, strict=True), earlier, strict=True) if result is None]
+        if new:
+            log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
+        computed = self.map(title, Storing(function, self.results.folder), new)
+        for result in earlier:
+            yield next(computed) if result is None else result
+        next(computed, None)  # its progress ends
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""
         return list(self.map(title, _call, work))
 
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
-        """Begin independent pieces of work, and return what waits for their results, in order: work that is asked for meanwhile runs beside them."""
+        """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         pieces = list(work)
         running = self.executor.map(_call, pieces)
 
         def results() -> list[T]:
             self.progress.start(title, len(pieces))
-            found = []
+            computed = []
             for result in running:
                 self.progress.advance()
-                found.append(result)
-            return found
+                computed.append(result)
+            return computed
 
         return results
 

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact
 from ..core.errors import DataError
+from ..core.files import is_file
 from ..core.loading import loader
-from ..core.records import is_file
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, scan_digests

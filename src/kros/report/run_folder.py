@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_arrays, read_json
-from ..core.records import recorded_files
+from ..core.store import recorded_files
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis

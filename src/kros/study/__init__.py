@@ -9,7 +9,10 @@ Examples
 ('auto', 0.95)
 """
 
+from ..core.removed import refusing
 from .config import Stage, StudyConfig, load_config, validate_config
-from .pipeline import RunResult, run, run_study
+from .pipeline import RunResult, run
 
-__all__ = ["RunResult", "Stage", "StudyConfig", "load_config", "run", "run_study", "validate_config"]
+__all__ = ["RunResult", "Stage", "StudyConfig", "load_config", "run", "validate_config"]
+
+__getattr__ = refusing(__name__)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Sequence
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +21,7 @@ from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
 
-class Stage(str, Enum):
+class Stage(StrEnum):
     """Stages in the order in which data flow.
 
     Examples
@@ -42,14 +42,13 @@ class Stage(str, Enum):
 
 
 class DataConfig(Settings):
-    """Where the recordings are and how they are prepared; units that `exclude` names take no part in anything."""
+    """Where the recordings are and how they are prepared."""
 
     source: Path = Field(description="folder of the recordings, relative to the study file")
     reader: str = Field("motor-drive-raw", description="motor-drive-raw, csv or parquet")
     exclude: tuple[str, ...] = Field((), description="units that take no part in anything")
     identify_on: str | None = Field(
-        None,
-        description="condition that models, uncertainty and synthesis are made of; noload where there is one, else the first",
+        None, description="condition that models and observers are made from; by default noload, or else the first"
     )
     on_nan: Literal["error", "drop_episode"] = Field(
         "error", description="what an episode with a missing value is: an error, or left out"
@@ -69,31 +68,21 @@ class SplitConfig(Settings):
     """Which episodes are held out."""
 
     test: tuple[str, ...] | None = Field(
-        None,
-        description="names of the episodes held out; by default the last tenth of every unit and condition, at least one",
+        None, description="episodes held out; by default the last tenth of every unit and condition, at least one"
     )
 
 
 class EvaluateConfig(Settings):
-    """Evaluation on units that took no part, and on disturbed measurements.
-
-    With `folds` the pooled units are parted into so many folds, and for each the study is made once more on all other units; 0 leaves that out.
-    With `reserve` so many units take part in nothing, and their errors bound those of the next unit with this `confidence`.
-    With `robustness` observers of the deployed kind of model run on disturbed measurements of a few units.
-    """
+    """Evaluation on units that took no part, and on disturbed measurements."""
 
     folds: int = Field(
-        0,
-        ge=0,
-        description="folds of units that are left out in turn, the whole study being made on all others; 0 for none",
+        0, ge=0, description="folds of units left out in turn, the whole study being made on all others; 0 for none"
     )
     reserve: int = Field(
         0, ge=0, description="units that take part in nothing; their errors bound those of the next unit"
     )
     confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
-    robustness: bool = Field(
-        True, description="whether observers of the deployed kind of model run on disturbed measurements of a few units"
-    )
+    robustness: bool = Field(True, description="whether observers run on disturbed measurements of a few units")
 
     @field_validator("folds")
     @classmethod
@@ -104,18 +93,12 @@ class EvaluateConfig(Settings):
 
 
 class LoadConfig(Settings):
-    """Load torque: what is mounted on `units` in a condition; without `moment` nothing is done about it.
-
-    The load is ``moment sin(angle - angle_rad) + inertia angle''``, both divided by the torque constant: in units of current. Without `units`
-    the first two that were recorded in the condition are taken; all others are judged on. `limit` is the current's.
-    """
+    """Load torque ``moment sin(angle) + inertia angle''``, over the torque constant, of a mounted mass."""
 
     moment: float | None = Field(
-        None,
-        description="of the mounted mass over the torque constant, in units of current; without it nothing is done about load",
+        None, description="of the mounted mass, in units of current; without it nothing is done about load"
     )
-    inertia: float = Field(0.0, ge=0, description="of the mounted mass over the torque constant")
-    angle_rad: float = Field(0.0, description="angle at which the moment is zero")
+    inertia: float = Field(0.0, ge=0, description="of the mounted mass, in the same units")
     condition: str = Field("load", description="in which the load is mounted")
     units: tuple[str, ...] = Field(
         (), description="on which the load is known; by default the first two recorded in the condition"
@@ -194,13 +177,14 @@ def load_config(path: Path | str, overrides: Sequence[str] = ()) -> StudyConfig:
 def validate_config(
     raw: dict[str, Any], base: Path, origin: str = "study", overrides: Sequence[str] = ()
 ) -> StudyConfig:
-    """Validate a study given as nested tables, with overrides as in `load_config`; a relative source is relative to `base`.
+    """Validate a study given as tables; a relative source is relative to `base`, overrides are as in `load_config`.
 
     Examples
     --------
     >>> from pathlib import Path
     >>> from kros.study import validate_config
-    >>> study = validate_config({"data": {"source": "recordings", "reader": "parquet"}}, Path(), overrides=["identify.alpha=90"])
+    >>> tables = {"data": {"source": "recordings", "reader": "parquet"}}
+    >>> study = validate_config(tables, Path(), overrides=["identify.alpha=90"])
     >>> study.identify.alpha
     90.0
     """

@@ -1,4 +1,4 @@
-"""The stages from recordings to observers: all that is made again where units are left out."""
+"""The stages from recordings to observers: what is repeated where units are left out."""
 
 from __future__ import annotations
 

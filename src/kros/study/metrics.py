@@ -24,22 +24,14 @@ from .stages import calibrate, left_out
 from .stages.load import load_metrics
 
 
-def collect_metrics(context: Context, until: Stage, total_s: float | None) -> dict[str, Any]:
+def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
     """Collect the metrics of all stages up to one."""
     done = list(Stage)[: list(Stage).index(until) + 1]
-    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done, total_s)}
+    metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
     metrics["units"] = _units(context, done)
-    if Stage.CALIBRATE in done:
-        metrics |= _calibration(context)
-    for stage, name, collect in _SECTIONS:
-        if stage in done:
-            metrics[name] = collect(context)
-    if Stage.SYNTHESIZE in done:
-        metrics |= _deployment(context)
-    if Stage.LEFT_OUT in done:
-        metrics |= left_out.results(context)
-    if Stage.EVALUATE in done:
-        metrics |= _disturbed(context) | load_metrics(context) | _recorded(context)
+    for stage in done:
+        if stage in _OF_STAGES:
+            metrics |= _OF_STAGES[stage](context)
     clean: dict[str, Any] = plain(metrics)
     return clean
 
@@ -59,10 +51,10 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
         "dropped": facts.dropped,
     }
     if context.config.sensor:
-        study["sensor"] = {name: own.model_dump(exclude_none=True) for name, own in context.config.sensor.items()}
+        study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
     if limits := limits_of(context.config.limits, facts.limits, context.population.states):
         study["limits"] = {
-            name: _limit(own, facts.limits.get(name), name in context.config.limits) for name, own in limits.items()
+            name: _limit(limit, facts.limits.get(name), name in context.config.limits) for name, limit in limits.items()
         }
     if facts.alerts:
         study["alerts"] = facts.alerts
@@ -75,22 +67,21 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
 
 def _episodes(context: Context) -> dict[str, dict[str, int]]:
     """Count episodes by condition, those for training and those held out."""
-    keys = {"train": context.facts.keys("train"), "held_out": context.facts.keys("test")}
-    return {
-        condition: {part: sum(k.condition == condition for k in found) for part, found in keys.items()}
-        for condition in context.population.conditions
-    }
+    parts = {"train": context.facts.train, "held_out": context.facts.test}
+    conditions = context.population.conditions
+    return {c: {part: sum(key.condition == c for key in keys) for part, keys in parts.items()} for c in conditions}
 
 
-def _limit(limit: Limit, found: FoundLimit | None, declared: bool) -> dict[str, Any]:
+def _limit(limit: Limit, seen: FoundLimit | None, declared: bool) -> dict[str, Any]:
     """Return a limit that counts, and where recordings were seen at one."""
     entry: dict[str, Any] = limit.model_dump() | {"declared": declared}
-    return entry if found is None else entry | {"seen": asdict(found)}
+    return entry if seen is None else entry | {"seen": asdict(seen)}
 
 
-def _timing(context: Context, done: list[Stage], total_s: float | None) -> dict[str, float]:
-    timing = {stage.value: record.seconds for stage in done if (record := context.store.record(stage)) is not None}
-    return timing | ({"total": total_s} if total_s is not None else {})
+def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
+    manifest = context.store.manifest
+    timing = {str(stage): manifest[stage].seconds for stage in done if stage in manifest}
+    return timing | {"total": sum(timing.values())}
 
 
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
@@ -122,7 +113,7 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
 
 
 def _calibration(context: Context) -> dict[str, Any]:
-    """Return what the phase of every unit belongs to; empty for a study without one."""
+    """What the phase of every unit belongs to; empty for a study without one."""
     calibration = calibrate.load(context)
     if calibration is None:
         return {}
@@ -132,78 +123,67 @@ def _calibration(context: Context) -> dict[str, Any]:
 
 
 def _models(context: Context) -> dict[str, Any]:
-    return {
-        name: {
-            "order": m.lifting.n_lifted,
-            "functions": list(m.lifting.functions),
-            "spectral_radius_max": _pooled_radius(context, name),
-        }
-        for name in context.identified.kinds
-        for m in [context.identified.models(name)]
-    }
-
-
-def _pooled_radius(context: Context, name: str) -> float:
-    models = context.identified.models(name)
-    rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
-    return float(models.spectral_radius()[rows].max())
+    """Models: order, functions and largest spectral radius over the pooled units."""
+    entries = {}
+    for name in context.identified.kinds:
+        models = context.identified.models(name)
+        rows = [models.index(u) for u in context.facts.pooled if u in models.unit_ids]
+        radius = float(models.spectral_radius()[rows].max())
+        lifting = {"order": models.lifting.n_lifted, "functions": list(models.lifting.functions)}
+        entries[name] = lifting | {"spectral_radius_max": radius}
+    return {"models": entries}
 
 
 def _uncertainty(context: Context) -> dict[str, Any]:
+    """Uncertain models by kind, and the scores of all units."""
     store = context.store
-    found = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
+    names = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
+    scored = store.holds("outliers", "scores.json")
     return {
-        name: uncertainty_entry(UncertainModel.load(store.path("uncertainty", name))) | diagnostic_entry(store, name)
-        for name in found
+        "uncertainty": {name: uncertainty_entry(store, name) for name in names},
+        "outliers": read_json(store.path("outliers", "scores.json"))["rows"] if scored else [],
     }
 
 
-def uncertainty_entry(model: UncertainModel) -> dict[str, Any]:
-    """Return the metrics of one uncertain model."""
-    weight = model.weight
+def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
+    """Return the metrics of one uncertain model, and the share of noise in it."""
+    model = UncertainModel.load(store.path("uncertainty", name))
     entry: dict[str, Any] = {
         "nominal": model.nominal_id,
         "form": model.form,
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
         "weight": {
-            "structure": weight.structure,
-            "orders": [weight.left_orders, weight.right_orders],
+            "structure": model.weight.structure,
+            "orders": [model.weight.left_orders, model.weight.right_orders],
             "cover_max": model.cover_max,
             "overbound_db_max": model.overbound_db_max,
         },
     }
-    return entry
-
-
-def diagnostic_entry(store: Store, name: str) -> dict[str, Any]:
-    """Return what was found out about one uncertain model beside its weights: the share of noise."""
-    entry: dict[str, Any] = {}
     if store.holds("uncertainty", name, "noise"):
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
-        shares = {
-            "median": np.median(noise.noise_share),
-            "at_peak": noise.noise_share[place],
+        share = noise.noise_share
+        entry["noise_share"] = {
+            "median": np.median(share),
+            "at_peak": share[place],
             "peak_hz": noise.freqs_hz[place],
         }
-        entry["noise_share"] = shares
     return entry
 
 
 def _observers(context: Context) -> dict[str, Any]:
+    """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     entries: dict[str, Any] = {}
     written, certified = context.store.files(), _certified(context)
     for name, facts in context.observers_record["facts"].items():
         entry = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
-            entry |= {"status": synthesis.status, "solve_s": synthesis.solve_s}
-            entry |= {key: getattr(synthesis, key) for key in ("h2_norm", "hinf_norm")}
-            if synthesis.worst_case_h2 is not None:  # a Kalman filter's own optimum bounds nothing in the worst case
-                entry |= {key: getattr(synthesis, key) for key in ("lower_bound", "gap_percent")}
-        entries[name] = entry
-    return {name: entry | certified.get(name, {}) for name, entry in entries.items()}
+            bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
+            entry |= {key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)}
+        entries[name] = entry | certified.get(name, {})
+    return {"observers": entries} | _deployment(context)
 
 
 def _certified(context: Context) -> dict[str, dict[str, Any]]:
@@ -211,12 +191,9 @@ def _certified(context: Context) -> dict[str, dict[str, Any]]:
     if not context.store.holds("observers", "relift.json"):
         return {}
     record = load_artifact(context.store.path("observers"), "relift")[0]
-    bounds = {
-        name: {"set_bound": dict(zip(own["states"], own["cover"], strict=True))}
-        for name, own in record.get("signals", {}).items()
-    }
-    proofs = record.get("certificates", {})
-    return {n: {"assumptions": own.get("assumptions", [])} | bounds.get(n, {}) for n, own in proofs.items()}
+    signals, proofs = record.get("signals", {}), record.get("certificates", {})
+    bounds = {n: {"set_bound": dict(zip(s["states"], s["cover"], strict=True))} for n, s in signals.items()}
+    return {n: {"assumptions": proof.get("assumptions", [])} | bounds.get(n, {}) for n, proof in proofs.items()}
 
 
 def _deployment(context: Context) -> dict[str, Any]:
@@ -241,52 +218,26 @@ def _deployment(context: Context) -> dict[str, Any]:
     return {"deployment": content}
 
 
-def _observers_and_baselines(context: Context) -> dict[str, Any]:
-    return {**_observers(context), **context.evaluation["baselines"]}
+def _evaluation(context: Context) -> dict[str, Any]:
+    """Errors on held-out episodes, disturbed or not, of the load, and of recorded states where truth is recorded."""
+    store, evaluated = context.store, context.evaluation
+    free = {name: {"freerun_error_percent": errors} for name, errors in evaluated["free_run"].items()}
+    entries: dict[str, Any] = {
+        "models": {name: entry | free[name] for name, entry in _models(context)["models"].items()},
+        "observers": _observers(context)["observers"] | evaluated["baselines"],
+        "evaluation": evaluated["rows"],
+        "intervals": interval_rows(evaluated["rows"]),
+    }
+    if store.holds("disturbed", "disturbed.json"):
+        entries["robustness"] = load_artifact(store.path("disturbed"), "disturbed")[0]["robustness"]
+    return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if "recorded" in evaluated else {})
 
 
-def _evaluation(context: Context) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = context.evaluation["rows"]
-    return rows
-
-
-def _intervals(context: Context) -> list[dict[str, Any]]:
-    return interval_rows(_evaluation(context))
-
-
-def _disturbed(context: Context) -> dict[str, Any]:
-    """Errors against severity, where the study asks for them."""
-    if not context.store.holds("disturbed", "disturbed.json"):
-        return {}
-    content = load_artifact(context.store.path("disturbed"), "disturbed")[0]
-    return {key: content[key] for key in ("robustness",) if key in content}
-
-
-def _recorded(context: Context) -> dict[str, Any]:
-    """Errors of recorded states against what they really were; only where the recordings say so."""
-    found = context.evaluation
-    return {"recorded": found["recorded"]} if "recorded" in found else {}
-
-
-def _outliers(context: Context) -> list[dict[str, Any]]:
-    kept = context.store.holds("outliers", "scores.json")
-    rows: list[dict[str, Any]] = read_json(context.store.path("outliers", "scores.json"))["rows"] if kept else []
-    return rows
-
-
-def _free_run(context: Context) -> dict[str, Any]:
-    models = _models(context)
-    free = context.evaluation["free_run"]
-    return {name: entry | {"freerun_error_percent": free[name]} for name, entry in models.items()}
-
-
-_SECTIONS = (
-    (Stage.IDENTIFY, "models", _models),
-    (Stage.QUANTIFY, "uncertainty", _uncertainty),
-    (Stage.QUANTIFY, "outliers", _outliers),
-    (Stage.SYNTHESIZE, "observers", _observers),
-    (Stage.EVALUATE, "models", _free_run),
-    (Stage.EVALUATE, "observers", _observers_and_baselines),
-    (Stage.EVALUATE, "evaluation", _evaluation),
-    (Stage.EVALUATE, "intervals", _intervals),
-)
+_OF_STAGES = {
+    Stage.CALIBRATE: _calibration,
+    Stage.IDENTIFY: _models,
+    Stage.QUANTIFY: _uncertainty,
+    Stage.SYNTHESIZE: _observers,
+    Stage.EVALUATE: _evaluation,
+    Stage.LEFT_OUT: left_out.results,
+}

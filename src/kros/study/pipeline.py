@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import read_json
+from ..core.choices import member
 from ..core.errors import ConfigError
 from ..core.work import Executor, Progress, Silent, Work
 from ..data import Population
@@ -21,7 +20,7 @@ from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
 from .engine.steps import StageStep, run_steps
-from .engine.store import Store, code_key
+from .engine.store import Store
 from .learning import LEARNING
 from .metrics import collect_metrics
 from .stages import evaluate, left_out, read, report
@@ -54,71 +53,13 @@ class RunResult:
     violations: tuple[str, ...]
 
     def __repr__(self) -> str:
-        return f"<RunResult {self.folder}: {self.metrics['study']['units']} units, deployed is {self.metrics['study'].get('deployed')}>"
+        study = self.metrics["study"]
+        return f"<RunResult {self.folder}: {study['units']} units, deployed is {study.get('deployed')}>"
 
     @property
     def observer(self) -> Observer:
         """The observer that is deployed."""
         return Observer.load(self.folder / "observers" / "deployed.json")
-
-
-def run_study(
-    config: StudyConfig,
-    out: Path | str,
-    until: Stage | str = Stage.REPORT,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Progress | None = None,
-    population: Population | None = None,
-) -> RunResult:
-    """Run a study into a folder.
-
-    Parameters
-    ----------
-    config : StudyConfig
-    out : Path or str
-        Run folder; a stage that finds its own earlier result there is skipped.
-    until : Stage or str
-        Last stage to run.
-    workers : int
-        Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
-    scheduler : str, optional
-        Address of a Dask scheduler, instead of processes; `out` and the recordings are in a shared folder then.
-    progress : Progress, optional
-        Told which stage runs and how far it is.
-    population : Population, optional
-        Recordings in place of those that the study names.
-
-    Returns
-    -------
-    RunResult
-
-    Raises
-    ------
-    KrosError
-        Bad input leaves no folder behind that was not there before; so does a folder in which another study lives, or another run is at work.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.plants import DcMotorPopulation
-    >>> from kros.study import run_study, validate_config
-    >>> motors = DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> with TemporaryDirectory() as folder:
-    ...     study = validate_config({"data": {"source": "recordings"}, "identify": {"refine": False}}, Path(folder))
-    ...     result = run_study(study, f"{folder}/run", until="identify", population=motors)
-    >>> result.metrics["study"]["units"]
-    2
-    """
-    out, until = (
-        Path(out) if scheduler is None else Path(out).absolute(),
-        stage_of(until),
-    )  # workers elsewhere have a current folder of their own
-    require_own(out, config)
-    require_usable(config, until, population)
-    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
-        return run_in(store, config, until, executor, progress, population)
 
 
 def run(
@@ -127,25 +68,40 @@ def run(
     *,
     until: Stage | str = Stage.REPORT,
     workers: int = 1,
+    scheduler: str | None = None,
     progress: Progress | None = None,
     **sections: Any,
 ) -> RunResult:
-    """Make a whole study into a folder, as ``kros run``.
+    """Run a whole study into a folder, as ``kros run``.
 
     Parameters
     ----------
     source : Population, Path or StudyConfig
-        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what `load_config` returns.
+        Recordings as `kros.read` and `kros.from_arrays` return them, a folder of them, or a study: a TOML file or what
+        `load_config` returns.
     out : Path or str
-        Run folder; a stage that finds its own earlier result there is skipped.
-    until, workers, progress
-        As in `run_study`.
+        Run folder; a stage whose result is there is skipped.
+    until : Stage or str
+        Last stage to run.
+    workers : int
+        Processes for maps over units. More than one needs the usual ``if __name__ == "__main__":`` guard in a script.
+    scheduler : str, optional
+        Address of a Dask scheduler, instead of processes; `out` and the recordings are in a shared folder then.
+    progress : Progress, optional
+        Told which stage runs and how far it is.
     **sections
-        Tables of a study, whose keys stand in place of its own, for example ``lifting={"functions": ["sin(100*position + phase)"]}``, or ``lifting=[...]``.
+        Tables of a study that replace keys of the study, for example ``identify={"alpha": 90}``; ``lifting`` may be a
+        list of functions.
 
     Returns
     -------
     RunResult
+
+    Raises
+    ------
+    KrosError
+        Bad input leaves no folder behind that was not there before; so does a folder of another study, or one in which
+        another run is at work.
 
     Examples
     --------
@@ -157,35 +113,42 @@ def run(
     ...     result.metrics["study"]["units"]
     2
     """
-    tables: dict[str, Any] = dict(sections)
-    if isinstance(tables.get("lifting"), list | tuple):
-        tables["lifting"] = {"functions": tables["lifting"]}
-    if not isinstance(source, Population | StudyConfig | str | Path):
-        raise ConfigError(
-            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with kros.from_arrays."
-        )
-    raw: dict[str, Any]
+    until, given = member(Stage, until, "--until"), source if isinstance(source, Population) else None
+    out = Path(out) if scheduler is None else Path(out).absolute()  # workers elsewhere have another current folder
+    config = study_of(source, out, sections)
+    require_own(out, config)
+    require_usable(config, until, given)
+    with open_run(out, config) as store, open_executor(workers, scheduler) as executor:
+        return run_in(store, config, until, executor, progress, given)
+
+
+def study_of(source: Population | StudyConfig | Path | str, out: Path, sections: Mapping[str, Any]) -> StudyConfig:
+    """Return the study of some recordings, or a study, with keys of some tables changed."""
+    base, tables = Path(), dict(sections)
     if isinstance(source, Population):
-        raw, base = {"name": Path(out).name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}, Path(out)
+        if set(tables.get("data", ())) & {"source", "reader"}:
+            raise ConfigError(
+                "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
+            )
+        raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
+        base = out
     elif isinstance(source, StudyConfig):
-        raw, base = source.dump(), Path()
+        raw = source.dump()
+    elif not isinstance(source, str | Path):
+        raise ConfigError(
+            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with "
+            "kros.from_arrays."
+        )
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
-        raw, base = (
-            {"name": Path(out).name, "data": {"source": str(source), **({} if reader is None else {"reader": reader})}},
-            Path(),
-        )
+        raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}
     else:
-        raw, base = load_config(source).dump(), Path(source).parent
+        raw = load_config(source).dump()
+    if isinstance(tables.get("lifting"), list | tuple):
+        tables["lifting"] = {"functions": tables["lifting"]}
     for name, table in tables.items():
         raw[name] = {**raw.get(name, {}), **table} if isinstance(table, Mapping) else table
-    given = source if isinstance(source, Population) else None
-    if given is not None and set(tables.get("data", ())) & {"source", "reader"}:
-        raise ConfigError(
-            "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
-        )
-    origin = str(source) if given is None else "of arrays"
-    return run_study(validate_config(raw, base, origin), out, until, workers, None, progress, given)
+    return validate_config(raw, base, str(source) if isinstance(source, str | Path) else f"for {out}")
 
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:
@@ -205,44 +168,24 @@ def run_in(
     given: Population | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
-    began = time.perf_counter()
-    context = Context(config, store, Work(executor, progress or Silent(), store.seen(code_key())), given)
+    context = Context(config, store, Work(executor, progress or Silent()), given)
     run_steps(context, STEPS, until)
-    metrics = kept_metrics(store, collect_metrics(context, until, time.perf_counter() - began))
-    return RunResult(store.folder, metrics, violations(config, metrics))
-
-
-def kept_metrics(store: Store, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Write the metrics where they are not those of an earlier run, with the time that took; return what is kept."""
-    earlier: dict[str, Any] = read_json(store.path("metrics.json")) if store.is_kept("metrics.json") else {}
-    total = earlier.get("timing_s", {}).get("total")
-    as_earlier = metrics | {"timing_s": metrics["timing_s"] | {"total": total}}
-    if as_earlier == earlier:
-        return earlier
+    metrics = collect_metrics(context, until)
     store.keep("metrics.json", metrics)
-    return metrics
-
-
-def stage_of(name: Stage | str) -> Stage:
-    """Return a stage by its name."""
-    try:
-        return Stage(name)
-    except ValueError as error:
-        raise ConfigError(
-            f"Stage {name!r}: is unknown; known are {', '.join(stage.value for stage in Stage)}."
-        ) from error
+    store.sweep()
+    return RunResult(store.folder, metrics, violations(config, metrics))
 
 
 def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
     """Return the requirements of the study that its result does not meet."""
-    found = []
+    unmet = []
     deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
     if config.require.robust and (deployed.get("status") == "failed" or not is_robust(deployed)):
         reason = deployed.get("reason", "none was computed")
-        found.append(
+        unmet.append(
             f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})"
         )
     flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]
     if config.require.no_outliers and flagged:
-        found.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
-    return tuple(found)
+        unmet.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
+    return tuple(unmet)

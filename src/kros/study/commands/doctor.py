@@ -19,7 +19,8 @@ _OPTIONAL = {
 def diagnose() -> list[str]:
     """Return lines for people."""
     lines = [
-        f"kros {_version('kros') or 'not installed as a package'}   Python {platform.python_version()} on {platform.platform(terse=True)}"
+        f"kros {_version('kros') or 'not installed as a package'}   Python {platform.python_version()} on "
+        f"{platform.platform(terse=True)}"
     ]
     lines += [f"  {name:<16} {_version(name) or 'MISSING: install kros again'}" for name in _REQUIRED]
     lines.append("optional")

@@ -46,9 +46,11 @@ def export_run(
         loads = {
             f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")
         }
-        if observer not in (*names, *loads):
+        known = (*names, *loads)
+        if observer not in known:
             raise ConfigError(
-                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, (*names, *loads)) or ';'} known are {', '.join((*names, *loads))}."
+                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, known) or ';'} "
+                f"known are {', '.join(known)}."
             )
         path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
         chosen, name = Observer.load(path), name or identifier(config.name)
@@ -91,11 +93,12 @@ def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut |
 
 def numerical_error(folder: Path) -> str:
     """Return in words what an export's manifest says of it."""
-    found = read_json(folder / "manifest.json")["numerical_error"]
-    if found is None:
+    error = read_json(folder / "manifest.json")["numerical_error"]
+    if error is None:
         return "numerical error: not measured"
-    loss = ", ".join(f"{name} {value:+.3f} %" for name, value in found["loss_percent"].items() if value is not None)
-    return f"numerical error on {found['samples']} held-out samples: {found['difference']:.0e} of the estimates' size; estimation errors {loss}"
+    loss = ", ".join(f"{name} {value:+.3f} %" for name, value in error["loss_percent"].items() if value is not None)
+    size = f"{error['difference']:.0e} of the estimates' size"
+    return f"numerical error on {error['samples']} held-out samples: {size}; estimation errors {loss}"
 
 
 def identifier(text: str) -> str:

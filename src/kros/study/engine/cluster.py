@@ -1,12 +1,14 @@
-"""Maps over units on a Dask cluster: the same code as here, one task at a time in a worker process, with one thread for linear algebra.
+"""Maps over units on a Dask cluster: the same code, one task at a time in a worker, one thread for linear algebra.
 
-Sums of a matrix product are ordered by the number of its threads, so that results have the same bytes only where all workers use the same number. A
-worker's environment is its own, and was read when its libraries were loaded: threads are set in the running process, around every task.
+The order of the sums in a matrix product depends on the number of threads, so results have the same bytes only where
+all workers use the same number. Libraries read the environment when they are loaded: threads are set in the running
+process, around every task.
 """
 
 from __future__ import annotations
 
 import logging
+import os
 import socket
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,13 +20,17 @@ from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError, MissingDependencyError
 from .store import code_key
-from .threads import single_threaded
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_BATCHES = 1024  # of a map, and
-_LARGEST = 1000  # tasks in one of them: the scheduler spends about a millisecond on a batch, whatever is in it
+_BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
 _ALONE = Lock()
+_LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
+_GIVEN_UP = (
+    "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
+    "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
+)
 
 
 class DaskExecutor:
@@ -43,7 +49,7 @@ class DaskExecutor:
         try:
             futures = self._client.map(partial(run_batch, code_key(), function), batches, pure=False)
         except ClosedClientError as error:
-            raise self._lost() from error
+            raise self._error(_LOST) from error
         return self._results(deque(futures))
 
     def _results(self, futures: deque[Any]) -> Iterator[Any]:
@@ -54,43 +60,49 @@ class DaskExecutor:
             while futures:
                 yield from futures.popleft().result()
         except KilledWorker as error:
-            raise KrosError(
-                f"Dask scheduler {self._address}: one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
-                "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
-            ) from error
+            raise self._error(_GIVEN_UP) from error
         except CancelledError as error:
-            raise self._lost() from error
+            raise self._error(_LOST) from error
         except (ImportError, RuntimeError) as error:
             missing = error if isinstance(error, ImportError) else error.__cause__
             if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
                 raise
-            raise KrosError(
-                f"Dask scheduler {self._address}: there or on a worker a package is not installed ({missing}); install the same kros[dask] on all of them."
+            raise self._error(
+                f"there or on a worker a package is not installed ({missing}); install kros[dask]."
             ) from error
 
-    def _lost(self) -> KrosError:
-        return KrosError(
-            f"Dask scheduler {self._address}: the connection was lost, and what was not finished there is gone. "
-            "Start a scheduler and workers again; the same command goes on where this one ended."
-        )
+    def _error(self, text: str) -> KrosError:
+        return KrosError(f"Dask scheduler {self._address}: {text}")
 
 
 def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
     """In a worker: run a batch of tasks, while no other one runs in this process."""
     from threadpoolctl import threadpool_limits
 
+    worker = f"Dask worker on {socket.gethostname()}"
     if code_key() != key:
-        raise KrosError(
-            f"Dask worker on {socket.gethostname()}: its kros is not the one that runs the study; install the same version on every worker."
-        )
+        raise KrosError(f"{worker}: its kros is not that of the study; install the same version on every worker.")
     with _ALONE, single_threaded(), threadpool_limits(1):
         try:
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
             raise KrosError(
-                f"Dask worker on {socket.gethostname()}: finds no {error.filename}; recordings and run folder must be in a "
-                "shared folder, which has the same path on every worker."
+                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, which has the "
+                "same path on every worker."
             ) from error
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let processes that start now, and libraries for linear algebra that are loaded now, use one thread."""
+    saved = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
 
 
 @contextmanager
@@ -109,21 +121,18 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); start one, or name its address."
+            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); correct the address."
         ) from error
     threads = client.nthreads()
     if not threads:
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
     if any(n > 1 for n in threads.values()):
-        log.warning(
-            "Dask scheduler %s: workers of several threads run one task at a time; start them with --nthreads 1.",
-            address,
-        )
-    told = logging.getLogger("distributed.client")
-    level = told.level
-    told.setLevel(logging.CRITICAL)  # what it says of a lost connection is said by an error here
+        log.warning("Dask scheduler %s: workers run one task at a time; start them with --nthreads 1.", address)
+    messages = logging.getLogger("distributed.client")
+    level = messages.level
+    messages.setLevel(logging.CRITICAL)  # a lost connection is an error here
     try:
         with client:
             yield DaskExecutor(client, address)
     finally:
-        told.setLevel(level)
+        messages.setLevel(level)

@@ -1,4 +1,4 @@
-"""What every stage gets: the study, its run folder, an executor and somebody to tell about progress."""
+"""What every stage gets: the study, its run folder, an executor and a progress listener."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
 """Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes.
 
-Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, by whatever ended this process too.
+Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, however
+this process ended.
 """
 
 from __future__ import annotations
@@ -8,57 +9,55 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
 from ...core.memory import keep_freed_memory
 from ...core.work import Executor, SerialExecutor
-from .cluster import open_dask
-from .threads import single_threaded
+from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")
-_CHUNKS = 128  # of a map of many tasks, which are small: handing each out by itself costs the parent as much as a tenth of the work
+_CHUNKS = 128  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 
+@dataclass(frozen=True)
 class ProcessExecutor:
     """Runs tasks in worker processes, each with a single BLAS thread."""
 
-    def __init__(self, pool: Any) -> None:
-        self._pool = pool
+    pool: Any
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
+        """Yield results in the order of the tasks, whose work begins at once."""
         tasks = list(tasks)
-        return _results(self._pool.map(function, tasks, chunksize=max(1, len(tasks) // _CHUNKS)))
+        return _results(self.pool.map(function, tasks, chunksize=max(1, len(tasks) // _CHUNKS)))
 
 
-def _results(found: Iterator[T]) -> Iterator[T]:
-    """Yield results of a pool, whose work has begun."""
+def _results(results: Iterator[T]) -> Iterator[T]:
     from concurrent.futures.process import BrokenProcessPool
 
     try:
-        yield from found
+        yield from results
     except BrokenProcessPool as error:
         raise KrosError(
-            'A worker process ended: memory ran out, or a script that asks for workers has no `if __name__ == "__main__":` around what it does. '
-            "Run again with fewer workers, or add that line."
+            "A worker process ended: memory ran out, or a script that asks for workers has no "
+            '`if __name__ == "__main__":` around what it does. Run again with fewer workers, or add that line.'
         ) from error
 
 
 @contextmanager
 def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Executor]:
     """Open the executor that fits: Dask for a scheduler's address, processes for more than one worker."""
+    if workers < 1:
+        raise ConfigError(f"--workers {workers}: at least 1 is needed.")
     if scheduler is not None:
         with open_dask(scheduler) as executor:
             yield executor
-        return
-    if workers < 1:
-        raise ConfigError(f"--workers {workers}: at least 1 is needed.")
-    if workers == 1:
+    elif workers == 1:
         yield SerialExecutor()
-        return
-    with single_threaded(), _pool(workers) as pool:
-        yield ProcessExecutor(pool)
+    else:
+        with single_threaded(), _pool(workers) as pool:
+            yield ProcessExecutor(pool)
 
 
 @contextmanager
@@ -80,7 +79,7 @@ def _pool(workers: int) -> Iterator[Any]:
 
 
 def _begin(pipe: Any) -> None:
-    """In a worker: end as soon as the other end of a pipe is closed; an interrupt from the keyboard is the parent's to handle."""
+    """In a worker: end when the other end of a pipe is closed; the parent handles interrupts from the keyboard."""
     import signal
     from threading import Thread
 

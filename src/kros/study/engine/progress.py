@@ -5,19 +5,17 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
 from threading import Event, Lock, Thread
 from typing import Any
 
 from ...core.work import Progress, Silent
 
-EVERY_S = 10.0  # without a line, after which people wonder whether anything happens
-
 
 class Lines:
-    """One line a finished stage, and one every ten seconds where nothing else is said."""
+    """One line a finished stage, and one every ten seconds where there is no other."""
 
-    def __init__(self, every_s: float = EVERY_S) -> None:
+    def __init__(self, every_s: float = 10.0) -> None:
         self._every_s, self._lock, self._over = every_s, Lock(), Event()
         self._stage, self._done, self._began = "", 0, 0.0
         self._total: int | None = None
@@ -59,7 +57,7 @@ class Lines:
 
     def _say(self, line: str) -> None:
         self._said = time.monotonic()
-        with suppress(OSError, ValueError):  # nobody may be listening any more
+        with suppress(OSError, ValueError):  # the reader may be gone
             sys.stderr.write(f"{line}\n")
             sys.stderr.flush()
 
@@ -97,11 +95,8 @@ def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     if quiet or asks:
         yield Silent()
     elif not sys.stderr.isatty():
-        lines = Lines()
-        try:
+        with closing(Lines()) as lines:
             yield lines
-        finally:
-            lines.close()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn

@@ -9,25 +9,26 @@ from typing import Any
 
 from ...core.artifacts import read_json
 from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.files import TEMPORARY
 from ...core.locks import locked
 from ..config import Stage, StudyConfig, stored_config
-from .store import BOOKKEEPING, Store
+from .store import Store
 
 STUDY = "study.json"
 
 
 def require_own(out: Path, config: StudyConfig) -> bool:
-    """Refuse a folder that is not this study's: one with the same name and recordings; tell whether it is new or empty."""
+    """Refuse a folder of another study, by name and recordings; return whether the folder is new or empty."""
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Output {out}: is a file; name a folder.")
-    if not out.exists() or not {p.name for p in out.iterdir()} - BOOKKEEPING:
+    if not out.exists() or all(path.name.startswith(TEMPORARY) for path in out.iterdir()):
         return True
     if not (out / STUDY).exists():
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
-    found, own = _identity(_read_study(out)), _identity(config.dump())
-    if found != own:
+    there, this = _identity(_read_study(out)), _identity(config.dump())
+    if there != this:
         raise ConfigError(
-            f"Output {out}: holds the study {found[0]!r} of {found[1]}, and this is {own[0]!r} of {own[1]}; "
+            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; "
             "name another folder, or remove this one if it is not needed any more."
         )
     return False
@@ -41,12 +42,12 @@ def _identity(study: dict[str, Any]) -> tuple[str, str]:
 
 def _read_study(folder: Path) -> dict[str, Any]:
     try:
-        found = read_json(folder / STUDY)
+        content = read_json(folder / STUDY)
     except DataError as error:
         raise ConfigError(f"Run {folder}: its {STUDY} cannot be read ({error}); name another folder.") from error
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise ConfigError(f"Run {folder}: its {STUDY} holds no study; name another folder.")
-    return found
+    return content
 
 
 @contextmanager
@@ -66,8 +67,6 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
                 if fresh and store.record(Stage.READ) is None:
                     store.remove()
                 raise
-            finally:
-                store.tidy()
     finally:
         with suppress(OSError):  # it is not empty, as a rule
             for folder in above:
@@ -76,7 +75,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
 
 @contextmanager
 def open_finished(folder: Path, *stages: Stage, alone: bool = False) -> Iterator[tuple[StudyConfig, Store]]:
-    """Open a run for reading while no other process writes there, and make sure that some stages' files are as they left them."""
+    """Open a run for reading while no other process writes there; the files of some stages are as they were written."""
     folder = Path(folder)
     load_run(folder)
     with locked(folder, shared=not alone):

@@ -1,116 +1,113 @@
-"""Steps of a study: run in order, skipped where nothing has changed, resumed where a run was interrupted."""
+"""Steps of a study: run in order, skipped where the store has their artefact, so an interrupted run resumes."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import sha256
+from pathlib import Path
 
 import numpy as np
 
+from ...core.results import Results
+from ...core.store import digest_of
 from ...data.checks import NonFiniteError
 from ...data.population import EpisodeKey, Population
 from ..config import Stage, StudyConfig
 from .context import Context
-from .store import code_key, hash_of, source_key
+from .store import code_key
 
 log = logging.getLogger(__name__)
 
 
-def always(config: StudyConfig) -> bool:
-    """Tell that a stage is part of every study."""
-    return True
-
-
 @dataclass(frozen=True)
 class StageStep:
-    """One stage: what it does, which sections of the study, or ``section.key``, it depends on beside the stages before it, and which studies have it."""
+    """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
 
     stage: Stage
     run: Callable[[Context], None]
     sections: tuple[str, ...]
-    wanted: Callable[[StudyConfig], bool] = always
+    wanted: Callable[[StudyConfig], bool] = lambda config: True
 
 
 def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> None:
-    """Run steps up to a stage, from the first one that is not current; what later ones left goes where it is not current any more."""
-    key, ahead = code_key(), False
-    try:
-        for position, step in enumerate(steps):
-            if not step.wanted(context.config):
-                context.store.erase(step.stage)
-            elif not ahead:
-                key = _run_step(context, steps[position:], key)
-            elif context.store.is_current(step.stage, own := _key(context, step, key)):
-                key = _next_key(context, step.stage, own)
-            else:
-                _outdate(context, steps[position:])
-                break
-            ahead = ahead or step.stage is until
-        context.store.keep("study.json", context.config.dump())
-    finally:
-        context.store.tidy()
-
-
-def _run_step(context: Context, steps: Sequence[StageStep], upstream: str) -> str:
-    """Run the first of some steps, or find it done; return what the next one depends on."""
-    stage = steps[0].stage
-    key = _key(context, steps[0], upstream)
-    if context.store.is_current(stage, key):
-        record = context.store.record(stage)
-        context.work.progress.finish(stage.value, record.seconds if record is not None else 0.0, skipped=True)
-        return _next_key(context, stage, key)
-    began = time.perf_counter()
-    context.work.progress.start(stage.value, None)
-    with context.store.drafting() as draft:
-        steps[0].run(replace(context, store=draft))
-        seconds = time.perf_counter() - began
-        _outdate(context, steps)
-        draft.commit(stage, key, seconds)
-    context.work.progress.finish(stage.value, seconds, skipped=False)
-    log.info("%s: %.2f s", stage.value, seconds)
-    return _next_key(context, stage, key)
-
-
-def _next_key(context: Context, stage: Stage, key: str) -> str:
-    return hash_of([key, context.store.output_key(stage)])
-
-
-def _outdate(context: Context, steps: Sequence[StageStep]) -> None:
-    """Remove what does not follow from the study any more; from here on the run folder is that of the study as it is now."""
-    context.store.discard("metrics.json")
-    for step in steps:
-        if step.wanted(context.config):
-            context.store.clear(step.stage)
-        else:
-            context.store.erase(step.stage)
+    """Run steps up to a stage; what later ones left goes where it does not follow from the study any more."""
+    digests = stage_digests(context, steps)
+    stages = [step.stage for step in steps]
+    for step in steps[: stages.index(until) + 1]:
+        if step.stage in digests:
+            _run_step(context, step, digests, stages)
+    _outdate(context, digests, stages)
     context.store.keep("study.json", context.config.dump())
 
 
-def _key(context: Context, step: StageStep, upstream: str) -> str:
-    dumped = context.config.dump()
-    dumped |= {
-        f"{section}.{key}": value
-        for section, table in dumped.items()
-        if isinstance(table, dict)
-        for key, value in table.items()
-    }
-    inputs = _inputs_key(context) if step.stage is Stage.READ else ""
-    return hash_of([upstream, inputs, {name: dumped[name] for name in step.sections}])
+def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
+    """Run a step, or find it done."""
+    store, digest = context.store, digests[step.stage]
+    artefact, record = store.stored(digest), store.record(step.stage)
+    if artefact is not None:
+        if record is None or record.digest != digest:
+            _outdate(context, digests, stages)
+        store.add(step.stage, artefact)
+        context.work.progress.finish(step.stage, artefact.seconds, skipped=True)
+        return
+    began = time.perf_counter()
+    context.work.progress.start(step.stage, None)
+    with store.drafting() as draft:
+        results = Results(store.artefacts.folder, code_key())
+        step.run(replace(context, store=draft, work=replace(context.work, results=results)))
+        seconds = time.perf_counter() - began
+        store.discard("metrics.json")
+        _outdate(context, digests, stages)
+        draft.commit(step.stage, digest, seconds, results.used)
+    context.work.progress.finish(step.stage, seconds, skipped=False)
+    log.info("%s: %.2f s", step.stage, seconds)
 
 
-def _inputs_key(context: Context) -> str:
-    given = context.given
-    if given is None:
-        return source_key(context.config.data.source)
-    declared = repr((given.columns, given.sample_period_s, given.units, sorted(given.metadata.items())))
-    return hash_of([declared, [[str(k), _digest(given, k)] for k in given.episodes]])
+def _outdate(context: Context, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
+    """Remove what does not follow from the study any more; the run folder is that of the study as it is now."""
+    store, manifest = context.store, context.store.manifest
+    outdated = [stage for stage in stages if stage in manifest and manifest[stage].digest != digests.get(stage)]
+    unwanted = [run for stage in stages if stage not in digests for run in store.runs(stage)]
+    if outdated or unwanted:
+        store.discard("metrics.json")
+        store.drop(*outdated)
+        for run in unwanted:
+            run.remove()
+        store.keep("study.json", context.config.dump())
+
+
+def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
+    """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
+    tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    for step in steps:
+        if step.wanted(context.config):
+            inputs = inputs_digest(context) if step.stage is Stage.READ else ""
+            digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
+            digests[step.stage] = digest
+    return digests
+
+
+def _part(tables: Mapping[str, Mapping[str, object]], name: str) -> object:
+    """Return a section of a study, or a ``section.key``."""
+    section, _, key = name.partition(".")
+    return tables[section][key] if key else tables[section]
+
+
+def inputs_digest(context: Context) -> str:
+    """Return a digest of all recordings: files by path, size and time, arrays by their content."""
+    given, source = context.given, context.config.data.source
+    if given is not None:
+        declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
+        return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
+    return digest_of([(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files])
 
 
 def _digest(given: Population, key: EpisodeKey) -> str:
-    """Return a digest of an episode; of one that is not finite, what is said of it: it is dropped, or an error."""
+    """Return a digest of an episode; of one that is not finite, the message: it is dropped, or an error."""
     try:
         return sha256(np.ascontiguousarray(given.source(key)).tobytes()).hexdigest()
     except NonFiniteError as error:

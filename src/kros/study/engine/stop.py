@@ -1,4 +1,4 @@
-"""Commands that end cleanly when they are told to stop."""
+"""Commands that end cleanly after a signal to stop."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
 
-_TOLD = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
+_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class Stopped(KeyboardInterrupt):
-    """The process was told to stop by a signal, whose number is `signal`."""
+    """The process got a signal to stop."""
 
     def __init__(self, number: int) -> None:
         self.signal = signal.Signals(number)
@@ -21,11 +21,11 @@ class Stopped(KeyboardInterrupt):
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Raise `Stopped` where the process is told to stop, so that what is half done goes as it does after an error."""
+    """Raise `Stopped` at a signal to stop, so that what is half done goes as it does after an error."""
     if current_thread() is not main_thread():
         yield
         return
-    mine = [number for number in _TOLD if signal.getsignal(number) is signal.SIG_DFL]
+    mine = [number for number in _SIGNALS if signal.getsignal(number) is signal.SIG_DFL]
 
     def stop(number: int, frame: FrameType | None) -> None:
         for other in mine:

@@ -30,7 +30,6 @@ from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import RequireConfig, Stage, StudyConfig
 from ..engine.context import Context
-from ..engine.seen import KnownResults
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
 from . import calibrate
@@ -114,14 +113,8 @@ def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
-    known = (
-        whole.work.seen.read_only() if isinstance(whole.work.seen, KnownResults) else None
-    )  # factors of the same episodes are the same
-    context = Context(
-        without(whole, held),
-        whole.store.nested(FOLDER, str(number)),
-        replace(whole.work, progress=progress, seen=known),
-    )
+    store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
+    context = Context(without(whole, held), store, replace(whole.work, progress=progress))
     steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)

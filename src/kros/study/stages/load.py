@@ -159,7 +159,7 @@ class LoadStudy:
         """Return the declared load, in units of current, zero in other conditions."""
         config, angle = self.config, self.places[0]
         torque = known_load(
-            batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, config.angle_rad, REAL_HZ
+            batch.states[..., angle], self.dt, float(config.moment or 0.0), config.inertia, corner_hz=REAL_HZ
         )
         return np.where([k.condition == config.condition for k in batch.keys], torque, 0.0)
 

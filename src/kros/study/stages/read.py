@@ -90,8 +90,9 @@ def run(context: Context) -> None:
         context.work,
         reserve,
         earlier,
-        context.store.told,
-        FEWEST_SAMPLES + 1 + resolve_lifting(config.lifting, config.calibrate, population, config.split.test).history,
+        fewest=FEWEST_SAMPLES
+        + 1
+        + resolve_lifting(config.lifting, config.calibrate, population, config.split.test).history,
     )
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")

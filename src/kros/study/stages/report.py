@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 
 from ...core.artifacts import read_json
+from ...core.store import digest_of
 from ...core.work import Progress
 from ..config import Stage
 from ..engine.context import Context
@@ -22,7 +23,7 @@ def run(context: Context) -> None:
     from ...report import render
     from ..metrics import collect_metrics
 
-    metrics = collect_metrics(context, Stage.LEFT_OUT, None)
+    metrics = collect_metrics(context, Stage.LEFT_OUT)
     render(context.store.folder, metrics, partial(context.work.map, "report"), context.store.draft(REPORT))
 
 
@@ -38,8 +39,9 @@ def render_run(folder: Path, workers: int = 1) -> Path:
     ):
         render(store.folder, read_json(store.path("metrics.json")), executor.map, draft.draft(REPORT))
         record = store.record(Stage.REPORT)
-        key, seconds = (record.key, record.seconds) if record is not None else ("", time.perf_counter() - began)
-        draft.commit(Stage.REPORT, key, seconds)
+        digest = digest_of(REPORT, [artefact.digest for artefact in store.manifest.values()])
+        digest, seconds = (record.digest, record.seconds) if record else (digest, time.perf_counter() - began)
+        draft.commit(Stage.REPORT, digest, seconds)
         return store.path(REPORT)
 
 

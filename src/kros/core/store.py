@@ -1,0 +1,195 @@
+"""Artefacts: folders named by the digest of all that they follow from, written beside their place and renamed into it.
+
+    <run>/store/<digest>/       what a stage wrote, and `artefact.json`, which lists it
+    <run>/store/<digest>.npz    the result of one task of a map; see `results`
+    <run>/manifest.json         the artefacts of a run; their files are at their places in the run folder too
+
+A digest is of settings, inputs and source. So what is there need not be computed, and what is computed twice is the
+same. Nothing is believed further than it can be checked: a file counts where it is as it was written, and no name leads
+out of its folder.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from pydantic import Field, NonNegativeFloat
+
+from .artifacts import CHECKSUM, check_checksum, read_json, with_checksum, write_json
+from .errors import ConfigError, DataError
+from .files import TEMPORARY, is_file
+from .settings import Settings
+
+MANIFEST, INDEX = "manifest.json", "artefact.json"
+Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
+
+
+class Artefact(Settings):
+    """Files that follow from what `digest` is of."""
+
+    digest: str = Field(pattern="^([0-9a-f]{64})?$")  # none for files that are of no stage
+    seconds: NonNegativeFloat = 0.0  # that it took
+    files: dict[str, Described] = Field(default_factory=dict)  # by name
+    runs: dict[str, str] = Field(default_factory=dict)  # digests of runs that were made with it, by folder
+    results: tuple[str, ...] = ()  # digests of the results that it was computed from
+
+    @classmethod
+    def read(cls, path: Path) -> Artefact:
+        """Read one that was written as JSON."""
+        return cls.of(_checked(path), f"Artefact {path}")
+
+    def matches(self, folder: Path, name: str) -> bool:
+        """Return whether a file is in a folder as it was written; one with its size and time is not read."""
+        path, (content, *stamp) = place(folder, name), self.files[name]
+        return is_file(path) and (_stamp(path) == tuple(stamp) or file_digest(path) == content)
+
+
+def digest_of(*content: object) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`."""
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def file_digest(path: Path) -> str:
+    """Return the SHA-256 of a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def describe(path: Path) -> Described:
+    """Return digest, size and time of a file."""
+    return file_digest(path), *_stamp(path)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def place(folder: Path, name: str) -> Path:
+    """Return the path of a file in a folder; a name that leads out of it, directly or through a link, is refused."""
+    parts = PurePosixPath(name).parts
+    if not parts or ".." in parts or "/".join(parts) != name or PureWindowsPath(name).anchor or "\0" in name:
+        raise DataError(f"Run folder {folder}: {name!r} is not the name of a file inside it.")
+    for depth in range(1, len(parts)):
+        path = folder.joinpath(*parts[:depth])
+        if path.is_symlink():
+            raise DataError(
+                f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place."
+            )
+    return folder / name
+
+
+def read_manifest(folder: Path) -> dict[str, Artefact]:
+    """Return the artefacts of a run by stage; none where there is no manifest."""
+    path = folder / MANIFEST
+    if not is_file(path):
+        return {}
+    try:
+        return {stage: Artefact.of(content, stage) for stage, content in _checked(path).items()}
+    except (ConfigError, DataError, AttributeError, TypeError) as error:
+        raise DataError(
+            f"Manifest {path}: is damaged, or of another version of kros ({error}); run the study again."
+        ) from error
+
+
+def _checked(path: Path) -> Mapping[str, object]:
+    content = read_json(path)
+    check_checksum(content, path)
+    return {key: value for key, value in content.items() if key != CHECKSUM}
+
+
+def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
+    """Write which artefacts a run has; what they were computed from stands in the store."""
+    write_json(folder / MANIFEST, with_checksum({s: a.model_dump(exclude={"results"}) for s, a in artefacts.items()}))
+
+
+def recorded_files(folder: Path) -> frozenset[str]:
+    """Return the names of all files that belong to a run."""
+    artefacts = read_manifest(folder).values()
+    inside = (
+        f"{run}/{name}"
+        for artefact in artefacts
+        for run in artefact.runs
+        for name in recorded_files(place(folder, run))
+    )
+    return frozenset(inside).union(*(artefact.files for artefact in artefacts))
+
+
+@dataclass(frozen=True)
+class ArtefactStore:
+    """A folder of artefacts."""
+
+    folder: Path
+
+    def load(self, digest: str) -> Artefact | None:
+        """Return an artefact that is there, whole."""
+        folder = self.folder / digest
+        if not is_file(folder / INDEX):
+            return None
+        try:
+            artefact = Artefact.read(folder / INDEX)
+            whole = artefact.digest == digest and all(artefact.matches(folder, name) for name in artefact.files)
+        except (ConfigError, DataError, AttributeError, TypeError):
+            return None
+        return artefact if whole else None
+
+    @contextmanager
+    def draft(self) -> Iterator[Path]:
+        """Give the path of a draft beside the artefacts; it goes where it was not put into its place."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=self.folder, ignore_cleanup_errors=True) as folder:
+            Path(folder).chmod(0o755)  # workers of a cluster may be other users
+            yield Path(folder, "draft")
+
+    def put(self, draft: Path, artefact: Artefact) -> None:
+        """Move a draft into its place; what is there, and not whole, goes."""
+        write_json(draft / INDEX, with_checksum(artefact.model_dump()))
+        target = self.folder / artefact.digest
+        if target.exists():
+            target.replace(draft.with_name("old"))
+        draft.replace(target)
+
+    def link(self, artefact: Artefact, name: str, folder: Path) -> None:
+        """Put a file of an artefact into a folder too: the same file where the file system can, else a copy."""
+        if artefact.matches(folder, name):
+            return
+        target, beside = place(folder, name), self.folder / f"{TEMPORARY}link"
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            link_or_copy(self.folder / artefact.digest / name, beside)
+            beside.replace(target)
+        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+            raise ConfigError(
+                f"Run folder {folder}: {error.filename2 or error.filename} is in the place of a result; move it away."
+            ) from error
+
+    def sweep(self, named: Collection[str]) -> None:
+        """Remove what is not named: artefacts, results, drafts of processes that were killed."""
+        for path in self.folder.iterdir() if self.folder.is_dir() else ():
+            ours = len(path.stem) == hashlib.sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
+            if ours and path.stem not in named:
+                remove(path)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Put a file in a second place, with its times."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or a folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

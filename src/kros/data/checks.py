@@ -7,6 +7,7 @@ import math
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
@@ -25,10 +26,7 @@ Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
 
 ON_NAN = ("error", "drop_episode")
 MIN_SAMPLES = 3  # two consecutive states and one more
-_BEYOND, _LARGEST = (
-    1e3,
-    1e100,
-)  # times the range of 98 % of the samples; the largest number where these stand still, whose square is a number
+WILD = 1e3  # times the size of a channel, from which on a sample is wild
 _ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
@@ -49,10 +47,8 @@ def check_episode(
         raise DataError(
             f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
         )
-    if not gaps:
-        if not usable(values).all():
-            check_finite(values, key, channels)
-        check_range(values, key, channels)
+    if not gaps and not usable(values).all():
+        check_finite(values, key, channels)
     _check_moving(values, key, channels)
 
 
@@ -95,26 +91,59 @@ def check_finite(
             )
 
 
-def check_range(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
-    """Refuse a sample that is farther from the median than a thousand times the range from the 1st to the 99th percentile."""
-    for i, channel in enumerate(channels):
-        finite = np.flatnonzero(np.isfinite(values[:, i]))
-        column = values[finite, i]
-        if len(column) < MIN_SAMPLES:
-            continue
-        few = np.sort(column[:: max(1, len(column) // 64)])
-        with np.errstate(over="ignore", invalid="ignore"):
-            if np.abs(column[[column.argmin(), column.argmax()]] - few[len(few) // 2]).max() <= _BEYOND * (
-                few[-2] - few[1]
-            ):
+@dataclass(frozen=True, eq=False)
+class _Suspects:
+    """Samples of a channel that are far from the others of their episode."""
+
+    key: EpisodeKey
+    channel: int
+    samples: npt.NDArray[np.int64]
+    values: npt.NDArray[np.float64]
+    middle: float  # median of the episode
+    low: float
+    high: float  # 98 % of the samples are between them
+
+    def beyond(self, range_elsewhere: float) -> npt.NDArray[np.int64]:
+        """Return which are wild: |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere)."""
+        size = max(self.high - self.low, abs(self.low), abs(self.high), range_elsewhere)
+        return np.flatnonzero(np.abs(self.values - self.middle) > WILD * size) if size > 0 else np.zeros(0, np.int64)
+
+
+class WildWatch:
+    """Notice samples that are wild beside their episode and beside the other episodes of one unit and condition.
+
+    A channel may rest in 99 % of an episode and then move (steps, flags, saturation): its size is that of its values, and what it moves by
+    in half of the other episodes.
+    """
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        self._channels = channels
+        self._ranges: dict[EpisodeKey, npt.NDArray[np.float64]] = {}
+        self._suspects: list[_Suspects] = []
+
+    def add(self, key: EpisodeKey, values: npt.NDArray[np.float64]) -> None:
+        """Look at one more episode, all of whose samples are usable."""
+        self._ranges[key] = np.ptp(values, axis=0)
+        for i, column in enumerate(values.T):
+            few = np.sort(column[:: max(1, len(column) // 64)])
+            if self._ranges[key][i] <= WILD * (few[-2] - few[1]):
                 continue  # a few samples show already that the channel moves as much
             low, middle, high = np.percentile(column, (1, 50, 99))
-            bad = np.flatnonzero(np.abs(column - middle) > (_BEYOND * (high - low) if high > low else _LARGEST))
-        if bad.size:
-            raise DataError(
-                f"{title(key)}: channel {channel.name!r} is {column[bad[0]]:g} at sample {finite[bad[0]]}, and 98 % of its samples are "
-                f"from {low:g} to {high:g} ({bad.size} such samples); fix the source, or leave the episode out."
-            )
+            far = np.flatnonzero(np.abs(column - middle) > WILD * (high - low))
+            if far.size:
+                self._suspects.append(_Suspects(key, i, far, column[far], middle, low, high))
+
+    def find(self) -> Iterator[tuple[EpisodeKey, str]]:
+        """Yield the episodes with wild samples, and what is wrong with them."""
+        for s in self._suspects:
+            others = sorted(r[s.channel] for key, r in self._ranges.items() if key != s.key)
+            wild = s.beyond(others[(len(others) - 1) // 2] if others else 0.0)
+            if wild.size:
+                yield (
+                    s.key,
+                    f"channel {self._channels[s.channel].name!r} is {s.values[wild[0]]:g} at sample {s.samples[wild[0]]}, and 98 % of its "
+                    f"samples are from {s.low:g} to {s.high:g} ({wild.size} such samples)",
+                )
 
 
 def _kind(value: float) -> str:
@@ -262,7 +291,7 @@ def usable_episodes(
     if on_nan not in ON_NAN:
         raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
     columns = population.columns
-    watch = RestWatch(columns)
+    watch, wild = RestWatch(columns), WildWatch(columns)
     key = None
     for key in keys:
         try:
@@ -274,8 +303,11 @@ def usable_episodes(
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(values)
+        wild.add(key, values)
         if look is not None:
             look(key, values)
         yield key, values, digest_of(values)
+    for episode, problem in wild.find():
+        raise DataError(f"{title(episode)}: {problem}; fix the source, or leave the episode out.")
     if key is not None:
         watch.check(key.unit, key.condition)

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
-from .checks import check_episode, check_period, check_range, check_structure
+from .checks import check_episode, check_period, check_structure
 from .population import (
     Channel,
     EpisodeKey,
@@ -59,8 +59,6 @@ class PreparedSource:
         if not any(step.makes_even for step in self.steps):
             where = self.recordings.where(key) if isinstance(self.recordings, Recordings) else ""
             check_even(recording, self.period_s, self.reference, where)
-        if self.steps and not self.gaps:
-            check_range(recording.values, key, self.channels)  # before steps spread a wrong sample
         channels, period = self.channels, self.period_s
         for step in self.steps:
             recording = step.apply(recording, channels, period)

@@ -13,11 +13,11 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...core.work import Work
 from ..alerts import period_alerts
-from ..checks import MIN_SAMPLES, check_range, is_constant
+from ..checks import MIN_SAMPLES, WildWatch, is_constant
 from ..copies import copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
-from ..recording import TIME_TOLERANCE, title, usable
+from ..recording import TIME_TOLERANCE, Recording, title, usable
 
 Array = npt.NDArray[np.float64]
 GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
@@ -111,29 +111,21 @@ def examine(population: Population, work: Work | None = None) -> Examined:
 def _look(population: Population) -> list[EpisodeLook]:
     """Look at the episodes of one unit and condition, in a worker."""
     source: Any = population.source
-    recordings = source.recordings if isinstance(source, PreparedSource) else None
-    found = []
-    for i, key in enumerate(population.episodes):
+    looks, wild = {}, WildWatch(population.columns)
+    for key in population.episodes:
         try:
-            if recordings is None:
-                found.append(
-                    _looked(key, population.source(key), None, population.columns, population.sample_period_s, i == 0)
-                )
-            else:
-                recording = recordings(key)
-                found.append(
-                    _looked(
-                        key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0
-                    )
-                )
+            recording = source.recordings(key) if isinstance(source, PreparedSource) else Recording(key, source(key))
+            looks[key] = _looked(recording, population.columns, population.sample_period_s, not looks)
+            if not looks[key].wrong and not looks[key].nan:
+                wild.add(key, recording.values)
         except DataError as error:
-            found.append(EpisodeLook(key, str(error)))
-    return found
+            looks[key] = EpisodeLook(key, str(error))
+    return list((looks | {key: EpisodeLook(key, problem) for key, problem in wild.find()}).values())
 
 
-def _looked(
-    key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool
-) -> EpisodeLook:
+def _looked(recording: Recording, channels: Sequence[Channel], period_s: float, first: bool) -> EpisodeLook:
+    """Look at one episode as recorded."""
+    key, values, time = recording.key, recording.values, recording.time_s
     n = len(values)
     if n < MIN_SAMPLES:
         return EpisodeLook(key, f"has {n} samples", n_samples=n)
@@ -160,7 +152,6 @@ def _looked(
         return EpisodeLook(
             key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap
         )
-    check_range(values, key, channels)
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
     if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
         stuck = channels[still[0]].name

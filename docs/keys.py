@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kros.core.settings import Settings
 from kros.data.readers.csv_mapping import ChannelMapping, CsvMapping, UnitMapping
-from kros.data.steps.parsing import STEPS
+from kros.data.steps import STEPS
 from kros.study.config import StudyConfig
 
 LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}

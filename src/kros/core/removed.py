@@ -138,6 +138,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "key injection.",
         "synthesis.injection",
     ),
+    (
+        "TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).",
+        "kros.data.TrueChannel",
+    ),
 )
 
 

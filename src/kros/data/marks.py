@@ -1,6 +1,7 @@
-"""Marks of recordings: what the samples of an episode follow from, told without reading them.
+"""Marks of recordings: what the samples of an episode follow from, without reading them.
 
-An episode follows from its file, known by path, size and time as whole runs are, from where in the file it is, and from how it is read and prepared.
+An episode follows from its file, known by path, size and time as whole runs are, from where in the file it is, and from how
+it is read and prepared.
 """
 
 from __future__ import annotations
@@ -23,37 +24,28 @@ def mark_of(*content: Any) -> str:
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return a mark of every group of episodes."""
+    """Return a mark of every group of episodes; None where the recordings are in no file."""
     about: list[Any] = []
     while isinstance(source, PreparedSource | EvenRecordings):
         if isinstance(source, PreparedSource):
             about.append((source.channels, source.period_s, source.steps, source.gaps))
-            source = source.recordings
-        else:
-            source = source.source
+        source = source.recordings if isinstance(source, PreparedSource) else source.source
     if not isinstance(source, Recordings):
         return [None for _ in groups]
-    about.append(
-        (
-            type(source).__name__,
-            [(f.name, getattr(source, f.name)) for f in dataclasses.fields(source) if f.name != "places"],
-        )
-    )
-    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, declared)
-    return [_mark(source, keys, how, stamp) for keys in groups]
+    settings = [(f.name, getattr(source, f.name)) for f in dataclasses.fields(source) if f.name != "places"]
+    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, type(source).__name__, settings, declared)
 
+    def mark(keys: Sequence[EpisodeKey]) -> str | None:
+        files = [source.file(source.places[key]) for key in keys]
+        rows = [
+            (key, source.places[key], stamp(file)) for key, file in zip(keys, files, strict=True) if file is not None
+        ]
+        return mark_of(how, rows) if len(rows) == len(keys) else None
 
-def _mark(source: Recordings, keys: Sequence[EpisodeKey], how: str, stamp: Any) -> str | None:
-    rows = []
-    for key in keys:
-        place = source.places[key]
-        file = source.file(place)
-        if file is None:
-            return None
-        rows.append((key, place, stamp(file)))
-    return mark_of(how, rows)
+    return [mark(keys) for keys in groups]
 
 
 def _stamp(file: Path) -> tuple[int, int]:
+    """Return size and time of change of a file."""
     status = file.stat()
     return status.st_size, status.st_mtime_ns

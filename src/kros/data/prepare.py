@@ -73,14 +73,7 @@ class PreparedSource:
 
 def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
     """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
-    return (
-        natural_key(key.unit),
-        key.unit,
-        natural_key(key.condition),
-        key.condition,
-        natural_key(key.episode),
-        key.episode,
-    )
+    return tuple((natural_key(name), name) for name in (key.unit, key.condition, key.episode))
 
 
 def assemble(
@@ -93,37 +86,26 @@ def assemble(
     steps: Iterable[Step] = (),
     scaling: Scalings | None = None,
 ) -> Population:
-    """Make the population that a reader found: natural order, one sampling period, steps declared, names checked."""
+    """Make the population of a reader: natural order, one sampling period, steps declared, names checked."""
     check_structure(channels, list(recordings.places))
     if channels != columns_in_order(channels):
-        raise DataError(
-            f"Channels should list states before inputs, and truths last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
-        )
+        roles = [(c.name, c.role.value) for c in channels]
+        raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
     episodes = tuple(sorted(recordings.places, key=episode_order))
     facts = {unit.id: unit for unit in units}
-    found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
-    first = episodes[0]
-    period = check_period(
-        sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population"
+    known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
+    period = estimate_period(recordings(episodes[0])) if sample_period_s is None else sample_period_s
+    period = check_period(period, "Population")
+    source = PreparedSource(recordings, channels, period, episodes[0])
+    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {})}
+    population = Population(
+        sample_period_s=period, units=known, episodes=episodes, source=source, **about, **part_columns(channels)
     )
-    source = PreparedSource(recordings, channels, period, first)
-    parts = part_columns(channels)
-    return prepare(
-        Population(
-            sample_period_s=period,
-            units=tuple(found),
-            episodes=episodes,
-            source=source,
-            metadata=dict(metadata or {}),
-            scaling=dict(scaling or {}),
-            **parts,
-        ),
-        steps,
-    )
+    return prepare(population, steps)
 
 
 def with_gaps(population: Population) -> Population:
-    """Return recordings as a machine gives them: samples that are NaN or infinite are kept, for an observer that knows what to do with them."""
+    """Return recordings as a machine gives them, with samples that are NaN or infinite, for a running observer."""
     source = population.source
     return replace(population, source=replace(source, gaps=True)) if isinstance(source, PreparedSource) else population
 
@@ -159,17 +141,12 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
         return population
     channels, period, scaling = population.columns, population.sample_period_s, population.scaling
     for step in added:
-        channels, period, scaling = (
-            step.channels_after(channels),
-            step.period_after(period),
-            step.scaling_after(scaling),
-        )
+        channels, period = step.channels_after(channels), step.period_after(period)
+        scaling = step.scaling_after(scaling)
     check_structure(channels, population.episodes)
     source = population.source
-    if isinstance(source, PreparedSource):
-        source = replace(source, steps=source.steps + added)
-    else:
-        source = PreparedSource(
-            EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added
-        )
+    if not isinstance(source, PreparedSource):
+        first, declared = population.episodes[0], (population.columns, population.sample_period_s)
+        source = PreparedSource(EvenRecordings(source), *declared, first)
+    source = replace(source, steps=source.steps + added)
     return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))

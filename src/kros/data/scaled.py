@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from .population import EpisodeKey, EpisodeSource, Population, TrueChannel, part_columns, restrict
+from .population import EpisodeKey, EpisodeSource, Population, part_columns, restrict
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +31,7 @@ class Scaled:
 
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
     """Return the population with channels divided by sizes; their units of measure are then unknown."""
-    owners = [c.of if isinstance(c, TrueChannel) else c.name for c in population.columns]
+    owners = [c.of or c.name for c in population.columns]
     factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
     columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
     return replace(population, source=Scaled(population.source, factors), **part_columns(columns))

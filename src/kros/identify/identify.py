@@ -109,7 +109,7 @@ def identify(
     asked, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
-        population, facts = survey(population, test, identify_on, on_nan, work=work)
+        population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
     known = isinstance(calibration, PhaseCalibration)
     declared = CalibrationSettings() if known else CalibrationSettings.of(calibration or {}, "Calibrate")
     found = (

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, TrueChannel, Unit
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
 from .simulated import SimulatedEpisodes, SimulatedPopulation, T
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +36,7 @@ class Batch(ABC, Generic[T]):
 
     plant: ClassVar[str]
     channels: ClassVar[tuple[Channel, ...]]
-    truths: ClassVar[tuple[TrueChannel, ...]] = ()
+    truths: ClassVar[tuple[Channel, ...]] = ()
     sample_period_s: ClassVar[float]
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
     nominal: ClassVar[Mapping[str, float]]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..data.population import Channel, Role, TrueChannel
+from ..data.population import Channel, Role
 from .batch import Batch, runge_kutta
 
 Array = npt.NDArray[np.float64]
@@ -53,7 +53,7 @@ CHANNELS = (
     Channel("voltage", Role.INPUT, "V"),
 )
 TRUTHS = tuple(
-    TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3]
+    Channel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3]
 )  # what the noisy sensors see
 
 

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ...core.choices import member
 from ...core.errors import ConfigError
 from ...data import prepare
-from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel, Unit
+from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ...data.steps import Offset, Trim
 from ..simulated import SimulatedEpisodes, SimulatedPopulation
 from .control import CURRENT_NOISE, GAINS, SAMPLE_PERIOD_S, Loop
@@ -30,7 +30,7 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
-TRUTHS = (TrueChannel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
+TRUTHS = (Channel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
 REST_SAMPLES = 1000
 # As a reader of raw recordings prepares them: offset found at rest, rest dropped; undoing the lag of the targets costs it the last sample.
 PREPARATION = (Offset("position", "target_position", 500, 1000), Trim(start=REST_SAMPLES, tail=1))

@@ -32,8 +32,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, write_parquet
+from kros.plants.batch import SimulatedEpisodes
 from kros.plants.harmonic_drive.reference import episode_reference
-from kros.plants.simulated import SimulatedEpisodes
 
 Array = npt.NDArray[np.float64]
 

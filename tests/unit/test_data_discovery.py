@@ -57,6 +57,14 @@ def test_conditions_groups_and_single_machines():
     )
     batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
     assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    seals = ["K_N_1bar.csv", "K_N_3bar.csv", "NAP310_1bar.csv", "NAP310_3bar.csv", "rig__O-ring257_1bar.csv"]
+    found = [re.search(infer_names(seals).pattern, name).groupdict() for name in seals]
+    assert [(m["unit"], m["condition"]) for m in found][1:] == [
+        ("K_N", "3bar"),
+        ("NAP310", "1bar"),
+        ("NAP310", "3bar"),
+        ("rig__O-ring257", "1bar"),
+    ]
     single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
     assert "(?P<unit>" not in single.pattern
     assert infer_names(["only.csv"]).pattern == r"^only\.csv$"

@@ -1,17 +1,8 @@
 """Preparation as declared steps: small frozen objects, applied to each episode in the order given.
 
-Each step says what it does to the channels and the sampling period (`channels_after`, `period_after`), so that a population
-can be described before anything is read, and does it to one recording at a time (`apply`). No step changes its argument.
-In TOML a step is a table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
-
-Examples
---------
->>> import numpy as np
->>> import kros
->>> population = kros.from_arrays({"a": [np.arange(6.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
->>> prepared = kros.data.prepare(population, [kros.data.steps.Trim(start=2)])
->>> len(prepared.read(prepared.keys()[0]))
-4
+Each step says what it does to the channels and the sampling period, so that a population can be described before anything
+is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a table with its
+name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
 """
 
 from __future__ import annotations
@@ -32,7 +23,7 @@ from ..core.removed import refusing
 from .checks import check_finite
 from .population import Channel, Role
 from .recording import Recording, check_increasing, estimate_period, title
-from .scaling import Scaling, Scalings, scaling_of
+from .scaling import Scalings, scaling_of
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
 __getattr__ = refusing(__name__)
@@ -48,27 +39,36 @@ class Step:
     Examples
     --------
     >>> from dataclasses import replace
-    >>> import numpy as np
     >>> import kros
     >>> class Magnitude(kros.data.steps.Step):
     ...     def apply(self, recording, channels, period_s):
     ...         return replace(recording, values=abs(recording.values))
-    >>> population = kros.from_arrays({"a": [-np.ones((3, 1))]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> positive = kros.data.prepare(population, [Magnitude()])
-    >>> positive.read(positive.keys()[0]).ravel().tolist()
-    [1.0, 1.0, 1.0]
+    >>> data = kros.from_arrays({"a": [[[-1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> kros.data.prepare(data, [Magnitude(), kros.data.steps.Trim(start=1)]).columns[0].name
+    'x'
     """
 
     step: ClassVar[str] = ""
     makes_even: ClassVar[bool] = False
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Channels that this step needs."""
+        names = getattr(self, "channels", None) or (getattr(self, "channel", None), getattr(self, "reference", None))
+        return tuple(name for name in names if name is not None)
+
+    def check(self, period_s: float) -> None:
+        """Refuse settings that cannot be."""
+
     def channels_after(self, channels: Channels) -> Channels:
         """Return the channels as this step leaves them; refuse channels that it does not fit."""
+        self.columns(self.named, channels)
         return channels
 
     def period_after(self, period_s: float) -> float:
         """Return the sampling period as this step leaves it, s."""
+        self.check(period_s)
         return period_s
 
     def scaling_after(self, scaling: Scalings) -> Scalings:
@@ -80,12 +80,11 @@ class Step:
         raise NotImplementedError
 
     def without(self, names: Collection[str]) -> Step | None:
-        """Return the step where some channels are absent: for those that are left, or None where it has nothing to do."""
-        wanted = getattr(self, "channels", None)
-        if wanted is not None:
-            left = tuple(name for name in wanted if name not in names)
-            return replace(self, channels=left) if left else None  # type: ignore[call-arg]
-        return None if {getattr(self, "channel", None), getattr(self, "reference", None)} & set(names) else self
+        """Return the step for the channels that are left without some, or None where it has nothing to do."""
+        left = tuple(name for name in self.named if name not in names)
+        if hasattr(self, "channels") and left:
+            return replace(self, channels=left)  # type: ignore[call-arg]
+        return self if left == self.named and not hasattr(self, "channels") else None
 
     def columns(self, names: Sequence[str], channels: Channels) -> list[int]:
         """Return the columns of named channels, or say which name is unknown."""
@@ -93,9 +92,7 @@ class Step:
         unknown = next((name for name in names if name not in known), None)
         if unknown is not None:
             hint = did_you_mean(unknown, known) or ";"
-            raise ConfigError(
-                f"Step {self.step!r} asks for channel {unknown!r}{hint} there are {known}; correct the name."
-            )
+            raise ConfigError(f"Step {self.step!r} asks for channel {unknown!r}{hint} there are {known}; correct it.")
         return [known.index(name) for name in names]
 
     def _require(self, condition: bool, needs: str) -> None:
@@ -109,14 +106,11 @@ class Scale(Step):
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Scale
-    >>> half_turn = {"a": [np.full((3, 1), 180.0)]}
-    >>> population = kros.from_arrays(half_turn, states=["angle"], measured=["angle"], sample_period_s=0.01)
-    >>> turned = kros.data.prepare(population, [Scale(("angle",), np.pi / 180, unit="rad")])
-    >>> turned.channels[0].unit, turned.read(turned.keys()[0]).ravel().round(3).tolist()
-    ('rad', [3.142, 3.142, 3.142])
+    >>> data = kros.from_arrays({"a": [[[180.0], [90.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> turned = kros.data.prepare(data, [kros.data.steps.Scale(("x",), 3.14159 / 180, unit="rad")])
+    >>> turned.channels[0].unit
+    'rad'
     """
 
     channels: tuple[str, ...]
@@ -124,23 +118,20 @@ class Scale(Step):
     unit: str | None = None
     step: ClassVar[str] = "scale"
 
+    def check(self, period_s: float) -> None:
+        """Refuse a factor that leaves nothing."""
+        self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
+
     def channels_after(self, channels: Channels) -> Channels:
         """Return the channels with their new unit of measure."""
-        self._require(
-            math.isfinite(self.factor) and self.factor != 0, f"a finite factor other than zero, found {self.factor}"
-        )
-        scaled = [channels[i] for i in self.columns(self.channels, channels)]
-        return tuple(
-            replace(c, unit=c.unit if self.unit is None else self.unit) if c in scaled else c for c in channels
-        )
+        self.columns(self.channels, channels)
+        scaled = self.channels if self.unit is not None else ()
+        return tuple(replace(c, unit=self.unit or "") if c.name in scaled else c for c in channels)
 
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, multiplied."""
-
-        def scaled(before: Scaling) -> Scaling:
-            return replace(before, factor=before.factor * self.factor)
-
-        return {**scaling, **{name: scaled(scaling_of(scaling, name)) for name in self.channels}}
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(s, factor=s.factor * self.factor) for name, s in before.items()}}
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with some columns multiplied."""
@@ -152,20 +143,16 @@ class Scale(Step):
 
 @dataclass(frozen=True)
 class Shift(Step):
-    """Move channels that lag the others by `lag` samples back into place.
+    """Move channels that lag the others by `lag` samples back into place; a negative `lag` is a lead.
 
-    The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut. A negative `lag`
-    moves channels that run ahead.
+    The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Shift
-    >>> arrays = {"a": [np.array([[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]])]}
-    >>> population = kros.from_arrays(arrays, states=["x", "late"], measured=["x"], sample_period_s=0.01)
-    >>> aligned = kros.data.prepare(population, [Shift(("late",), lag=1)])
-    >>> aligned.read(aligned.keys()[0]).tolist()
+    >>> names = {"states": ["x", "late"], "measured": ["x"], "sample_period_s": 0.01}
+    >>> data = kros.from_arrays({"a": [[[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]]}, **names)
+    >>> kros.data.prepare(data, [kros.data.steps.Shift(("late",), lag=1)]).read(data.keys()[0]).tolist()
     [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
     """
 
@@ -173,26 +160,17 @@ class Shift(Step):
     lag: int
     step: ClassVar[str] = "shift"
 
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels, unchanged."""
-        self.columns(self.channels, channels)
-        return channels
-
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, moved."""
-
-        def moved(before: Scaling) -> Scaling:
-            return replace(before, lag_samples=before.lag_samples + self.lag)
-
-        return {**scaling, **{name: moved(scaling_of(scaling, name)) for name in self.channels}}
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(s, lag_samples=s.lag_samples + self.lag) for name, s in before.items()}}
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the aligned recording, `abs(lag)` samples shorter."""
-        length = len(recording.values) - abs(self.lag)
+        n, length = len(recording.values), len(recording.values) - abs(self.lag)
         if length <= 0:
-            name = title(recording.key)
             raise DataError(
-                f"{name}: shifting by {self.lag} samples leaves nothing of {len(recording.values)}; leave it out."
+                f"{title(recording.key)}: shifting by {self.lag} samples leaves nothing of {n}; leave it out."
             )
         fixed, moved = max(0, -self.lag), max(0, self.lag)
         columns, rest = self.columns(self.channels, channels), recording.cut(fixed, fixed + length)
@@ -207,15 +185,12 @@ class Offset(Step):
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Offset
-    >>> target = np.arange(4.0)
-    >>> arrays = {"a": [np.column_stack([target + 0.5, target])]}
-    >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["target"], sample_period_s=0.01)
-    >>> shifted = kros.data.prepare(population, [Offset("x", "target", 0, 2)])
+    >>> names = {"states": ["x"], "inputs": ["target"], "measured": ["x"], "sample_period_s": 0.01}
+    >>> data = kros.from_arrays({"a": [[[0.5, 0.0], [1.5, 1.0], [2.5, 2.0]]]}, **names)
+    >>> shifted = kros.data.prepare(data, [kros.data.steps.Offset("x", "target", 0, 2)])
     >>> shifted.read(shifted.keys()[0])[:, 0].tolist()
-    [0.0, 1.0, 2.0, 3.0]
+    [0.0, 1.0, 2.0]
     """
 
     channel: str
@@ -224,27 +199,23 @@ class Offset(Step):
     stop: int
     step: ClassVar[str] = "offset"
 
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels, unchanged."""
-        self.columns((self.channel, self.reference), channels)
+    def check(self, period_s: float) -> None:
+        """Refuse an empty window."""
         self._require(0 <= self.start < self.stop, f"0 <= start < stop, found start = {self.start}, stop = {self.stop}")
-        return channels
 
     def scaling_after(self, scaling: Scalings) -> Scalings:
         """Return where channels come from, with the offset in words."""
-        offset = (
-            f"mean of {self.reference} - {self.channel} over samples {self.start} to {self.stop - 1} of every episode"
-        )
+        window = f"samples {self.start} to {self.stop - 1} of every episode"
+        offset = f"mean of {self.reference} - {self.channel} over {window}"
         return {**scaling, self.channel: replace(scaling_of(scaling, self.channel), offset=offset)}
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
         column, reference = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
-            raise DataError(
-                f"{title(recording.key)}: the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}, "
-                f"the episode has {len(recording.values)}; leave the episode out."
-            )
+            needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
+            found = f"the episode has {len(recording.values)}"
+            raise DataError(f"{title(recording.key)}: {needs}, {found}; leave the episode out.")
         window = recording.values[self.start : self.stop]
         check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
         values = recording.values.copy()
@@ -258,13 +229,10 @@ class Trim(Step):
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Trim
-    >>> population = kros.from_arrays({"a": [np.arange(6.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> trimmed = kros.data.prepare(population, [Trim(start=2, tail=1)])
-    >>> trimmed.read(trimmed.keys()[0]).ravel().tolist()
-    [2.0, 3.0, 4.0]
+    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> kros.data.prepare(data, [kros.data.steps.Trim(start=1, tail=1)]).source.steps
+    (Trim(start=1, stop=None, tail=1),)
     """
 
     start: int = 0
@@ -272,11 +240,10 @@ class Trim(Step):
     tail: int = 0
     step: ClassVar[str] = "trim"
 
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels, unchanged."""
+    def check(self, period_s: float) -> None:
+        """Refuse bounds in the wrong order."""
         ordered = self.stop is None or self.start < self.stop
         self._require(self.start >= 0 and self.tail >= 0 and ordered, f"0 <= start < stop and tail >= 0, found {self}")
-        return channels
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the shorter recording."""
@@ -293,9 +260,9 @@ class Trim(Step):
 class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
 
-    All channels are treated alike, so linear relations between them survive. At the same or a higher rate this is linear
-    interpolation. When the rate falls, the samples are interpolated to a grid that is an integer number of times finer, filtered
-    without delay below the new Nyquist frequency, and thinned.
+    At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid that is
+    an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All channels are
+    treated alike, so linear relations between them survive.
 
     Parameters
     ----------
@@ -307,13 +274,11 @@ class Resample(Step):
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Resample
-    >>> population = kros.from_arrays({"a": [np.arange(4.0)[:, None]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> finer = kros.data.prepare(population, [Resample(0.005)])
+    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> finer = kros.data.prepare(data, [kros.data.steps.Resample(0.005)])
     >>> finer.read(finer.keys()[0]).ravel().tolist()
-    [0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0]
+    [0.0, 0.5, 1.0, 1.5, 2.0]
     """
 
     period_s: float
@@ -331,20 +296,19 @@ class Resample(Step):
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording on the new grid, which starts at its first sample."""
-        time = recording.time_s
+        time, what = recording.time_s, f"{title(recording.key)}: resampling"
         time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        median, name = estimate_period(timed), title(recording.key)
-        gap = int(np.diff(time).argmax())
+        median, gap = estimate_period(timed), int(np.diff(time).argmax())
         longest, limit = time[gap + 1] - time[gap], 10 * median if self.max_gap_s is None else self.max_gap_s
         if longest > limit:
             bridge = f"bridge a gap of {longest:g} s after sample {gap} (allowed: {limit:g} s)"
-            raise DataError(f"{name}: resampling would {bridge}; cut the episode there, or raise max_gap_s.")
+            raise DataError(f"{what} would {bridge}; cut the episode there, or raise max_gap_s.")
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
-            make = f"to period_s = {self.period_s:g} would make {count:g} samples of {len(time)}"
-            raise DataError(f"{name}: resampling {make}; correct the period.")
+            make = f"would make {count:g} samples of {len(time)}"
+            raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
         return replace(recording, values=self.resampled(time, recording.values, median), time_s=None)
 
     def resampled(self, time_s: Float, values: Float, median_s: float) -> Float:
@@ -358,19 +322,17 @@ class Resample(Step):
 
 @dataclass(frozen=True)
 class Differentiate(Step):
-    """Add the filtered derivative of a channel as a new state.
+    """Add the derivative of a channel, low-passed at `cutoff_hz`, as a new state.
 
-    Central differences after a low-pass filter without delay: it looks ahead, so the result is for identification and
-    evaluation, never something a running observer could have measured.
+    The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a running
+    observer could have measured.
 
     Examples
     --------
-    >>> import numpy as np
     >>> import kros
-    >>> from kros.data.steps import Differentiate
-    >>> parabola = {"a": [(0.01 * np.arange(200)[:, None]) ** 2]}
-    >>> population = kros.from_arrays(parabola, states=["angle"], measured=["angle"], sample_period_s=0.01)
-    >>> with_rate = kros.data.prepare(population, [Differentiate("angle", "rate", cutoff_hz=5.0)])
+    >>> parabola = {"a": [[[(0.01 * k) ** 2] for k in range(200)]]}
+    >>> data = kros.from_arrays(parabola, states=["angle"], measured=["angle"], sample_period_s=0.01)
+    >>> with_rate = kros.data.prepare(data, [kros.data.steps.Differentiate("angle", "rate", cutoff_hz=5.0)])
     >>> with_rate.states, float(with_rate.read(with_rate.keys()[0])[100, 1].round(6))
     (('angle', 'rate'), 2.0)
     """
@@ -381,13 +343,16 @@ class Differentiate(Step):
     unit: str = ""
     step: ClassVar[str] = "differentiate"
 
+    def check(self, period_s: float) -> None:
+        """Refuse a cut-off that is not below the Nyquist frequency."""
+        bound = f"a cutoff_hz above zero and below the Nyquist frequency of {0.5 / period_s:g} Hz"
+        self._require(0 < self.cutoff_hz < 0.5 / period_s, f"{bound}, found {self.cutoff_hz}")
+
     def channels_after(self, channels: Channels) -> Channels:
         """Return the channels with the new state after the other states."""
-        self.columns((self.channel,), channels)
+        self.columns(self.named, channels)
         if self.name in [c.name for c in channels]:
-            raise ConfigError(
-                f"Step 'differentiate' would add {self.name!r}, which is there already; choose another name."
-            )
+            raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
         at = _n_states(channels)
         return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
 
@@ -395,15 +360,9 @@ class Differentiate(Step):
         """Return where channels come from: the derivative has the factor of its channel, and no column."""
         return {**scaling, self.name: replace(scaling_of(scaling, self.channel), column=None, offset="")}
 
-    def period_after(self, period_s: float) -> float:
-        """Return the sampling period, unchanged; the cut-off has to lie below half its inverse."""
-        bound = f"a cutoff_hz above zero and below the Nyquist frequency of {0.5 / period_s:g} Hz"
-        self._require(0 < self.cutoff_hz < 0.5 / period_s, f"{bound}, found {self.cutoff_hz}")
-        return period_s
-
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with one more column."""
-        smooth = lowpass(recording.values[:, self.columns((self.channel,), channels)], self.cutoff_hz * period_s)[:, 0]
+        smooth = lowpass(recording.values[:, self.columns(self.named, channels)], self.cutoff_hz * period_s)[:, 0]
         values = np.insert(recording.values, _n_states(channels), np.gradient(smooth, period_s), axis=1)
         return replace(recording, values=values)
 
@@ -413,7 +372,7 @@ def _n_states(channels: Channels) -> int:
 
 
 def lowpass(values: Float, cutoff: float) -> Float:
-    """Filter columns without delay by a windowed sinc; ends are extended by odd reflection, shape (n_samples, n_channels)."""
+    """Filter columns without delay by a windowed sinc; ends are extended by odd reflection."""
     half = min(math.ceil(4 / cutoff), len(values) - 1) if cutoff > 0 else 0
     if cutoff >= 0.5 or half < 1:
         return values

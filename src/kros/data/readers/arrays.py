@@ -337,7 +337,7 @@ def from_pykoop(
         raise DataError(f"from_pykoop: {needs}, found {shapes[:5]}; check n_inputs.")
     states, inputs = [f"x{i}" for i in range(width - 1 - n_inputs)], [f"u{i}" for i in range(n_inputs)]
     named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
-    episodes = {}
+    episodes: dict[EpisodeKey, Any] = {}
     for unit, x in arrays.items():
         rows = _rows_of(EpisodeKey(unit, DEFAULT_CONDITION, name) for name in _numbered_episodes(unit, x[:, 0]))
         episodes |= {key: x[at, 1:] for key, at in rows.items()}

@@ -21,8 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .control import SAMPLE_PERIOD_S
-from .parameters import GEAR_RATIO, SMOOTHING_VELOCITY, DriveParameters
+from .parameters import GEAR_RATIO, SAMPLE_PERIOD_S, SMOOTHING_VELOCITY, DriveParameters
 
 Array = npt.NDArray[Any]
 
@@ -31,10 +30,7 @@ SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
 TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
 MEASURED = 2  # rows of p and v, in front of q and z
 RECORDED = MEASURED + 1 + COMMAND  # rows from p to i
-_HALF_STEP, _RATIO = (
-    np.array(0.5 * SUBSTEP_S),
-    np.array(float(GEAR_RATIO)),
-)  # NumPy turns floats into these, at every call
+_HALF_STEP, _RATIO = np.array(0.5 * SUBSTEP_S), np.array(float(GEAR_RATIO))  # as NumPy makes of floats at every call
 _SMOOTHING = np.array([[1.0], [SMOOTHING_VELOCITY**2]])  # of what fades with the velocity, and of its sign
 
 

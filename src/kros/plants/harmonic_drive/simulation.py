@@ -1,7 +1,7 @@
 """Run the drives: sampled control around the physics, many trajectories at once.
 
-Time is the outer loop; every step is vectorised over trajectories. SimulatedSignals are kept time-major in small blocks and turned
-over into one row per trajectory as each block is full.
+Time is the outer loop; every step is vectorised over trajectories. Signals are recorded time-major in small blocks and turned
+into one row per trajectory as each block is full.
 
 Symbols
 -------
@@ -16,9 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .control import COUNT_RAD, SAMPLE_PERIOD_S, VELOCITY_POLE, Gains
 from .dynamics import COMMAND, CURRENT, MEASURED, RECORDED, Physics, W, load_torque
-from .parameters import DriveParameters
+from .parameters import COUNT_RAD, SAMPLE_PERIOD_S, VELOCITY_POLE, DriveParameters, Gains
 
 Array = npt.NDArray[Any]
 
@@ -43,49 +42,44 @@ def simulate(
 ) -> SimulatedSignals:
     """Simulate all trajectories; `targets` hold position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples = len(p), targets[0].shape[1]
-    n_loaded = int(np.count_nonzero(loaded))
-    rows = np.cumsum(loaded > 0) - 1
-    out = SimulatedSignals(
-        np.empty((n, len(_SIGNALS), n_samples)),
-        np.empty((n, 1, n_samples)),
-        np.empty((n_loaded, n_samples), np.float32),
-    )
+    states, velocity = np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples))
+    out = SimulatedSignals(states, velocity, np.empty((np.count_nonzero(loaded), n_samples), np.float32))
+    first_loaded = np.concatenate([[0], np.cumsum(loaded > 0)])
     for start in range(0, n, CHUNK_TRAJECTORIES):
-        part = slice(start, start + CHUNK_TRAJECTORIES)
-        _simulate_chunk(p.take(part), loaded[part], reference[part], targets, gains, out, part, rows[part])
+        stop = min(start + CHUNK_TRAJECTORIES, n)
+        part = slice(start, stop)
+        torque = out.load_torque[first_loaded[start] : first_loaded[stop]]
+        chunk = SimulatedSignals(states[part], velocity[part], torque)
+        tracked = [(target, reference[part]) for target in targets]
+        _simulate_chunk(p.take(part), loaded[part], tracked, gains, chunk)
     return out
 
 
 def _simulate_chunk(
-    p: DriveParameters,
-    loaded: Array,
-    reference: Array,
-    targets: tuple[Array, Array],
-    gains: Gains,
-    out: SimulatedSignals,
-    part: slice,
-    rows: Array,
+    p: DriveParameters, loaded: Array, tracked: list[tuple[Array, Array]], gains: Gains, out: SimulatedSignals
 ) -> None:
-    n, n_samples = len(p), targets[0].shape[1]
-    physics = Physics(p, loaded, targets[0][reference, 0])
+    """Simulate some trajectories into `out`; `tracked` holds targets and the one of every trajectory."""
+    n, n_samples = len(p), out.states.shape[-1]
+    position, rows = tracked[0]
+    physics = Physics(p, loaded, position[rows, 0])
     drive = _Controller(physics, gains)
     is_loaded = np.flatnonzero(loaded)
     with_load = p.take(is_loaded)
     recorded = np.empty((BLOCK_SAMPLES, RECORDED, n))
     for first in range(0, n_samples, BLOCK_SAMPLES):
         stop = min(first + BLOCK_SAMPLES, n_samples)
-        rp, rv = (np.ascontiguousarray(t[:, first:stop].T)[:, reference] for t in targets)
+        rp, rv = (np.ascontiguousarray(target[:, first:stop].T)[:, of] for target, of in tracked)
         for k in range(stop - first):
             drive.sample(rp[k], rv[k])
             recorded[k] = physics.rows[:RECORDED]
             physics.advance()
         block = recorded[: stop - first]
         for row, signal in enumerate(_SIGNALS):
-            out.states[part, row, first:stop] = block[:, signal].T
-        out.velocity[part, 0, first:stop] = block[:, MEASURED + 1 + W].T
+            out.states[:, row, first:stop] = block[:, signal].T
+        out.velocity[:, 0, first:stop] = block[:, MEASURED + 1 + W].T
         if len(is_loaded):
             torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
-            out.load_torque[rows[is_loaded], first:stop] = (torque / with_load.torque_constant).T
+            out.load_torque[:, first:stop] = (torque / with_load.torque_constant).T
 
 
 class _Controller:
@@ -98,11 +92,8 @@ class _Controller:
         self.p[:] = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
         self._integral = physics.z[COMMAND].copy()
         self._error, self._raw = np.empty(n), np.empty(n)
-        self._position, self._velocity, self._antiwindup = (
-            np.array(gains.position),
-            np.array(gains.velocity),
-            np.array(gains.antiwindup),
-        )
+        self._position, self._velocity = np.array(gains.position), np.array(gains.velocity)
+        self._antiwindup = np.array(gains.antiwindup)
         self._integrated = np.array(gains.integral * SAMPLE_PERIOD_S)
 
     def sample(self, rp: Array, rv: Array) -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from kros.core.errors import IdentificationError
 from kros.data.checks import check_episode, is_constant
-from kros.data.scaled import scale_population
+from kros.data.prepare import scale_population
 from kros.identify import (
     Factor,
     PhaseSpec,

@@ -20,8 +20,8 @@ from kros.data import (
     steps,
     write_parquet,
 )
+from kros.data.prepare import scale_population
 from kros.data.readers.parquet import read_parquet
-from kros.data.scaled import scale_population
 from kros.data.survey import survey
 from kros.plants import PLANTS
 

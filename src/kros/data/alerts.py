@@ -57,7 +57,7 @@ def scale_alerts(sizes: Mapping[EpisodeKey, Array], channels: Sequence[Channel])
 
 
 def _two_scales(sizes: Mapping[str, float]) -> str:
-    """Return the fewer of two groups of sizes, the factor between them, and what it may be; nothing where all are alike."""
+    """Return the fewer of two groups of sizes, the factor between them and what it may be, or nothing."""
     names = sorted(sizes, key=lambda name: (sizes[name], name))
     logs = np.log([sizes[name] for name in names])
     if len(names) < 2:
@@ -74,7 +74,7 @@ def _two_scales(sizes: Mapping[str, float]) -> str:
 
 
 def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:
-    """A state that is another one's slope, but for a factor of a thousand or a million: one of the units of time is another."""
+    """A state that is another one's slope, but for a factor of a thousand or a million: units of time are mixed."""
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
     for one, other in permutations(states, 2):
         slope, speed = values[2:, one] - values[:-2, one], values[1:-1, other]  # of two periods
@@ -94,6 +94,6 @@ def _sampling(values: Array, channels: Sequence[Channel], period_s: float) -> It
     step, size = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=0)), states.std(axis=0)
     if np.all(step > size) and np.all(size > 0):
         yield (
-            f"At the sampling period of {period_s:g} s every state changes by more than its own standard deviation from "
-            "sample to sample: either they hold noise alone, or samples are too far apart for a model of one step."
+            f"At the sampling period of {period_s:g} s every state changes by more than its own standard deviation "
+            "from sample to sample: they hold noise alone, or samples are too far apart for a model of one step."
         )

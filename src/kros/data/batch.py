@@ -66,9 +66,9 @@ class EpisodeBatch:
         parameters: Mapping[str, Mapping[str, float]] | None = None,
         truths: bool = False,
     ) -> EpisodeBatch:
-        """Read episodes, each cut to at most `max_samples`; `parameters` are lifting parameters by unit and name, kept where all units have them.
+        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have.
 
-        With `truths` also what states really were, for judging.
+        With `truths` also what states really were, for evaluation.
         """
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
@@ -115,7 +115,7 @@ class EpisodeBatch:
         return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
     def first_states(self, history: int = 0) -> Array:
-        """Return what a free run starts from: the first states of every episode, and those that a lifting's delays of up to `history` need.
+        """Return what a simulation starts from: the first states of every episode, with `history` more for delays.
 
         Returns
         -------
@@ -131,13 +131,14 @@ class EpisodeBatch:
         for key, length in zip(self.keys, self.lengths, strict=True):
             if length < history + 1:
                 raise DataError(
-                    f"Free run over {key}: needs {history + 1} samples for delays of up to {history}, found {length}; leave the episode out."
+                    f"Simulation of {key}: needs {history + 1} samples for delays of up to {history}, found {length}; "
+                    "leave the episode out."
                 )
         return np.swapaxes(self.states[: history + 1], 0, 1)
 
 
 def hold_missing(y: Array) -> Array:
-    """Return measurements, shape (n_samples, ...), with the last one that arrived in place of those that are missing, zero before the first."""
+    """Return measurements, (n_samples, ...), with the last that arrived for those that are missing, zero before it."""
     there = np.isfinite(y)
     if there.all():
         return y

@@ -45,20 +45,12 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
     if not gaps and not usable(values).all():
         check_finite(values, key, channels)
-    stuck = stuck_state(values, channels)
-    if stuck:
-        raise DataError(f"{title(key)}: {stuck}; leave the episode out, or the channel.")
-
-
-def stuck_state(values: Array, channels: Sequence[Channel]) -> str:
-    """Return which state stands still for the whole episode while anything else moves; nothing where none does."""
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
-    if not still:
-        return ""
-    moving = [repr(c.name) for i, c in enumerate(channels) if i not in still and not is_constant(values[:, i])]
-    place = f"stays at {values[0, still[0]]:g} in all {len(values)} samples"
-    reason = f"{place} while {', '.join(moving)} move, so its sensor is stuck or the column is wrong"
-    return f"state {channels[still[0]].name!r} {reason}" if moving else ""
+    moving = [c.name for i, c in enumerate(channels) if still and i not in still and not is_constant(values[:, i])]
+    if moving:
+        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
+        reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
+        raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
 def is_constant(column: Array) -> bool:
@@ -113,8 +105,8 @@ class _Suspects:
 class GroupWatch:
     """What only the episodes of one unit and condition tell together: channels that never move, and wild samples.
 
-    A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its values, and
-    what it moves by in half of the other episodes.
+    A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
+    values, and what it moves by in half of the other episodes.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
@@ -228,8 +220,8 @@ def check_population(population: Population, allow_single: bool = False) -> None
     if len(units) < 2 and not allow_single:
         raise DataError(
             f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} "
-            f"({', '.join(units) or 'none'}): uncertainty is the difference between units; add recordings of more units, "
-            'or stop after identification ("--until identify").'
+            f"({', '.join(units) or 'none'}): uncertainty is the difference between units; add recordings of more "
+            'units, or stop after identification ("--until identify").'
         )
 
 
@@ -246,7 +238,7 @@ def scan_digests(
 def usable_episodes(
     population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
 ) -> Iterator[tuple[EpisodeKey, Array, str]]:
-    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and their digest."""
+    """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
     if on_nan not in ON_NAN:
         raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
     watch = GroupWatch(population.columns)

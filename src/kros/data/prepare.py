@@ -1,9 +1,12 @@
-"""Lazy preparation, and how every reader makes its population: recordings, then steps, then checks."""
+"""Lazy preparation: how every reader makes its population of recordings, steps and checks, and what identifies one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -150,3 +153,63 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
         source = PreparedSource(EvenRecordings(source), *declared, first)
     source = replace(source, steps=source.steps + added)
     return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A source whose columns are divided by sizes, shape (n_columns,); nothing is copied."""
+
+    source: EpisodeSource
+    sizes: npt.NDArray[np.float64]
+
+    def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+        """Return the samples of an episode, shape (n_samples, n_columns)."""
+        return np.asarray(self.source(key) / self.sizes)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
+        """Return the same for fewer episodes."""
+        return Scaled(restrict(self.source, keys), self.sizes)
+
+
+def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
+    """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
+    owners = [c.of or c.name for c in population.columns]
+    factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
+    columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
+    return replace(population, source=Scaled(population.source, factors), **part_columns(columns))
+
+
+def mark_of(*content: Any) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`."""
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
+    """Return what the samples of every group follow from, without reading; None where the recordings are in no file.
+
+    These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
+    """
+    about: list[Any] = []
+    while isinstance(source, PreparedSource | EvenRecordings):
+        if isinstance(source, PreparedSource):
+            about.append((source.channels, source.period_s, source.steps, source.gaps))
+        source = source.recordings if isinstance(source, PreparedSource) else source.source
+    if not isinstance(source, Recordings):
+        return [None for _ in groups]
+    settings = [(f.name, getattr(source, f.name)) for f in fields(source) if f.name != "places"]
+    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, type(source).__name__, settings, declared)
+
+    def mark(keys: Sequence[EpisodeKey]) -> str | None:
+        files = [source.file(source.places[key]) for key in keys]
+        rows = [
+            (key, source.places[key], stamp(file)) for key, file in zip(keys, files, strict=True) if file is not None
+        ]
+        return mark_of(how, rows) if len(rows) == len(keys) else None
+
+    return [mark(keys) for keys in groups]
+
+
+def _stamp(file: Path) -> tuple[int, int]:
+    """Return size and time of change of a file."""
+    status = file.stat()
+    return status.st_size, status.st_mtime_ns

@@ -128,8 +128,8 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
     if deviation[worst] > TIME_TOLERANCE * period:
         count = np.count_nonzero(deviation > TIME_TOLERANCE * period)
         raise DataError(
-            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {period:g} s by more "
-            f"than {TIME_TOLERANCE:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
+            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {period:g} s by "
+            f"more than {TIME_TOLERANCE:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
             f"period_s = {period:.3g}, or fix the source."
         )
     mean = float((time[-1] - time[0]) / len(steps))

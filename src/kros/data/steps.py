@@ -1,8 +1,8 @@
 """Preparation as declared steps: small frozen objects, applied to each episode in the order given.
 
-Each step says what it does to the channels and the sampling period, so that a population can be described before anything
-is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a table with its
-name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
+Each step says what it does to the channels and the sampling period, so that a population can be described before
+anything is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a
+table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
 """
 
 from __future__ import annotations
@@ -260,9 +260,9 @@ class Trim(Step):
 class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
 
-    At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid that is
-    an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All channels are
-    treated alike, so linear relations between them survive.
+    At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid
+    that is an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All
+    channels are treated alike, so linear relations between them survive.
 
     Parameters
     ----------
@@ -324,8 +324,8 @@ class Resample(Step):
 class Differentiate(Step):
     """Add the derivative of a channel, low-passed at `cutoff_hz`, as a new state.
 
-    The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a running
-    observer could have measured.
+    The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a
+    running observer could have measured.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""One pass over all recordings: every episode read and checked once, training and test told apart, and what later steps need to know.
+"""One pass over all recordings: every episode read and checked once, and split into training and test.
 
 Population --survey--> Population that can be used, RecordingFacts
 """
@@ -24,8 +24,8 @@ from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, refuse_copies, scan_digests
 from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
-from .marks import recording_marks
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
+from .prepare import recording_marks
 from .recording import some, title
 from .writers.folders import same_file
 from .writers.parquet import GroupRecord, write_group, write_index
@@ -146,7 +146,7 @@ class SurveyOptions:
 
 @dataclass(frozen=True)
 class Copy:
-    """Where a survey writes the recordings as Parquet, and an earlier copy whose files are taken where nothing changed."""
+    """Where a survey writes the recordings as Parquet, and an earlier copy whose unchanged files are taken."""
 
     folder: Path
     earlier: Path
@@ -156,7 +156,7 @@ class Copy:
 def survey(
     population: Population, work: Work | None = None, copy: Copy | None = None, **options: Any
 ) -> tuple[Population, RecordingFacts]:
-    """Read all recordings once, without those that `work` knows from earlier; `options` are those of `SurveyOptions`."""
+    """Read all recordings once, without those that `work` knows from earlier, with options of `SurveyOptions`."""
     chosen = SurveyOptions(**options)
     folder = None if copy is None else copy.folder
     if folder is not None:

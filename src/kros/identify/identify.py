@@ -20,8 +20,8 @@ from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
 from ..core.work import Work
-from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
+from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate

@@ -4,7 +4,8 @@ Examples
 --------
 >>> from kros.plants import DcMotorPopulation
 >>> DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0).simulate().population
-Population(2 units, 1 condition, 2 episodes every 0.002 s; states position (measured), velocity, current; inputs voltage; true velocity, current)
+Population(2 units, 1 condition, 2 episodes every 0.002 s; states position (measured), velocity, current; inputs
+voltage; true velocity, current)
 """
 
 from .batch import SimulatedPopulation

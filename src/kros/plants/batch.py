@@ -1,4 +1,4 @@
-"""What simulated populations have in common: recordings with their truth, drawn parameters, one planted outlier, sensors."""
+"""What simulated populations have in common: recordings with their truth, drawn parameters, an outlier, sensors."""
 
 from __future__ import annotations
 

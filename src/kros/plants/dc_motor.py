@@ -4,8 +4,9 @@
     J dw/dt = k i - b w - c tanh(w / w_s)
       dp/dt = w
 
-The input `v` is a pseudorandom voltage; every level is followed by its opposite, so that the shaft comes back. Position comes from an encoder,
-velocity and current from noisy sensors. `tanh(velocity)` lifts the Coulomb friction exactly.
+The input `v` is a pseudorandom voltage; every level is followed by its opposite, so that the shaft comes back.
+Position comes from an encoder, velocity and current from noisy sensors. `tanh(velocity)` lifts the Coulomb friction
+exactly.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class DcMotorTruth(UnitTruth):
 
 
 class DcMotorPopulation(Batch[DcMotorTruth]):
-    """Settings of a simulated batch of DC motors, see `BatchSettings`; a spread of 1 means deviations of 5 to 15 percent.
+    """Settings of a simulated batch of DC motors, see `BatchSettings`; a spread of 1 means deviations of 5 to 15 %.
 
     The outlier has a tired magnet and a dry bearing.
 

@@ -2,7 +2,8 @@
 
     d2 theta / dt2 = -a sin(theta) - b d theta / dt + g u
 
-The input `u` is a pseudorandom staircase, held between samples. Position comes from an encoder, velocity from a noisy sensor.
+The input `u` is a pseudorandom staircase, held between samples. Position comes from an encoder, velocity from a noisy
+sensor.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class PendulumTruth(UnitTruth):
 
 
 class PendulumPopulation(Batch[PendulumTruth]):
-    """Settings of a simulated batch of pendulums, see `BatchSettings`; a spread of 1 means deviations of 8 to 15 percent.
+    """Settings of a simulated batch of pendulums, see `BatchSettings`; a spread of 1 means deviations of 8 to 15 %.
 
     The outlier has a stiff joint.
 

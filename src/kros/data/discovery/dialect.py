@@ -1,4 +1,4 @@
-"""How a text file of numbers is written: encoding, delimiter, decimal point, header, rows of units and the rows before."""
+"""How a text file of numbers is written: encoding, delimiter, decimal point, header and rows of units."""
 
 from __future__ import annotations
 
@@ -20,11 +20,8 @@ SPREAD = 200  # further lines, spread over the head of a file: machines rest at 
 _ABOVE = 20  # lines that may stand before the header
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
-_NO_NUMBER = {
-    "",
-    *["nan", "+nan", "-nan", "null", "none", "na", "n/a", "inf", "-inf", "+inf", "#n/a"],
-    *(a.lower() for a in ABSENT),
-}
+_ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
+_NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 _UNNAMED = {name: re.sub(r"[?]P<[a-z]+>", "?:", text) for name, text in {"clock": CLOCK, **DATES}.items()}
 _TIME = re.compile(rf"^\s*(?:(?:{'|'.join(_UNNAMED[order] for order in DATES)})[T ]\s*)?{_UNNAMED['clock']}\s*$")
 

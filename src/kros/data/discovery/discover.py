@@ -1,4 +1,4 @@
-"""A folder of somebody's recordings, described: how files are written, what their names say, what columns are, what looks wrong.
+"""A folder of recordings, described: how files are written, what names and columns are, what looks wrong.
 
 folder ── dialect ── names of files ── columns ── parts ── mapping ── every episode looked at ── Discovery
 """
@@ -296,7 +296,7 @@ def _examined(
         mapping = mapping | {"pieces": PIECES}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
-    findings += [f"left out, {_relative(population, source, key)}: {key}: {why}" for key, why in wrong.items()]
+    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
     findings += examined.doubts
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")

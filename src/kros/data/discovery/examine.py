@@ -12,10 +12,10 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.work import Work
-from ..checks import MIN_SAMPLES, GroupWatch, copies_among, digest_of, stuck_state
+from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
-from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, title, usable
+from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, check_increasing, title
 
 Array = npt.NDArray[np.float64]
 GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
@@ -101,40 +101,28 @@ def _look(population: Population) -> list[EpisodeLook]:
     source: Any = population.source
     looks, watch = {}, GroupWatch(population.columns)
     for key in population.episodes:
+        looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
             recording = source.recordings(key) if isinstance(source, PreparedSource) else Recording(key, source(key))
-            looks[key] = _looked(recording, population.columns, population.sample_period_s)
-            if looks[key].digest:
-                watch.add(key, recording.values)
+            values = recording.values
+            check_increasing(recording)
+            looks[key] = look = _timed(replace(looks[key], n_samples=len(values)), recording.time_s)
+            check_episode(values, key, population.columns)
+            doubts = tuple(_rests(key, values, population.columns))
+            looks[key] = replace(look, doubts=doubts, digest=digest_of(values))
+            watch.add(key, values)
+        except NonFiniteError as error:
+            looks[key] = replace(looks[key], nan=True, doubts=(str(error),))
         except DataError as error:
-            looks[key] = EpisodeLook(key, str(error))
+            looks[key] = replace(looks[key], wrong=str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())
 
 
-def _looked(recording: Recording, channels: Sequence[Channel], period_s: float) -> EpisodeLook:
-    """Look at one episode as recorded."""
-    key, values, time = recording.key, recording.values, recording.time_s
-    look = EpisodeLook(key, n_samples=len(values), period_s=period_s)
-    if len(values) < MIN_SAMPLES:
-        return replace(look, wrong=f"has {len(values)} samples")
-    if time is not None:
-        steps = np.diff(time)
-        bad = np.flatnonzero(~(steps > 0))
-        if bad.size:
-            where = f"sample {bad[0]} ({time[bad[0]]:g} s, then {time[bad[0] + 1]:g} s), {bad.size} times"
-            return replace(look, wrong=f"time stands still or runs back at {where}")
-        look = _timed(look, steps)
-    if not usable(values).all():
-        bad = np.count_nonzero(~usable(values), axis=0)
-        names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
-        return replace(look, doubts=(f"{title(key)}: no number in some samples of {names}",), nan=True)
-    stuck = stuck_state(values, channels)
-    doubts = () if stuck else tuple(_rests(key, values, channels))
-    return replace(look, wrong=stuck, doubts=doubts, digest="" if stuck else digest_of(values))
-
-
-def _timed(look: EpisodeLook, steps: Array) -> EpisodeLook:
+def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
     """Return a look with what the steps of time say."""
+    if time is None or len(time) < 2:
+        return look
+    steps = np.diff(time)
     period, longest = float(np.median(steps)), int(steps.argmax())
     deviation = np.abs(steps - period) / period
     worst = int(deviation.argmax())

@@ -1,7 +1,8 @@
-"""Unit, condition, episode and group from the names of files: a regular expression that says which part of a path is what.
+"""Unit, condition, episode and group from the names of files, as a regular expression on their paths.
 
-A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart by the word that it begins
-with or that stands before it (``run_3``), by what conditions are called, and else by its place: units before episodes.
+A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart
+by the word that it begins with or that stands before it (``run_3``), by what conditions are called, and else by its
+place: units before episodes.
 """
 
 from __future__ import annotations
@@ -14,18 +15,19 @@ from ..population import OUTLIERS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
 _WORDS = {
-    UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder pump "
-    "valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur variateur "
-    "part id",
-    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung versuch "
-    "lauf aufnahme essai mesure meas nr no",
+    UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
+    "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
+    "variateur part id",
+    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung "
+    "versuch lauf aufnahme essai mesure meas nr no",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
 _ROLE_OF = {word: role for role, words in _WORDS.items() for word in words.split()}
-_CONDITIONS = set(
-    "load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast leerlauf leer kalt "
-    "heiss heiß belastet unbelastet mitlast charge vide froid chaud forward reverse".split()
-)
+_STATES = """
+load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast leerlauf leer kalt
+heiss heiß belastet unbelastet mitlast charge vide froid chaud forward reverse
+"""
+_CONDITIONS = set(_STATES.split())
 _MEASURE = re.compile(
     r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE
 )
@@ -99,7 +101,7 @@ def _words(stems: Sequence[str]) -> _Cut | None:
 
 
 def _aligned(stems: Sequence[str]) -> _Cut | None:
-    """Cut into words, where some paths have more of them: what all begin with, and as many words at the end as all have."""
+    """Cut into words where some paths have more: what all begin with, and as many words at the end as all have."""
     parts = [re.split(r"([/_ ]+)", s) for s in stems]
     fewest, head = min(map(len, parts)), 0
     while head + 1 < fewest and len({tuple(p[head : head + 2]) for p in parts}) == 1:

@@ -35,13 +35,8 @@ _TO_RADIANS = {
 }
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 _AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
-_SPELLED = dict(
-    zip(
-        "äöüßÄÖÜΔωφθατ",
-        ["ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "d", "omega", "phi", "theta", "alpha", "tau"],
-        strict=True,
-    )
-)
+_LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
+_SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
 
 
 @dataclass(frozen=True)

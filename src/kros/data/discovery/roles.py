@@ -27,13 +27,13 @@ class ColumnPart(str, Enum):
 
 
 WORDS = {
-    "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl sollgeschwindigkeit "
-    "ref reference consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward demand demanded "
-    "set vorgabe commande u",
+    "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
+    "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "
+    "demand demanded set vorgabe commande u",
     "spare": "filt filtered smooth smoothed index idx sample samples counter count nr no number status flag error err "
     "saturation sat mode id fault fehler zaehler",
-    "time": "time zeit t timestamp timestamps date datum uhrzeit clock temps tijd tiempo tempo secs seconds millis datetime "
-    "zeitstempel",
+    "time": "time zeit t timestamp timestamps date datum uhrzeit clock temps tijd tiempo tempo secs seconds millis "
+    "datetime zeitstempel",
     "angle": "angle winkel theta phi alpha beta gamma q encoder enc rotation drehwinkel angolo",
     "position": "pos position lage weg stroke hub displacement x y z istposition posizione travel",
     "velocity": "vel velocity speed drehzahl geschwindigkeit omega rpm rate v w dq qd vitesse istdrehzahl velocita",
@@ -90,7 +90,7 @@ def _kinds_of(name: str) -> list[str]:
 
 
 def kind_of(name: str, unit: str = "") -> str:
-    """Return the kind of quantity that a channel is, by its unit of measure or its name; nothing where neither tells."""
+    """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
     quantities = (kind for kind in _kinds_of(name) if kind not in ("", "input", "spare"))
     return kind_of_unit(unit) or next(quantities, "")
 
@@ -123,7 +123,7 @@ def _counts(column: Array) -> bool:
 
 
 def time_scale(unit: str, step: float) -> tuple[float, str]:
-    """Return the factor from a column of time to seconds, and what it rests on: its unit, else the size of its steps."""
+    """Return the factor from a column of time to seconds by its unit, else the size of its steps, and the reason."""
     if unit.lower() in SECONDS:
         return SECONDS[unit.lower()], f"its unit of measure is {unit}"
     for name in ("s", "ms", "us", "ns"):

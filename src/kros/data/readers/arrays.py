@@ -22,7 +22,7 @@ _EXACT = 2.0**53  # floating-point numbers from here on do not tell whole number
 
 @dataclass(frozen=True, eq=False)
 class ArrayRecordings(Recordings):
-    """Episodes held in memory, with their times or None, columns in the order of the channels; read-only from now on."""
+    """Episodes held in memory, with their times or None, columns in the order of the channels; made read-only."""
 
     def __post_init__(self) -> None:
         for values, _ in self.places.values():
@@ -69,10 +69,11 @@ def from_arrays(
     Parameters
     ----------
     data : mapping or sequence
-        One of: ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; the same with a mapping from episode id in
-        place of a list; ``{EpisodeKey: episode}``; or a list in place of the outer mapping, which numbers the units from zero.
-        An episode is an array of shape (n_samples, n_channels) with states, then inputs, as columns; a pair (states, inputs);
-        or a mapping from the name of a channel to its samples, shape (n_samples,).
+        One of: ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; the same with a mapping from
+        episode id in place of a list; ``{EpisodeKey: episode}``; or a list in place of the outer mapping, which
+        numbers the units from zero. An episode is an array of shape (n_samples, n_channels) with states, then inputs,
+        as columns; a pair (states, inputs); or a mapping from the name of a channel to its samples, shape
+        (n_samples,).
     channels : sequence of Channel, optional
         In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns.
     sample_period_s : float, s
@@ -298,8 +299,9 @@ def from_pykoop(
     Parameters
     ----------
     X : array_like, shape (n_samples, 1 + n_states + n_inputs), or mapping from unit id to such arrays
-        First column the episode, then states, then inputs. One array is one unit, named ``0``. Episodes are whole numbers; in
-        an array of objects they may be text. Rows of an episode need not stand together and keep their order.
+        First column the episode, then states, then inputs. One array is one unit, named ``0``. Episodes are whole
+        numbers; in an array of objects they may be text. Rows of an episode need not stand together and keep their
+        order.
     n_inputs : int
         How many of the last columns are inputs.
     sample_period_s : float

@@ -37,7 +37,7 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, its columns, those wanted (time first, where there is one), and which piece of how many."""
+    """Where an episode is: a file, its columns, those wanted (time first, if any), and which piece of how many."""
 
     path: str
     names: tuple[str, ...]
@@ -215,7 +215,7 @@ def file_fields(path: Path, dialect: Dialect) -> list[str]:
 
 
 def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) -> Array:
-    """Read columns of anybody's Parquet file; the first as seconds since its first row with `timestamp`, (len(wanted), n_rows)."""
+    """Read columns of anybody's Parquet file, the first as seconds with `timestamp`, shape (len(wanted), n_rows)."""
     import pyarrow as pa
     from pyarrow import parquet
 

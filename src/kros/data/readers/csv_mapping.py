@@ -60,8 +60,8 @@ class CsvMapping(Settings):
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
     files: str = Field(
-        description="regular expression searched in the path relative to the folder (with `/`); the named groups `unit`, "
-        "`condition`, `episode` and `group` say what a file is, a missing one gets a default"
+        description="regular expression searched in the path relative to the folder (with `/`); the named groups "
+        "`unit`, `condition`, `episode` and `group` say what a file is, a missing one gets a default"
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
@@ -77,8 +77,8 @@ class CsvMapping(Settings):
     encoding: str = Field("utf-8", description="of the text, for example cp1252 or utf-16")
     timestamp: Literal["ymd", "dmy", "mdy"] | None = Field(
         None,
-        description="where time is a timestamp such as `2024-05-31 12:00:00.010`: the order of its date; a time of day alone "
-        "takes any of them",
+        description="where time is a timestamp such as `2024-05-31 12:00:00.010`: the order of its date; a time of day "
+        "alone takes any of them",
     )
     pieces: int = Field(
         1, ge=1, description="a file is cut into so many episodes of equal length, `<episode>.1` and so on"

@@ -46,7 +46,7 @@ COMMA = Dialect()
 
 
 class LimitedFile:
-    """An open file that gives no more than is ever read; text that was packed too tightly to be recordings is refused."""
+    """An open file that gives no more than is ever read; text that was packed too tightly is refused."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         self._file, self._path = file, path

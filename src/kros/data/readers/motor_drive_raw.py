@@ -2,9 +2,9 @@
 
     raw/batch_b/{population,outliers}/<YYYYmmddTHHMMSS>_<serial>_<load|noload>/*_<episode>.csv
 
-Columns, by position after one header line: time (s, also ms or us), position (deg), velocity (deg/s), torque (% of full
-scale), target position (deg), target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS` declares the
-preparation.
+Columns, by position after one header line: time (s, also ms or us), position (deg), velocity (deg/s), torque (% of
+full scale), target position (deg), target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS`
+declares the preparation.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ MAPPING = CsvMapping(
 
 
 def find_root(source: Path) -> Path | None:
-    """Return the folder that holds ``population`` or ``outliers``: `source`, or its ``batch_b`` (also below ``raw``)."""
+    """Return the folder with ``population`` or ``outliers``: `source`, or its ``batch_b`` (also below ``raw``)."""
     for candidate in (source, source / "batch_b", source / "raw" / "batch_b"):
         if any((candidate / group).is_dir() for group in GROUPS):
             return candidate
@@ -67,7 +67,7 @@ def find_root(source: Path) -> Path | None:
 
 
 def is_raw_layout(source: Path) -> bool:
-    """Tell whether a folder in ``population`` or ``outliers`` is named as the raw layout does: others use these words too."""
+    """Tell whether a folder in ``population`` or ``outliers``, words that others use too, is named as in the layout."""
     root = find_root(source)
     folders = [path for group in GROUPS for path in root.glob(f"{group}/*")] if root is not None else []
     return any(path.is_dir() and re.fullmatch(FOLDER, path.name) for path in folders)

@@ -53,7 +53,8 @@ def read(
     prepare : iterable of Step or mapping
         Further steps, as in ``[[data.prepare]]``, after those of the mapping.
     optional : collection of str
-        Channels that recordings may lack, such as states that only a test bench measures; steps that need them are left out with them.
+        Channels that recordings may lack, such as states that only a test bench measures; steps that need them are
+        left out with them.
 
     Returns
     -------

@@ -1,9 +1,11 @@
 """Write a population in kros's native format.
 
     <out>/population.json                    channels, period, units, episodes with their lengths
-    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels and truths
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels
+    and truths
 
-Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
+Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`),
+then the index.
 """
 
 from __future__ import annotations
@@ -33,8 +35,7 @@ logger = logging.getLogger(__name__)
 
 _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
-# Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB; zstd: 55 %
-# for 0.08 s.
+# Signals as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s per 91 MB; zstd: 55 %, 0.08 s.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
 
 

@@ -23,14 +23,15 @@ FIRST_STAMP = datetime(2023, 1, 1)
 
 
 def write_raw(population: Population, out: Path | str) -> None:
-    """Write the paper's raw layout, ``<out>/batch_b/{population,outliers}/<stamp>_<serial>_<load|noload>/*_<episode>.csv``.
+    """Write the paper's raw layout, ``<out>/batch_b/<group>/<stamp>_<serial>_<load|noload>/*_<episode>.csv``.
 
     Parameters
     ----------
     population : Population
-        Drives *before* preparation, in the reader's channels and units (rad and rad/s at the gear output, fraction of full
-        scale): episodes still hold the 1000 samples at rest and the offset of the position. Targets are written one row later
-        than the measurements they belong to, so reading back gives one sample less (and 1000 less at rest).
+        Drives *before* preparation, in the reader's channels and units (rad and rad/s at the gear output, fraction of
+        full scale): episodes still hold the 1000 samples at rest and the offset of the position. Targets are written
+        one row later than the measurements they belong to, so reading back gives one sample less (and 1000 less at
+        rest).
     out : Path
         Folder to make, whole or not at all.
 

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, IdentificationError
 from ...core.linalg import radius_text
 from ...data.population import EpisodeKey, Population
-from ...data.scaled import scale_population
+from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ..factors import Factor
 from ..ranges import Ranges

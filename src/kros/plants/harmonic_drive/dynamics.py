@@ -4,14 +4,14 @@
     J_l dw_l/dt = k s + c (w - w_l) - m g l sin(q - s)               flange, and load where there is one
     ds/dt = w - w_l,   dq/dt = w,   tau di/dt = u - i
 
-The linear part is integrated exactly over a substep (matrix exponential); friction `F`, disturbance `i_d` and gravity are held,
-evaluated at the predicted middle of the substep.
+The linear part is integrated exactly over a substep (matrix exponential); friction `F`, disturbance `i_d` and gravity
+are held, evaluated at the predicted middle of the substep.
 
 Symbols
 -------
-q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its command
-p, v : position and velocity that the drive measures
-z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
+q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its
+command p, v : position and velocity that the drive measures z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map
+from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ target position --> (+) --> Kp --> (+) --> PI --> limit --> current
                     -|    target velocity +|  -|
               position                     velocity = filtered difference of position
 
-All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases are uniform.
-Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
+All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases
+are uniform. Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ class DriveParameters:
         return DriveParameters(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def dry_friction(self, velocity: Array) -> Array:
-        """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign function, shape (n_units,), N m."""
+        """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign, shape (n_units,), N m."""
         fade = 1.0 + (velocity / self.stribeck_velocity) ** 2
         sign = velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
         return sign * (self.coulomb_torque + self.breakaway_torque / fade)

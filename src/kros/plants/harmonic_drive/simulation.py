@@ -1,11 +1,12 @@
 """Run the drives: sampled control around the physics, many trajectories at once.
 
-Time is the outer loop; every step is vectorised over trajectories. Signals are recorded time-major in small blocks and turned
-into one row per trajectory as each block is full.
+Time is the outer loop; every step is vectorised over trajectories. Signals are recorded time-major in small blocks
+and turned into one row per trajectory as each block is full.
 
 Symbols
 -------
-p, v : measured position and velocity;   rp, rv : their targets;   u : current command;   integral : state of the velocity controller
+p, v : measured position and velocity;   rp, rv : their targets;   u : current command;   integral : state of the
+velocity controller
 """
 
 from __future__ import annotations
@@ -32,15 +33,17 @@ _DIFFERENCE = np.array((1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S)
 class SimulatedSignals:
     """What a simulation leaves behind, one row per trajectory."""
 
-    states: Array  # shape (n, 3, n_samples): quantised position, rad, its filtered difference, rad/s, and current without noise
+    states: (
+        Array  # shape (n, 3, n_samples): quantised position, rad, its filtered difference, rad/s, current, noiseless
+    )
     velocity: Array  # shape (n, 1, n_samples), rad/s; true velocity of the motor
-    load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current: what the load takes from the flange
+    load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current; taken from the flange
 
 
 def simulate(
     p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains
 ) -> SimulatedSignals:
-    """Simulate all trajectories; `targets` hold position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
+    """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
     n, n_samples = len(p), targets[0].shape[1]
     states, velocity = np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples))
     out = SimulatedSignals(states, velocity, np.empty((np.count_nonzero(loaded), n_samples), np.float32))
@@ -83,7 +86,7 @@ def _simulate_chunk(
 
 
 class _Controller:
-    """Encoder, velocity estimate and cascaded control of a batch; writes what it measures and the command into the physics."""
+    """Encoder, velocity estimate and cascaded control of a batch; writes measurement and command into the physics."""
 
     def __init__(self, physics: Physics, gains: Gains) -> None:
         n = len(physics.q)

@@ -1,10 +1,11 @@
-"""What the simulation knows and identification must find out, among it how the gearbox disturbance shows at constant speed.
+"""What the simulation knows and identification must find out.
 
 Steady forward motion at constant speed turns the disturbance `a1 sin(100 theta + phi1)` into a velocity error
 
     e = target velocity - velocity = |H| a1 sin(100 theta + phi1 + eta),     eta = arg H
 
-and reverse motion into `|H| a1 sin(100 theta + phi1 - eta)`: with the angle running backwards the same delay has the other sign.
+and reverse motion into `|H| a1 sin(100 theta + phi1 - eta)`: with the angle running backwards the same delay has the
+other sign.
 
 Symbols
 -------
@@ -53,7 +54,7 @@ class Truth:
 
     @property
     def lag_rad(self) -> Array:
-        """Phase `eta` of the disturbance's effect on the velocity error at full speed without load, shape (n_units,), rad."""
+        """Phase `eta` of the disturbance's effect on the velocity error at full speed without load, (n_units,), rad."""
         return np.angle(self.response())
 
     def response(self, loaded: bool = False) -> Array:
@@ -61,7 +62,7 @@ class Truth:
         return disturbance_response(self.parameters, self.gains, loaded, MAX_SPEED)
 
     def load_torque(self, key: EpisodeKey) -> Array:
-        """Return the torque that the load takes from the flange in an episode, inertia and gravity, shape (n_samples,)."""
+        """Return the torque that the load takes from the flange in an episode, inertia and gravity, (n_samples,)."""
         if key not in self.load_rows:
             raise DataError(
                 f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one."

@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
-from ...data.scaled import scale_population
+from ...data.prepare import scale_population
 from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights, lifted_factor
 from ...identify.bootstrap import bootstrap_refined
 from ...identify.ranges import Ranges

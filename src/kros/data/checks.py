@@ -61,11 +61,7 @@ def is_constant(column: Array) -> bool:
 
 
 def check_finite(
-    values: Array,
-    key: EpisodeKey,
-    channels: Sequence[Channel],
-    first: int = 0,
-    columns: Iterable[int] | None = None,
+    values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0, columns: Iterable[int] | None = None
 ) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for column in range(len(channels)) if columns is None else columns:

@@ -19,10 +19,10 @@ from .batch import EpisodeBatch
 from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes
 from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame, from_pykoop, to_pykoop
+from .readers.motor_drive_raw import write_raw
 from .readers.opening import read
 from .readers.parquet import read_parquet
 from .writers.parquet import write_parquet
-from .writers.raw import write_raw
 
 __all__ = [
     "Channel",

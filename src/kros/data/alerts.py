@@ -31,7 +31,7 @@ def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -
     alerts = []
     if not SHORTEST_S < period_s < LONGEST_S:
         alerts.append(
-            f"The sampling period of {period_s:g} s is unusual for a machine: {UNUSUAL} and sample_period_s, "
+            f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s, "
             "on which every frequency depends."
         )
     return (*alerts, *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))

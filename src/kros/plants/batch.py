@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -27,14 +27,7 @@ _LIMITS: dict[str, tuple[float, float]] = {
 }
 
 
-class HasTruth(Protocol):
-    """True parameters of a simulated population."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything but long signals, ready for JSON."""
-
-
-T = TypeVar("T", bound=HasTruth)
+T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
 
 
 @dataclass(frozen=True, eq=False)

@@ -110,9 +110,9 @@ class DriveParameters:
 
     def dry_friction(self, velocity: Array) -> Array:
         """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign, shape (n_units,), N m."""
-        fade = 1.0 + (velocity / self.stribeck_velocity) ** 2
-        sign = velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
-        return sign * (self.coulomb_torque + self.breakaway_torque / fade)
+        fade = (1.0 / self.stribeck_velocity * velocity) ** 2 + 1.0
+        torque = self.breakaway_torque / fade + self.coulomb_torque
+        return torque * velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
 
     def gearbox_current(self, position: Array) -> Array:
         """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""

@@ -14,9 +14,9 @@ from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ...data.steps import Offset, Trim
 from ..batch import BatchSettings, SimulatedEpisodes, SimulatedPopulation
+from .dynamics import simulate
 from .parameters import CURRENT_NOISE, GAINS, GEAR_RATIO, SAMPLE_PERIOD_S, Loop, draw_parameters
 from .reference import episode_reference
-from .simulation import simulate
 from .truth import Truth
 
 Array = npt.NDArray[Any]

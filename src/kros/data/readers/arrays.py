@@ -377,10 +377,10 @@ def to_pykoop(population: Population) -> Array:
     --------
     >>> import numpy as np
     >>> import kros
-    >>> arrays = {"a": [np.ones((2, 2)), np.zeros((2, 2))]}
+    >>> arrays = {"a": [np.ones((3, 2)), np.zeros((3, 2))]}
     >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
-    >>> kros.data.to_pykoop(population).tolist()
-    [[0.0, 1.0, 1.0], [0.0, 1.0, 1.0], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    >>> kros.data.to_pykoop(population)[2:4].tolist()
+    [[0.0, 1.0, 1.0], [1.0, 0.0, 0.0]]
     """
     parts = [population.read(key) for key in population.episodes]
     return np.concatenate([np.column_stack([np.full(len(part), float(i)), part]) for i, part in enumerate(parts)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -20,10 +21,20 @@ _FACTORS = {  # between units of measure that are mixed up, and what they are
     60.0: "minutes and seconds",
     1000.0: "a unit and its thousandth",
 }
-_NEAR = 1.2  # within which a ratio of sizes is one of these factors
-_COMPACT = 3.0  # by which sizes may differ on either side
-_CORRELATED = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
 UNUSUAL = "check the unit of the column of time (time_scale)"
+
+
+@dataclass(frozen=True)
+class AlertRule:
+    """From when on sizes speak for units of measure that are mixed up."""
+
+    near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
+    compact: float = 3.0  # by which sizes may differ on either side of it
+    apart: float = 0.6  # of the gap between both sides that sizes of one side may span
+    correlated: float = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
+
+
+_RULE = AlertRule()
 
 
 def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
@@ -64,8 +75,8 @@ def _two_scales(sizes: Mapping[str, float]) -> str:
         return ""
     cut = int(np.diff(logs).argmax()) + 1
     gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
-    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_NEAR)]
-    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_COMPACT), 0.6 * gap):
+    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_RULE.near)]
+    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_RULE.compact), _RULE.apart * gap):
         return ""
     smaller = cut <= len(names) - cut
     fewer = some(names[:cut] if smaller else names[cut:])
@@ -79,7 +90,7 @@ def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) ->
     for one, other in permutations(states, 2):
         slope, speed = values[2:, one] - values[:-2, one], values[1:-1, other]  # of two periods
         sizes = np.linalg.norm(slope), np.linalg.norm(speed)
-        if min(sizes) > 0 and slope @ speed > _CORRELATED * sizes[0] * sizes[1]:
+        if min(sizes) > 0 and slope @ speed > _RULE.correlated * sizes[0] * sizes[1]:
             decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
             if abs(abs(decades) - 3) < 0.05 or abs(abs(decades) - 6) < 0.05:
                 found = (

@@ -22,14 +22,24 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
-SHORTEST = 8  # samples of a run
-_RUNS, _EPISODES = 5, 2  # fewest runs, in so many episodes
-_LEVELS = 64  # fewer make a coarse signal, whose top level is no limit
-_NOISE = 5.0  # standard deviations
-_FAR = 5.0  # times the noise's width
-_BENT = 0.25  # of this width
-_VARIED = 0.02  # of an input's range
 _OF_RUNS = ("values", "lengths", "steep", "bend", "inputs")
+
+
+@dataclass(frozen=True)
+class LimitRule:
+    """When flat tops count as a limit."""
+
+    shortest: int = 8  # samples of a run: as many as a filter of a sensor may smear
+    runs: int = 5  # fewest runs
+    episodes: int = 2  # in so many of which they are
+    levels: int = 64  # of a signal; fewer make a coarse one, whose top level is no limit
+    noise: float = 5.0  # standard deviations that noise is wide
+    far: float = 5.0  # widths of the noise by which the signal falls beside a run
+    bent: float = 0.25  # width of the noise that the middle of a run may be above its ends
+    varied: float = 0.02  # of an input's range that it covers in the runs
+
+
+_RULE = LimitRule()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,18 +115,22 @@ def _mirrored(other: _Level | None, tops: Sequence[FlatTops]) -> _Level | None:
 
 def flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
     """Return the flat tops of a signal at its upper end, with noise of a width, and how far the signal goes."""
-    top = float(np.partition(signal, -SHORTEST)[-SHORTEST]) if len(signal) > 2 * SHORTEST else float(signal.max())
+    top = (
+        float(np.partition(signal, -_RULE.shortest)[-_RULE.shortest])
+        if len(signal) > 2 * _RULE.shortest
+        else float(signal.max())
+    )
     for _ in range(2):
         top = float(signal[signal >= top - width].mean())
     edges = np.flatnonzero(np.diff(np.concatenate([[False], signal >= top - width, [False]])))
     starts, stops = edges[::2], edges[1::2]
-    coarse = len(np.unique(signal[::_LEVELS])) < _LEVELS and len(np.unique(signal)) < _LEVELS
-    long = (stops - starts >= SHORTEST) & (not coarse)
+    coarse = len(np.unique(signal[:: _RULE.levels])) < _RULE.levels and len(np.unique(signal)) < _RULE.levels
+    long = (stops - starts >= _RULE.shortest) & (not coarse)
     starts, stops = starts[long], stops[long]
     third = (stops - starts) // 3
     values, middle = _means(signal, starts, stops), _means(signal, starts + third, stops - third)
     held = np.reshape([_means(u, starts, stops) for u in inputs.T], (inputs.shape[1], len(starts))).T
-    steep = _steep(signal, starts, stops, top - _FAR * width)
+    steep = _steep(signal, starts, stops, top - _RULE.far * width)
     return FlatTops(unit, episode, top, width, values, stops - starts, steep, 1.5 * (middle - values), held)
 
 
@@ -129,9 +143,9 @@ def limit_of(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
         return None
     runs = (np.concatenate([getattr(f, name)[rows] for f, rows in at]) for name in _OF_RUNS)
     values, lengths, steep, bend, inputs = runs
-    often = len(lengths) >= _RUNS and len({(f.unit, f.episode) for f, _ in at}) >= _EPISODES
-    straight = abs(np.average(bend, weights=lengths)) <= _BENT * max(f.width for f, _ in at)
-    varied = np.all(np.ptp(inputs, axis=0) > _VARIED * ranges)
+    often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in at}) >= _RULE.episodes
+    straight = abs(np.average(bend, weights=lengths)) <= _RULE.bent * max(f.width for f, _ in at)
+    varied = np.all(np.ptp(inputs, axis=0) > _RULE.varied * ranges)
     if not (often and straight and varied and np.average(steep, weights=lengths) >= 0.5):
         return None
     units = tuple(dict.fromkeys(f.unit for f, _ in at))
@@ -145,7 +159,7 @@ def _width(signal: Array) -> float:
     floor = 1e-9 * float(np.abs(signal).max())
     np.abs(steps, out=steps)
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
-    return max(_NOISE * noise, 1.01 * smallest if np.isfinite(smallest) else floor)
+    return max(_RULE.noise * noise, 1.01 * smallest if np.isfinite(smallest) else floor)
 
 
 def _means(signal: Array, starts: Rows, stops: Rows) -> Array:

@@ -23,15 +23,13 @@ from ..readers.csv_folder import csv_files, file_fields, parquet_columns, parque
 from ..readers.csvfile import Dialect, read_columns
 from ..recording import some, usable
 from .dialect import ROWS, TableHead, look_at
-from .examine import Examined, examine
+from .examine import RULE, Examined, examine
 from .filenames import infer_names, quoted
 from .measures import SECONDS
 from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
 Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
-LOOKED_AT, SAMPLED = 15, 6  # files whose first lines, and whose numbers, say what columns are
-PIECES, SHORTEST_PIECE = 5, 200  # episodes that a single long recording is cut into, and the samples that each needs
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ def _names(paths: Sequence[str], expression: str | None) -> tuple[dict[str, Any]
 def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
     """Return how most files are written, those files, and the others."""
     paths = list(files.values())
-    heads = [h for path in paths[:: max(1, len(paths) // LOOKED_AT)] if (h := _head_of(path)) is not None]
+    heads = [h for path in paths[:: max(1, len(paths) // RULE.looked_at)] if (h := _head_of(path)) is not None]
     if not heads:
         problem = "none of the files looked at holds rows of numbers"
         raise DataError(f"Looking at {paths[0].parent}: {problem}; check the folder.")
@@ -153,7 +151,7 @@ def _columns(
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     described = _described(head)
     numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    samples = [_numbers(path, head, numeric) for path in paths[:: max(1, len(paths) // SAMPLED)]]
+    samples = [_numbers(path, head, numeric) for path in paths[:: max(1, len(paths) // RULE.sampled)]]
     samples = [s for s in samples if s.shape[1] > 2]
     if not samples:
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
@@ -292,8 +290,8 @@ def _examined(
         problem = f"none of {len(population.episodes)} episodes can be used; {key}: {why}"
         raise DataError(f"Looking at {source}: {problem}.")
     few = [group for group, n in examined.counts.items() if n < 2]
-    if few and 2 * len(few) > len(examined.counts) and examined.shortest >= PIECES * SHORTEST_PIECE:
-        mapping = mapping | {"pieces": PIECES}
+    if few and 2 * len(few) > len(examined.counts) and examined.shortest >= RULE.pieces * RULE.shortest_piece:
+        mapping = mapping | {"pieces": RULE.pieces}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
     findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]

@@ -18,11 +18,24 @@ from ..prepare import PreparedSource
 from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, check_increasing, title
 
 Array = npt.NDArray[np.float64]
-GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
-BRIDGED = 50.0  # median steps of a gap that is bridged, where a fifth of the episodes or more have gaps
-_MANY = 5
-_LONG_REST = 0.2  # of an episode, from which on a signal that stands still while others move is worth a word
-_SLOWER = 1.5  # times the median period, from which on an episode was sampled too slowly
+
+
+@dataclass(frozen=True)
+class DiscoveryRule:
+    """What recordings are judged by before a study exists."""
+
+    looked_at: int = 15  # files whose first lines say how all are written
+    sampled: int = 6  # files whose numbers say what columns are
+    pieces: int = 5  # episodes that a single long recording is cut into
+    shortest_piece: int = 200  # samples that each of them needs
+    gap: float = 10.0  # median steps that a step may take before it is a gap, as in the step `resample`
+    bridged: float = 50.0  # median steps of the longest gap that is bridged
+    often: float = 0.2  # share of episodes with gaps, from which on gaps are bridged
+    long_rest: float = 0.2  # of an episode, from which on a signal that stands still while others move is reported
+    slower: float = 1.5  # times the median period, from which on an episode was sampled too slowly
+
+
+RULE = DiscoveryRule()
 
 
 @dataclass(frozen=True)
@@ -60,9 +73,9 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
     usable_looks = [s for s in looks if not s.wrong]
     median = float(np.median([s.period_s for s in usable_looks])) if usable_looks else np.nan
-    gaps = [s.gap[0] for s in usable_looks if s.gap[0] and s.period_s <= _SLOWER * median]
-    many = _MANY * len(gaps) > len(usable_looks)
-    bridged = max((g for g in gaps if many and g <= BRIDGED * median), default=0.0)
+    gaps = [s.gap[0] for s in usable_looks if s.gap[0] and s.period_s <= RULE.slower * median]
+    many = len(gaps) > RULE.often * len(usable_looks)
+    bridged = max((g for g in gaps if many and g <= RULE.bridged * median), default=0.0)
     wrong = {s.key: problem for s in looks if (problem := _problem(s, median, bridged))}
     for key, other in copies_among((s.key, s.digest) for s in looks if s.digest and s.key not in wrong):
         wrong[key] = f"a copy of {other}"
@@ -90,7 +103,7 @@ def _problem(look: EpisodeLook, median: float, bridged: float) -> str:
     """Return why an episode cannot be used beside the others, or nothing."""
     if look.wrong:
         return look.wrong
-    if look.period_s > _SLOWER * median:
+    if look.period_s > RULE.slower * median:
         return f"sampled every {look.period_s:.3g} s, the others every {median:.3g} s"
     gap, sample = look.gap
     return f"a gap of {gap:.3g} s after sample {sample}" if gap > bridged else ""
@@ -127,7 +140,7 @@ def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
     deviation = np.abs(steps - period) / period
     worst = int(deviation.argmax())
     uneven = (float(deviation[worst]), worst) if deviation[worst] > TIME_TOLERANCE else look.uneven
-    gap = (float(steps[longest]), longest) if steps[longest] > GAP * period else look.gap
+    gap = (float(steps[longest]), longest) if steps[longest] > RULE.gap * period else look.gap
     return replace(look, period_s=period, uneven=uneven, gap=gap)
 
 
@@ -139,7 +152,7 @@ def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[
         ends = np.concatenate([[-1], np.flatnonzero(np.diff(values[:, i]) != 0), [len(values) - 1]])
         longest = int(np.diff(ends).argmax())
         start, stop = int(ends[longest]) + 1, int(ends[longest + 1]) + 1
-        if stop - start < max(50, _LONG_REST * len(values)):
+        if stop - start < max(50, RULE.long_rest * len(values)):
             continue
         moving = [channels[j].name for j in states if j != i and np.ptp(values[start:stop, j]) > 0.2 * ranges[j] > 0]
         if moving:

@@ -81,7 +81,7 @@ class CsvMapping(Settings):
         "alone takes any of them",
     )
     pieces: int = Field(
-        1, ge=1, description="a file is cut into so many episodes of equal length, `<episode>.1` and so on"
+        1, ge=1, le=100_000, description="a file is cut into so many episodes of equal length, `<episode>.1` and so on"
     )
     prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")

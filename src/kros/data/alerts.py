@@ -93,10 +93,9 @@ def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) ->
         if min(sizes) > 0 and slope @ speed > _RULE.correlated * sizes[0] * sizes[1]:
             decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
             if abs(abs(decades) - 3) < 0.05 or abs(abs(decades) - 6) < 0.05:
-                found = (
-                    f"{channels[other].name!r} is the slope of {channels[one].name!r} times {10.0 ** round(decades):g}"
-                )
-                yield f"{found} at the sampling period of {period_s:g} s: {UNUSUAL}, or the units of these channels."
+                slope_of = f"{channels[other].name!r} is the slope of {channels[one].name!r}"
+                factor = f"times {10.0 ** round(decades):g} at the sampling period of {period_s:g} s"
+                yield f"{slope_of} {factor}: {UNUSUAL}, or the units of these channels."
 
 
 def _sampling(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:

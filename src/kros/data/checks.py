@@ -132,10 +132,10 @@ class GroupWatch:
             others = sorted(r[s.channel] for key, r in self._ranges.items() if key != s.key)
             wild = s.beyond(others[(len(others) - 1) // 2] if others else 0.0)
             if wild.size:
-                found = f"{s.values[wild[0]]:g} at sample {s.samples[wild[0]]}"
+                actual = f"{s.values[wild[0]]:g} at sample {s.samples[wild[0]]}"
                 most = f"98 % of its samples are from {s.quantiles[0]:g} to {s.quantiles[2]:g}"
                 name = self._channels[s.channel].name
-                yield s.key, f"channel {name!r} is {found}, and {most} ({wild.size} such samples)"
+                yield s.key, f"channel {name!r} is {actual}, and {most} ({wild.size} such samples)"
 
     def check(self) -> None:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
@@ -171,8 +171,8 @@ def check_period(period_s: Any, what: str) -> float:
     except OverflowError:
         seconds = math.inf
     if not 1 / limits.MAX_VALUE < seconds < limits.MAX_VALUE:
-        wanted, found = "should be a number of seconds above zero", shortened(repr(period_s))
-        raise DataError(f"{what}: the sampling period {wanted}, found {found}; give it in seconds.")
+        wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
+        raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
     return seconds
 
 
@@ -199,8 +199,8 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
     copies = [(key, count) for key, count in Counter(episodes).items() if count > 1]
     if copies:
-        found = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
-        raise DataError(f"Duplicate episodes: {found}; rename or remove the copies.")
+        actual = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
+        raise DataError(f"Duplicate episodes: {actual}; rename or remove the copies.")
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:
@@ -226,9 +226,9 @@ def scan_digests(
 ) -> list[tuple[EpisodeKey, str]]:
     """Read and check every episode; return the usable ones with their digests. `look` is called with every episode."""
     groups = (keys for _, _, keys in population.groups())
-    found = [(key, digest) for keys in groups for key, _, digest in usable_episodes(population, keys, on_nan, look)]
-    refuse_copies(found)
-    return found
+    digests = [(key, digest) for keys in groups for key, _, digest in usable_episodes(population, keys, on_nan, look)]
+    refuse_copies(digests)
+    return digests
 
 
 def usable_episodes(

@@ -129,9 +129,9 @@ def flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: floa
     starts, stops = starts[long], stops[long]
     third = (stops - starts) // 3
     values, middle = _means(signal, starts, stops), _means(signal, starts + third, stops - third)
-    held = np.reshape([_means(u, starts, stops) for u in inputs.T], (inputs.shape[1], len(starts))).T
+    mean_inputs = np.reshape([_means(u, starts, stops) for u in inputs.T], (inputs.shape[1], len(starts))).T
     steep = _steep(signal, starts, stops, top - _RULE.far * width)
-    return FlatTops(unit, episode, top, width, values, stops - starts, steep, 1.5 * (middle - values), held)
+    return FlatTops(unit, episode, top, width, values, stops - starts, steep, 1.5 * (middle - values), mean_inputs)
 
 
 def limit_of(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:

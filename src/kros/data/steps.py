@@ -214,8 +214,8 @@ class Offset(Step):
         column, reference = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
             needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
-            found = f"the episode has {len(recording.values)}"
-            raise DataError(f"{title(recording.key)}: {needs}, {found}; leave the episode out.")
+            actual = f"the episode has {len(recording.values)}"
+            raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
         window = recording.values[self.start : self.stop]
         check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
         values = recording.values.copy()
@@ -419,8 +419,8 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
         return TypeAdapter(STEPS[name]).validate_python({key: v for key, v in table.items() if key != "step"})
     except ValidationError as error:
         problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
-        key, found = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
-        text = f"{key}: {problem['msg'].lower()}, found {found}"
+        key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
+        text = f"{key}: {problem['msg'].lower()}, found {actual}"
         if problem["type"] == "unexpected_keyword_argument":
             text = f"unknown key {key!r}{did_you_mean(key, known) or ';'} known keys are {', '.join(known)}"
         if problem["type"] == "missing":

@@ -121,7 +121,6 @@ class _Found:
 
     record: GroupRecord | None
     written: str | None
-    episodes: tuple[EpisodeKey, ...]
     resolution: dict[str, float]
     scanned: list[tuple[EpisodeKey, str]]
     alerts: tuple[str, ...]
@@ -204,7 +203,7 @@ def _facts(
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=tuple(dict.fromkeys(alerts)),
         reserve=tuple(options.reserve),
-        limits=_limits([f for f in found if f.episodes[0].unit not in outliers]),
+        limits=_limits([f for f in found if f.scanned[0][0].unit not in outliers]),
         digests=dict(pair for f in found for pair in f.scanned),
     )
 
@@ -232,9 +231,8 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Group) -> _Found:
     """Read, check and, where asked, write one unit and condition."""
     population, record = task.population, None
-    names = [c.name for c in population.channels]
-    inputs, hidden = slice(len(population.states), len(names)), set(population.states) - set(population.measured)
-    ends: dict[str, list[Ends]] = {name: [] for name in population.states if name in hidden}
+    names, inputs = [c.name for c in population.channels], slice(len(population.states), len(population.channels))
+    ends: dict[str, list[Ends]] = {name: [] for name in population.states if name not in population.measured}
     reach = np.array([[np.inf], [-np.inf]]) * np.ones(len(population.inputs))
     first: list[Array] = []
     sizes: list[Array] = []
@@ -261,7 +259,7 @@ def _read_group(task: _Group) -> _Found:
     steps = {name: resolution(first[0][:, names.index(name)]) for name in population.measured}
     alerts = period_alerts(first[0][:, : len(names)], population.channels, population.sample_period_s)
     written = None if record is None or task.folder is None else _digest(task.folder / record.file)
-    return _Found(record, written, tuple(key for key, _ in digests), steps, digests, alerts, ends, reach, sizes)
+    return _Found(record, written, steps, digests, alerts, ends, reach, sizes)
 
 
 def _digest(path: Path) -> str:
@@ -297,8 +295,9 @@ def _retained(population: Population, found: Sequence[_Found], folder: Path | No
         records = [replace(record, digests=digests) for record, digests in written if record is not None]
         write_index(population, records, folder, converted=False)
         return read_parquet(folder)
-    refuse_copies(pair for f in found for pair in f.scanned)
-    present = {key for f in found for key in f.episodes}
+    scanned = [pair for f in found for pair in f.scanned]
+    refuse_copies(scanned)
+    present = {key for key, _ in scanned}
     return replace(population, episodes=tuple(k for k in population.episodes if k in present))
 
 

@@ -60,8 +60,8 @@ def look_at(path: Path) -> TableHead:
     readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
     rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
     if _score(rows, decimal)[0] < 2:
-        found = f"no rows of numbers were found in its first {len(lines)} lines"
-        raise DataError(f"Reading {path}: {found}; is it a recording?")
+        actual = f"no rows of numbers were found in its first {len(lines)} lines"
+        raise DataError(f"Reading {path}: {actual}; is it a recording?")
     return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding.removesuffix("-sig")))
 
 

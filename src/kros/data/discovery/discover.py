@@ -203,10 +203,10 @@ def _time(
 def _no_time(columns: Sequence[TableColumn]) -> str:
     """Return why no column is time."""
     called = next((c.header for c in columns if c.kind == "time"), None)
-    found = f"found the columns {', '.join(repr(c.header) for c in columns)}"
+    actual = f"found the columns {', '.join(repr(c.header) for c in columns)}"
     if called is None:
-        return f"no column increases like time, {found}"
-    return f"{called!r} stands still or runs back in places, as rounded times do, {found}"
+        return f"no column increases like time, {actual}"
+    return f"{called!r} stands still or runs back in places, as rounded times do, {actual}"
 
 
 def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:

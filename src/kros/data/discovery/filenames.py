@@ -166,8 +166,8 @@ def _by_words(columns: list[tuple[str, ...]], i: int) -> str | None:
     plain = {re.sub(r"\d+$", "", v) for v in values}
     before = columns[i - 1][0].lower() if i and len(set(columns[i - 1])) == 1 else ""
     numbered = plain.pop() if len(plain) == 1 and all(re.search(r"\d", v) for v in values) else ""
-    told = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
-    role = next((role for role in _WORDS if role in told), None)
+    roles = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
+    role = next((role for role in _WORDS if role in roles), None)
     return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 

@@ -38,8 +38,8 @@ def declare_channels(
 ) -> tuple[Channel, ...]:
     """Return the channels as given, or those that the names declare."""
     if (channels is None) != bool(states):
-        found = f"found states = {list(states)} and channels = {channels!r}"
-        raise DataError(f"{what}: give the names of states, inputs and measured, or channels, {found}.")
+        actual = f"found states = {list(states)} and channels = {channels!r}"
+        raise DataError(f"{what}: give the names of states, inputs and measured, or channels, {actual}.")
     if channels is not None:
         return tuple(channels)
     for name, value in {"states": states, "inputs": inputs, "measured": measured}.items():
@@ -47,8 +47,8 @@ def declare_channels(
             raise DataError(f"{what}: {name} should be a list of names, found the text {value!r}; write [{value!r}].")
     if not measured or not set(measured) <= set(states):
         wanted = "measured should name the states that a running observer will be given"
-        found = f"found {list(measured)} for the states {list(states)}"
-        raise DataError(f"{what}: {wanted}, {found}; name one of them at least.")
+        actual = f"found {list(measured)} for the states {list(states)}"
+        raise DataError(f"{what}: {wanted}, {actual}; name one of them at least.")
     recorded = (Channel(s, Role.STATE, measured=s in measured) for s in states)
     return (*recorded, *(Channel(u, Role.INPUT) for u in inputs))
 
@@ -160,8 +160,8 @@ def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> Arra
     if isinstance(episode, Mapping):
         missing = next((name for name in names if name not in episode), None)
         if missing is not None:
-            found = f"channel {missing!r} is missing, found {list(episode)}"
-            raise DataError(f"{title(key)}: {found}; add it, or correct the names.")
+            actual = f"channel {missing!r} is missing, found {list(episode)}"
+            raise DataError(f"{title(key)}: {actual}; add it, or correct the names.")
         episode = tuple(episode[name] for name in names)
     try:
         parts = [as_numbers(part) for part in episode] if isinstance(episode, tuple) else []
@@ -227,8 +227,8 @@ def from_frame(
             f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays for arrays."
         )
     if (time is None) == (sample_period_s is None):
-        found = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
-        raise DataError(f"from_frame needs one of time and sample_period_s, {found}.")
+        actual = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
+        raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
     ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
     _check_columns(frame, [unit, *([time] if time else []), *(c.name for c in ordered)], [condition, episode])
     defaults = ((unit, ""), (condition, DEFAULT_CONDITION), (episode, "0"))
@@ -356,8 +356,8 @@ def _numbered_episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
     if not good.all():
         row = int(np.argmin(good))
         wanted = "the first column should number the episodes (as floating-point numbers below 2**53)"
-        found = f"found {column.tolist()[row]!r} in row {row} of unit {unit}"
-        raise DataError(f"from_pykoop: {wanted}, {found}; use an integer or object array.")
+        actual = f"found {column.tolist()[row]!r} in row {row} of unit {unit}"
+        raise DataError(f"from_pykoop: {wanted}, {actual}; use an integer or object array.")
     return [str(int(v) if kind == "f" else v) for v in column]
 
 

@@ -109,8 +109,8 @@ def read_csv_folder(
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
-        found = f"no file matches files = {chosen.files!r}{_sample(source)}"
-        raise DataError(f"Reading {source} as csv: {found}; correct the expression.")
+        actual = f"no file matches files = {chosen.files!r}{_sample(source)}"
+        raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
     time_scale = None if chosen.time is None else chosen.time_scale
     recordings = CsvRecordings(places, chosen.dialect, time_scale, chosen.timestamp)
     units = [Unit(unit, group) for unit, group in groups.items()]

@@ -174,8 +174,8 @@ def read_columns(
 def _skip(file: LimitedFile, lines: int, path: Path) -> None:
     for line in range(lines):
         if not file.readline():
-            found = f"{lines} lines stand before the numbers by the mapping, found {line} in all"
-            raise DataError(f"Reading {path}: {found}; correct skip_rows.")
+            actual = f"{lines} lines stand before the numbers by the mapping, found {line} in all"
+            raise DataError(f"Reading {path}: {actual}; correct skip_rows.")
 
 
 def _text(line: bytes, path: Path, encoding: str) -> str:

@@ -94,8 +94,8 @@ class ParquetRecordings(Recordings):
                 fill(values[:, column], table.column(channel))
             table.select(KEYS).validate(full=True)
             for name in KEYS:
-                expected, found = getattr(key, name), table.column(name).unique().to_pylist()
-                _require(found == [expected], path, f"the index says {name} {expected!r}, the samples say {found!r}")
+                expected, actual = getattr(key, name), table.column(name).unique().to_pylist()
+                _require(actual == [expected], path, f"the index says {name} {expected!r}, the samples say {actual!r}")
             return values
         except DataError:
             raise
@@ -119,8 +119,8 @@ def _read_group(path: Path, version: Version, place: Place, columns: list[str]) 
     _, group, samples = place
     options: dict[str, Any] = {"memory_map": True, "pre_buffer": False, "page_checksum_verification": True}
     with parquet.ParquetFile(path, metadata=_metadata(path, version), **options) as file:
-        found = file.metadata.row_group(group).num_rows
-        _require(found == samples, path, f"{samples} samples are expected in row group {group}, found {found}")
+        actual = file.metadata.row_group(group).num_rows
+        _require(actual == samples, path, f"{samples} samples are expected in row group {group}, found {actual}")
         if samples > limits.MAX_SAMPLES:
             advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
             raise DataError(f"Reading {path}: an episode has {samples} samples; {advice}.")

@@ -74,8 +74,8 @@ class Truth:
         lags, loaded = self.lag_rad, np.angle(self.response(loaded=True))
         units = {}
         for row, unit in enumerate(self.unit_ids):
-            own = {f.name: getattr(self.parameters, f.name)[row].tolist() for f in fields(self.parameters)}
-            units[unit] = {**own, "lag_rad": float(lags[row]), "lag_loaded_rad": float(loaded[row])}
+            values = {f.name: getattr(self.parameters, f.name)[row].tolist() for f in fields(self.parameters)}
+            units[unit] = {**values, "lag_rad": float(lags[row]), "lag_loaded_rad": float(loaded[row])}
         gains = {f.name: getattr(self.gains, f.name) for f in fields(self.gains)}
         return {"plant": "harmonic-drive", "loop": self.loop.value, "gains": gains, "units": units}
 

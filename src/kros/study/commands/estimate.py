@@ -39,12 +39,12 @@ class Estimated:
 
     def lines(self) -> list[str]:
         """Return it for people at a terminal, a line a unit where there is anything to say."""
-        units, said = dict.fromkeys([*self.parameters, *(u for u, own in self.samples.items() if own)]), []
+        units, lines = dict.fromkeys([*self.parameters, *(u for u, counts in self.samples.items() if counts)]), []
         for unit in units:
             parts = [f"parameters {self.parameters[unit]}"] if unit in self.parameters else []
             parts += [f"{count} samples {bit}" for bit, count in self.samples.get(unit, {}).items()]
-            said.append(f"unit {unit}: {'; '.join(parts)}")
-        return said
+            lines.append(f"unit {unit}: {'; '.join(parts)}")
+        return lines
 
 
 def estimate_recordings(

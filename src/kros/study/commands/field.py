@@ -79,8 +79,8 @@ class FieldRecordings:
             [i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True)
         )
         if others:
-            own = found.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], own)
+            parameters = found.parameters(observer, others)
+            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], parameters)
             estimates[:, others] = x[..., :n]
         if self.name is None:
             return estimates, None, status
@@ -97,10 +97,10 @@ class FieldRecordings:
         """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
         status = sample_status(self.observer, found.y, found.u) if status is None else status
         for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
-            own = counts.setdefault(unit, {})
+            of_unit = counts.setdefault(unit, {})
             for bit in SampleStatus:
                 if number := int(np.count_nonzero(status[:length, i] & bit)):
-                    own[str(bit.name)] = own.get(str(bit.name), 0) + number
+                    of_unit[str(bit.name)] = of_unit.get(str(bit.name), 0) + number
 
 
 def _settled(

@@ -71,8 +71,8 @@ def highest_levels(
     if monitor is None or not any(judged.any() for _, judged in innovations):
         return None, None
     squares = np.concatenate(monitor.in_turn(innovations))
-    own = condition if condition in monitor.bounds else None
-    return float(monitor.level(squares, own).max()), monitor.band_levels(squares.max(axis=0))
+    known = condition if condition in monitor.bounds else None
+    return float(monitor.level(squares, known).max()), monitor.band_levels(squares.max(axis=0))
 
 
 def level_text(row: dict[str, Any]) -> str:

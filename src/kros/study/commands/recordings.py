@@ -109,9 +109,11 @@ def unit_values(
         if parameter in values:
             found.sources[unit] = "given"
             continue
-        own = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
         try:
-            segments = segments_of((population, own.get(prefer) or next(iter(own.values())), calibration.spec))
+            segments = segments_of(
+                (population, by_condition.get(prefer) or next(iter(by_condition.values())), calibration.spec)
+            )
             values[parameter], found.sources[unit] = calibration.calibrate(segments, unit).phase_rad, "calibrated"
             if calibration.spec.measured not in population.states:
                 found.sources[unit] = f"calibrated on the derivative of {calibration.spec.angle}"

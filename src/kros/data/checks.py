@@ -121,7 +121,8 @@ class GroupWatch:
             few = np.sort(column[:: max(1, len(column) // 64)])
             if self._ranges[key][i] <= WILD * (few[-2] - few[1]):
                 continue  # a few samples show already that the channel moves as much
-            low, middle, high = np.percentile(column, (1, 50, 99))
+            outside = max(1, len(column) // 100)  # at each end; one at least, for short episodes
+            low, middle, high = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
             far = np.flatnonzero(np.abs(column - middle) > WILD * (high - low))
             if far.size:
                 self._suspects.append(_Suspects(key, i, far, column[far], (low, middle, high)))

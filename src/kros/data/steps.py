@@ -3,6 +3,12 @@
 Each step says what it does to the channels and the sampling period, so that a population can be described before
 anything is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a
 table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
+
+Examples
+--------
+>>> import kros
+>>> kros.data.steps.parse_steps([{"step": "shift", "channels": ["torque"], "lag": 1}])
+(Shift(channels=('torque',), lag=1),)
 """
 
 from __future__ import annotations

@@ -41,12 +41,14 @@ MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
 
 @dataclass(frozen=True)
 class HarmonicDrivePopulation(BatchSettings):
-    """Settings of a simulated batch of motor drives.
+    """Settings of a simulated batch of motor drives: those of `BatchSettings`, the loop and the conditions.
+
+    Episode `e` follows the same reference everywhere; the outlier has loose fasteners.
 
     Parameters
     ----------
-    n_units, n_episodes, seconds, seed, spread, outlier, outlier_severity
-        As in `BatchSettings`; episode `e` follows the same reference everywhere, the outlier has loose fasteners.
+    n_units : int
+        Units of the population, the outlier not counted.
     loop : Loop or str
         Stiff or soft velocity loop.
     conditions : tuple of str

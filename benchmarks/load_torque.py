@@ -33,7 +33,7 @@ from kros.observer import Observer, identify_predictor, relift_certificate, run_
 from kros.observer.residual.models import one_step_rows
 from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.control import COUNT_RAD
+from kros.plants.harmonic_drive.parameters import COUNT_RAD
 from kros.synthesis import kalman
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))

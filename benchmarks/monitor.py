@@ -6,7 +6,7 @@ One observer is designed for a loop, on a population of 12 drives of its own (se
 Then every seed is a population of the same distribution: 12 drives, 6 episodes of 12 s with and without load each, that the monitor's bounds are found
 on by `fit_monitor`, as a study does; 12 further good drives, 2 episodes of 14 s each, which count false alarms; and one faulty drive of every kind and
 severity, which has ten seconds of motion in each condition to be found. New drives follow other trajectories than those of training. Faults are those of
-the simulator: its badly assembled drive (`draw_outlier`; 1 is its default), all friction times a factor, all harmonics of the gearbox times a factor.
+the simulator: its badly assembled drive (`draw_parameters`; 1 is its default), all friction times a factor, all harmonics of the gearbox times a factor.
 Phases are the simulation's.
 
 Printed are counts over all seeds; rates of false alarms with exact 95 % intervals (binomial a unit, Poisson an hour of motion), with the condition
@@ -30,7 +30,7 @@ from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
 from kros.observer.monitor import poisson_interval
 from kros.observer.simulate import run_innovations
-from kros.plants.harmonic_drive.parameters import DriveParameters, concatenate, draw_outlier, draw_parameters
+from kros.plants.harmonic_drive.parameters import DriveParameters, draw_parameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 DESIGN_SEED, UNITS, EPISODES, SECONDS, WITHIN_S, RATE = 9041, 12, 6, 12.0, 10.0, 0.02
@@ -58,8 +58,8 @@ class Given(HarmonicDrivePopulation):
 def faulty(seed: int, kind: str, severity: float) -> DriveParameters:
     """Return one faulty drive."""
     if kind == "badly assembled":
-        return draw_outlier(seed, 1.0, severity)
-    good = draw_outlier(seed, 1.0, 0.0)
+        return draw_parameters(seed, 0, 1.0, severity)
+    good = draw_parameters(seed, 0, 1.0, 0.0)
     names = FRICTION if kind == "friction" else ("ripple",)
     return replace(good, **{name: getattr(good, name) * severity for name in names})
 
@@ -175,7 +175,12 @@ def main() -> None:
         counts["told"].add(rows, bounds)
         drives = faulty(seed, *kinds[0])
         for kind in kinds[1:]:
-            drives = concatenate(drives, faulty(seed, *kind))
+            drives = DriveParameters(
+                *(
+                    np.concatenate(pair)
+                    for pair in zip(vars(drives).values(), vars(faulty(seed, *kind)).values(), strict=True)
+                )
+            )
         for unit, condition, level, motion in levels(
             watched, record(drives, ELSEWHERE + seed, args.loop, 1, NEW_SECONDS)
         ):

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from kros.core.settings import Settings
 from kros.data.readers.csv_mapping import ChannelMapping, CsvMapping, UnitMapping
-from kros.data.steps.parsing import STEPS
+from kros.data.steps import STEPS
 from kros.study.config import StudyConfig
 
 LIMITS = {"gt": "above", "ge": "at least", "lt": "below", "le": "at most"}
@@ -89,32 +89,22 @@ def settings_rows(model: type[Settings]) -> list[tuple[str, str, str, str]]:
         ]
         value = ", ".join([written(field.annotation), *bounds])
         said = "required" if field.is_required() else default(None if field.default_factory else field.default)
-        rows.append((f"`{name}`", value, said, field.description or ""))
+        rows.append((f"`{field.alias or name}`", value, said, field.description or ""))
     return rows
 
 
-def documented(kind: type) -> dict[str, str]:
-    """Return what the section *Parameters* of a docstring says, by name."""
-    text = inspect.getdoc(kind) or ""
-    parts = re.split(r"^(\w+) : .*$", text.partition("----------\n")[2], flags=re.MULTILINE)
-    return {name: " ".join(says.split()) for name, says in zip(parts[1::2], parts[2::2], strict=True)}
-
-
-def dataclass_rows(kind: type) -> list[tuple[str, str, str, str]]:
-    """Return the rows of a table that is read into a dataclass."""
-    hints, says = typing.get_type_hints(kind), documented(kind)
-    rows = []
+def dataclass_rows(kind: type) -> list[tuple[str, str, str]]:
+    """Return key, value and default of a table that is read into a dataclass."""
+    hints, rows = typing.get_type_hints(kind), []
     for field in dataclasses.fields(kind):
-        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-        said = "required" if required else default(None if field.default is dataclasses.MISSING else field.default)
-        text = says.get(field.name, "").replace("``", "`")
-        rows.append((f"`{field.name}`", written(hints[field.name]), said, text))
+        said = "required" if field.default is dataclasses.MISSING else default(field.default)
+        rows.append((f"`{field.name}`", written(hints[field.name]), said))
     return rows
 
 
 def summary(kind: type) -> str:
     """Return the docstring before its sections, with code in single backticks."""
-    return (inspect.getdoc(kind) or "").split("\n\nParameters\n")[0].replace("``", "`")
+    return re.split(r"\n\n(?:Parameters|Examples)\n", inspect.getdoc(kind) or "")[0].replace("``", "`")
 
 
 def study_keys() -> str:
@@ -129,15 +119,16 @@ def study_keys() -> str:
 def mapping_keys() -> str:
     """Return a section for every table of a mapping."""
     kinds = {"### At the top": CsvMapping, "### `[[channel]]`": ChannelMapping, "### `[[unit]]`": UnitMapping}
-    return "\n".join(f"{title}\n\n{summary(kind)}\n\n{table(dataclass_rows(kind))}" for title, kind in kinds.items())
+    return "\n".join(f"{title}\n\n{summary(kind)}\n\n{table(settings_rows(kind))}" for title, kind in kinds.items())
 
 
 def step_keys() -> str:
     """Return a section for every preparation step."""
     parts = []
     for name, kind in STEPS.items():
-        rows = [row[:3] for row in dataclass_rows(kind)]
-        lines = "\n".join("| " + " | ".join(row) + " |" for row in [("key", "value", "default"), ("---",) * 3, *rows])
+        lines = "\n".join(
+            "| " + " | ".join(row) + " |" for row in [("key", "value", "default"), ("---",) * 3, *dataclass_rows(kind)]
+        )
         parts.append(f"### `{name}`\n\n{summary(kind)}\n\n{lines}\n")
     return "\n".join(parts)
 

@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kros.data import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, write_parquet
+from kros.data import Channel, EpisodeKey, Population, Role, Unit, write_parquet
+from kros.plants.batch import SimulatedEpisodes
 from kros.plants.harmonic_drive.reference import episode_reference
-from kros.plants.simulated import SimulatedEpisodes
 
 Array = npt.NDArray[np.float64]
 
@@ -80,7 +80,7 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "rad"),
     Channel("target_velocity", Role.INPUT, "rad/s"),
 )
-TRUTHS = (TrueChannel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
+TRUTHS = (Channel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
 
 
 def draw(seed: int, n_units: int, spread: float) -> dict[str, Array]:

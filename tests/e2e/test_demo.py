@@ -8,7 +8,7 @@ import pytest
 
 from kros.core.work import Work
 from kros.identify import ModelSet
-from kros.plants.harmonic_drive.control import VELOCITY_POLE
+from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
 from kros.study.engine.context import Context
 from kros.study.engine.executors import open_executor
 from kros.study.pipeline import load_run

@@ -155,7 +155,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     assert result.exit_code == 0, result.output
     for part in (
         "a copy of episode",
-        "'current' stays at 1.5 in all samples",
+        "'current' stays at 1.5 in all ",
         "a gap of",
         "1 files are not like the others and left alone: notes.csv",
     ):

@@ -9,12 +9,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from kros.plants import HarmonicDrivePopulation
-from kros.plants.harmonic_drive.control import GAINS, VELOCITY_POLE, Loop
-from kros.plants.harmonic_drive.dynamics import Physics
-from kros.plants.harmonic_drive.linear import disturbance_response
-from kros.plants.harmonic_drive.parameters import draw_parameters
+from kros.plants.harmonic_drive.dynamics import Physics, simulate
+from kros.plants.harmonic_drive.parameters import GAINS, VELOCITY_POLE, Loop, draw_parameters
 from kros.plants.harmonic_drive.reference import MAX_SPEED
-from kros.plants.harmonic_drive.simulation import simulate
+from kros.plants.harmonic_drive.truth import disturbance_response
 
 PERIOD = 1e-3
 TURN = 20  # samples of a motor revolution at full speed

@@ -6,7 +6,7 @@ from kros.core import StateSpace, gain
 from kros.core.errors import ConfigError
 from kros.data import Channel, Role
 from kros.evaluate.disturb import Disturbance, Kind
-from kros.plants.harmonic_drive.control import Loop
+from kros.plants.harmonic_drive.parameters import Loop
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 from kros.synthesis import Injection, ObserverProblem
 

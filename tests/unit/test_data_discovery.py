@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
+from kros.data.discovery.discover import discover
 from kros.data.discovery.filenames import infer_names
 from kros.data.discovery.measures import identifier, split_header
 from kros.data.discovery.roles import kind_of, time_scale
@@ -57,6 +59,14 @@ def test_conditions_groups_and_single_machines():
     )
     batches = infer_names([f"batch{b}/motor{u}/run{e}.csv" for b in (1, 2) for u in UNITS for e in EPISODES])
     assert re.search(batches.pattern, "batch1/motor2/run3.csv")["unit"] == "batch1/motor2"
+    seals = ["K_N_1bar.csv", "K_N_3bar.csv", "NAP310_1bar.csv", "NAP310_3bar.csv", "rig__O-ring257_1bar.csv"]
+    found = [re.search(infer_names(seals).pattern, name).groupdict() for name in seals]
+    assert [(m["unit"], m["condition"]) for m in found][1:] == [
+        ("K_N", "3bar"),
+        ("NAP310", "1bar"),
+        ("NAP310", "3bar"),
+        ("rig__O-ring257", "1bar"),
+    ]
     single = infer_names([f"qube_20240101T12{e}{e}00_43{e}_7{e}.csv" for e in EPISODES])
     assert "(?P<unit>" not in single.pattern
     assert infer_names(["only.csv"]).pattern == r"^only\.csv$"
@@ -165,3 +175,18 @@ def test_lines_before_the_numbers(tmp_path: Path):
     path.write_text("once upon a time\nthere was; a table\n")
     with pytest.raises(DataError, match=r"a\.csv: no rows of numbers were found in its first 2 lines"):
         look_at(path)
+
+
+def test_a_unit_that_lacks_a_condition_and_a_wild_sample_are_reported(tmp_path: Path):
+    rng = np.random.default_rng(0)
+    for unit, condition, episode in [(u, c, e) for u in "ab" for c in ("hot", "cold") for e in (1, 2, 3)]:
+        if (unit, condition) != ("b", "cold"):
+            values = np.column_stack([0.01 * np.arange(60), rng.normal(size=(60, 3))])
+            values[30, 2] *= 1e9 if (unit, condition, episode) == ("a", "hot", 2) else 1.0
+            path = tmp_path / f"unit_{unit}" / f"{condition}_run{episode}.csv"
+            path.parent.mkdir(exist_ok=True)
+            np.savetxt(path, values, delimiter=",", header="time,angle,speed,voltage", comments="")
+    found = discover(tmp_path)
+    assert len(found.population.episodes) == 8
+    assert any("not every unit was recorded in every condition: b lacks cold" in text for text in found.findings)
+    assert any(re.search(r"hot_run2\.csv: channel 'speed' is .* at sample 30,", text) for text in found.findings)

@@ -91,6 +91,39 @@ def test_pulses_and_channels_at_rest_are_no_wild_samples() -> None:
     assert len(survey(population(data))[0].episodes) == UNITS * EPISODES
 
 
+RESTS = {  # a channel that stands nearly still but for the last samples
+    "flag": lambda k: np.where(k < 4, 0.82 + 0.04 * k, 1.0),
+    "step up": lambda k: np.where(k > SAMPLES - 4, 3.0, 0.0),
+    "step down": lambda k: np.where(k > SAMPLES - 4, 0.0, 5.0),
+    "saturated": lambda k: np.where(k % 200 < 2, -2.0, 10.0),
+    "ramp from rest": lambda k: np.maximum(0.0, k - SAMPLES + 4),
+}
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3, 1e-5, 1e-7])
+@pytest.mark.parametrize("kind", RESTS)
+def test_channels_that_rest_for_nearly_all_of_an_episode_are_used(kind: str, noise: float) -> None:
+    data, rng = episodes(), np.random.default_rng(7)
+    for rows in data.values():
+        for values in rows:
+            for column in (1, 2):
+                values[:, column] = RESTS[kind](np.arange(SAMPLES)) + noise * rng.normal(size=SAMPLES)
+    assert len(survey(population(data))[0].episodes) == UNITS * EPISODES
+    data["u2"][3][200, 2] = 1e6
+    with pytest.raises(DataError, match=r"Episode 3 of unit u2 \(default\): channel 'torque' is 1e\+06 at sample 200,"):
+        survey(population(data))
+
+
+@pytest.mark.parametrize("level", [1.0, -20.0])
+def test_one_episode_alone_may_change_a_flag_for_a_few_samples(level: float) -> None:
+    data, rng = episodes(), np.random.default_rng(8)
+    for rows in data.values():
+        for values in rows:
+            values[:, 2] = level + 1e-6 * rng.normal(size=SAMPLES)
+    data["u0"][0][7:9, 2] = -level
+    assert len(survey(population(data))[0].episodes) == UNITS * EPISODES
+
+
 def test_short_episodes_are_named() -> None:
     data = episodes()
     data["u1"][3] = data["u1"][3][:50]

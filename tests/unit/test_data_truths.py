@@ -14,20 +14,19 @@ from kros.data import (
     EpisodeBatch,
     Population,
     Role,
-    TrueChannel,
     from_arrays,
     prepare,
     read,
     steps,
     write_parquet,
 )
+from kros.data.prepare import scale_population
 from kros.data.readers.parquet import read_parquet
-from kros.data.scaled import scale_population
 from kros.data.survey import survey
 from kros.plants import PLANTS
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
-TRUTH = TrueChannel("v_true", Role.TRUTH, of="v")
+TRUTH = Channel("v_true", Role.TRUTH, of="v")
 
 
 def recorded(channels: tuple[Channel, ...] = (TRUTH, *CHANNELS), seed: int = 3) -> Population:
@@ -61,7 +60,7 @@ def test_truths_are_written_prepared_and_scaled_with_their_states(tmp_path: Path
     for name, population in (("judged", judged), ("plain", prepare(recorded(CHANNELS), [steps.Trim(start=3)]))):
         write_parquet(population, tmp_path / name)
     again = read_parquet(tmp_path / "judged")
-    assert again.truths == (TrueChannel("v_true", Role.TRUTH, "mm/s", of="v"),)
+    assert again.truths == (Channel("v_true", Role.TRUTH, "mm/s", of="v"),)
     scaled = scale_population(again, {"v": 4.0})
     assert [t.unit for t in scaled.truths] == [""]
     for key in judged.episodes:
@@ -102,9 +101,9 @@ def test_a_csv_mapping_declares_a_truth(tmp_path: Path) -> None:
     "wrong",
     [
         (Channel("v_true", Role.TRUTH),),
-        (TrueChannel("v_true", Role.TRUTH, of="u"),),
-        (TrueChannel("v_true", Role.STATE, of="v"),),
-        (TRUTH, TrueChannel("v_other", Role.TRUTH, of="v")),
+        (Channel("v_true", Role.TRUTH, of="u"),),
+        (Channel("v_true", Role.STATE, of="v"),),
+        (TRUTH, Channel("v_other", Role.TRUTH, of="v")),
     ],
 )
 def test_a_truth_is_that_of_one_state(wrong: tuple[Channel, ...]) -> None:

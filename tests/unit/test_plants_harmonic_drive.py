@@ -14,7 +14,6 @@ from kros.plants.harmonic_drive.parameters import (
     NOMINAL,
     OUTLIER_LOG_FACTORS,
     RIPPLE_DEVIATION,
-    draw_outlier,
     draw_parameters,
 )
 
@@ -80,7 +79,7 @@ def test_spread_scales_the_stated_relative_deviations(spread):
 
 
 def test_outlier_is_loose_by_its_severity():
-    mild, loose = draw_outlier(2, 1.0, 0.0), draw_outlier(2, 1.0, 1.5)
+    mild, loose = (draw_parameters(2, 0, 1.0, severity) for severity in (0.0, 1.5))
     for name, log_factor in OUTLIER_LOG_FACTORS.items():
         np.testing.assert_allclose(getattr(loose, name), np.exp(1.5 * log_factor) * getattr(mild, name))
     np.testing.assert_array_equal(loose.motor_inertia, mild.motor_inertia)

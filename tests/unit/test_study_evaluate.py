@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Role, TrueChannel, from_arrays
+from kros.data import Channel, EpisodeKey, Role, from_arrays
 from kros.study.stages import evaluate
 
 STATES = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE)
-CHANNELS = (*STATES, Channel("u", Role.INPUT), TrueChannel("v_true", Role.TRUTH, of="v"))
+CHANNELS = (*STATES, Channel("u", Role.INPUT), Channel("v_true", Role.TRUTH, of="v"))
 
 
 def population_of(count):

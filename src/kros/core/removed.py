@@ -167,6 +167,10 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).",
         "kros.lifting.concatenate",
     ),
+    (
+        "TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).",
+        "kros.data.TrueChannel",
+    ),
 )
 
 

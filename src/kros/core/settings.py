@@ -47,8 +47,9 @@ class Settings(BaseModel):
         """Return the names that are known in a table inside these settings."""
         settings: Any = cls
         for name in place:  # a mapping's keys are free
-            settings = get_args(settings)[1] if get_origin(settings) is dict else settings.model_fields[name].annotation
-        return list(settings.model_fields)
+            held = get_args(settings)  # of a dict the keys and values, of a tuple the items
+            settings = held[get_origin(settings) is dict] if held else settings.model_fields[name].annotation
+        return [field.alias or name for name, field in settings.model_fields.items()]
 
 
 def require_kind(value: object, kind: type[T], asked: str, instead: str) -> T:

@@ -6,8 +6,9 @@ Examples
 --------
 >>> import numpy as np
 >>> from kros.data import Channel, Role, from_arrays
->>> channels = (Channel("angle", Role.STATE, "rad", measured=True), Channel("rate", Role.STATE, "rad/s"), Channel("torque", Role.INPUT, "N m"))
->>> population = from_arrays({"left": [np.zeros((50, 3))], "right": [np.ones((50, 3))]}, channels, sample_period_s=0.01)
+>>> states = Channel("angle", Role.STATE, "rad", measured=True), Channel("rate", Role.STATE, "rad/s")
+>>> channels = (*states, Channel("torque", Role.INPUT, "N m"))
+>>> population = from_arrays({"left": [np.zeros((50, 3))], "right": [np.ones((50, 3))]}, channels, 0.01)
 >>> population.measured, population.read(population.keys("right")[0]).shape
 (('angle',), (50, 3))
 """
@@ -15,15 +16,13 @@ Examples
 from ..core.removed import refusing
 from . import steps
 from .batch import EpisodeBatch
-from .population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, split_episodes
+from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes
 from .prepare import prepare
-from .readers.arrays import from_arrays
-from .readers.frame import from_frame
+from .readers.arrays import from_arrays, from_frame, from_pykoop, to_pykoop
+from .readers.motor_drive_raw import write_raw
 from .readers.opening import read
 from .readers.parquet import read_parquet
-from .readers.pykoop_array import from_pykoop, to_pykoop
 from .writers.parquet import write_parquet
-from .writers.raw import write_raw
 
 __all__ = [
     "Channel",
@@ -31,7 +30,6 @@ __all__ = [
     "EpisodeKey",
     "Population",
     "Role",
-    "TrueChannel",
     "Unit",
     "from_arrays",
     "from_frame",

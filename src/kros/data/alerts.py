@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -11,95 +12,98 @@ import numpy.typing as npt
 from .population import Channel, EpisodeKey, Role
 from .recording import some, title
 
-LONGEST_S, SHORTEST_S = (
-    0.5,
-    1e-6,
-)  # sampling periods outside are rare for machines, and usual for a time in ms or us taken for seconds
+Array = npt.NDArray[np.float64]
+LONGEST_S, SHORTEST_S = 0.5, 1e-6  # sampling periods outside are usual for a time in ms or us that is taken for seconds
 _FACTORS = {  # between units of measure that are mixed up, and what they are
-    57.29578: "degrees and radians",
-    9.549297: "revolutions per minute and radians per second",
-    6.283185: "revolutions and radians, or Hz and rad/s",
+    180 / np.pi: "degrees and radians",
+    30 / np.pi: "revolutions per minute and radians per second",
+    2 * np.pi: "revolutions and radians, or Hz and rad/s",
     60.0: "minutes and seconds",
     1000.0: "a unit and its thousandth",
 }
-_NEAR, _COMPACT = (
-    1.2,
-    3.0,
-)  # factor within which a ratio of sizes is one of these; factor that sizes may differ by on either side
-_CORRELATED = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
+UNUSUAL = "check the unit of the column of time (time_scale)"
 
 
-def period_alerts(values: npt.NDArray[np.float64], channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
+@dataclass(frozen=True)
+class AlertRule:
+    """From when on sizes speak for units of measure that are mixed up."""
+
+    near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
+    compact: float = 3.0  # by which sizes may differ on either side of it
+    apart: float = 0.6  # of the gap between both sides that sizes of one side may span
+    correlated: float = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
+
+
+_RULE = AlertRule()
+
+
+def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
     """Return what speaks against a sampling period."""
-    return (*_size(period_s), *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))
+    alerts = []
+    if not SHORTEST_S < period_s < LONGEST_S:
+        alerts.append(
+            f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s, "
+            "on which every frequency depends."
+        )
+    return (*alerts, *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))
 
 
-def size_of(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def size_of(values: Array) -> Array:
     """Return the range of every channel from the 5th to the 95th percentile, shape (n_channels,)."""
     low, high = np.percentile(values[:: max(1, len(values) // 2000)], (5, 95), axis=0)
     return np.asarray(high - low)
 
 
-def scale_alerts(sizes: Mapping[EpisodeKey, npt.NDArray[np.float64]], channels: Sequence[Channel]) -> tuple[str, ...]:
-    """Return which channels have sizes (`size_of`) of two kinds, a factor apart that lies between units of measure, with the units or episodes."""
-    texts = []
+def scale_alerts(sizes: Mapping[EpisodeKey, Array], channels: Sequence[Channel]) -> tuple[str, ...]:
+    """Return which channels have sizes (`size_of`) a factor apart that lies between units of measure, and where."""
+    alerts = []
     for i, channel in enumerate(channels):
         for condition in dict.fromkeys(key.condition for key in sizes):
-            own = {key: size[i] for key, size in sizes.items() if key.condition == condition and size[i] > 0}
-            units = {key.unit: float(np.median([v for k, v in own.items() if k.unit == key.unit])) for key in own}
-            found = _two_scales(units) or _two_scales({title(key): float(value) for key, value in own.items()})
-            if found is not None:
-                texts.append(
-                    f"{channel.name!r} ({condition}) is {found[1]:.3g} times {'smaller' if found[2] else 'larger'} in {some(found[0])} than in the "
-                    f"others: are its units of measure mixed up ({' or '.join(found[3])})?"
-                )
-    return tuple(texts)
+            episodes = {key: size[i] for key, size in sizes.items() if key.condition == condition and size[i] > 0}
+            of_unit = {u: [size for key, size in episodes.items() if key.unit == u] for u in {k.unit for k in episodes}}
+            text = _two_scales({unit: float(np.median(of)) for unit, of in of_unit.items()})
+            text = text or _two_scales({title(key): float(size) for key, size in episodes.items()})
+            alerts += [f"{channel.name!r} ({condition}) is {text}"] if text else []
+    return tuple(alerts)
 
 
-def _two_scales(sizes: Mapping[str, float]) -> tuple[list[str], float, bool, list[str]] | None:
-    """Return the fewer of two groups of sizes, the factor, whether it is the smaller one, and what the factor may be; None without."""
-    names = sorted(sizes, key=lambda name: sizes[name])
+def _two_scales(sizes: Mapping[str, float]) -> str:
+    """Return the fewer of two groups of sizes, the factor between them and what it may be, or nothing."""
+    names = sorted(sizes, key=lambda name: (sizes[name], name))
     logs = np.log([sizes[name] for name in names])
     if len(names) < 2:
-        return None
+        return ""
     cut = int(np.diff(logs).argmax()) + 1
     gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
-    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_NEAR)]
-    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_COMPACT), 0.6 * gap):
-        return None
+    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_RULE.near)]
+    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_RULE.compact), _RULE.apart * gap):
+        return ""
     smaller = cut <= len(names) - cut
-    return (names[:cut] if smaller else names[cut:]), float(np.exp(gap)), smaller, kinds
+    fewer = some(names[:cut] if smaller else names[cut:])
+    factor = f"{np.exp(gap):.3g} times {'smaller' if smaller else 'larger'}"
+    return f"{factor} in {fewer} than in the others: are its units of measure mixed up ({' or '.join(kinds)})?"
 
 
-def _size(period_s: float) -> Iterator[str]:
-    if not SHORTEST_S < period_s < LONGEST_S:
-        yield (
-            f"The sampling period of {period_s:g} s is unusual for a machine: check the unit of the column of time (time_scale) and sample_period_s, "
-            "on which every frequency depends."
-        )
-
-
-def _derivatives(values: npt.NDArray[np.float64], channels: Sequence[Channel], period_s: float) -> Iterator[str]:
-    """A state that is another one's slope, but for a factor of a thousand or a million: one of the units of time is another."""
+def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:
+    """A state that is another one's slope, but for a factor of a thousand or a million: units of time are mixed."""
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
     for one, other in permutations(states, 2):
         slope, speed = values[2:, one] - values[:-2, one], values[1:-1, other]  # of two periods
         sizes = np.linalg.norm(slope), np.linalg.norm(speed)
-        if min(sizes) > 0 and slope @ speed > _CORRELATED * sizes[0] * sizes[1]:
+        if min(sizes) > 0 and slope @ speed > _RULE.correlated * sizes[0] * sizes[1]:
             decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
             if abs(abs(decades) - 3) < 0.05 or abs(abs(decades) - 6) < 0.05:
-                yield (
-                    f"{channels[other].name!r} is the slope of {channels[one].name!r} times {10.0 ** round(decades):g} at the sampling period of "
-                    f"{period_s:g} s: check the unit of the column of time (time_scale), or the units of these channels."
-                )
+                slope_of = f"{channels[other].name!r} is the slope of {channels[one].name!r}"
+                factor = f"times {10.0 ** round(decades):g} at the sampling period of {period_s:g} s"
+                yield f"{slope_of} {factor}: {UNUSUAL}, or the units of these channels."
 
 
-def _sampling(values: npt.NDArray[np.float64], channels: Sequence[Channel], period_s: float) -> Iterator[str]:
+def _sampling(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:
     """Signals that change by as much as their own size from sample to sample: sampled too slowly, or noise."""
     states = values[:, [i for i, c in enumerate(channels) if c.role is Role.STATE]]
     step, size = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=0)), states.std(axis=0)
     if np.all(step > size) and np.all(size > 0):
         yield (
-            f"At the sampling period of {period_s:g} s every state changes by more than its own standard deviation from sample to sample: either "
-            "they hold noise alone, or samples are too far apart for a model of one step."
+            f"At the sampling period of {period_s:g} s every state changes by more than its own standard deviation "
+            "from sample to sample: they hold noise alone, or samples are too far apart for a model of one step."
         )

@@ -1,6 +1,7 @@
 """Between NumPy and Arrow through bare buffers.
 
-`pyarrow.array` and `to_numpy` import pandas wherever it is installed, which costs every process more than half a second; these do not.
+`pyarrow.array` and `to_numpy` import pandas wherever it is installed, which costs every process more than half a
+second; these do not.
 """
 
 from __future__ import annotations

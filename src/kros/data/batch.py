@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -65,9 +66,9 @@ class EpisodeBatch:
         parameters: Mapping[str, Mapping[str, float]] | None = None,
         truths: bool = False,
     ) -> EpisodeBatch:
-        """Read episodes, each cut to at most `max_samples`; `parameters` are lifting parameters by unit and name, kept where all units have them.
+        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have.
 
-        With `truths` also what states really were, for judging.
+        With `truths` also what states really were, for evaluation.
         """
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
@@ -77,16 +78,9 @@ class EpisodeBatch:
         values = _side_by_side([e[:max_samples] for e, _ in pairs], lengths)
         true = _side_by_side([t[:max_samples] for _, t in pairs], lengths) if truths and population.truths else None
         rows = [(parameters or {}).get(k.unit, {}) for k in keys]
-        own = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
-        return cls(
-            tuple(keys),
-            lengths,
-            values[..., :n],
-            np.ascontiguousarray(values[..., n:]),
-            population.sample_period_s,
-            own,
-            truths=true,
-        )
+        shared = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+        inputs = np.ascontiguousarray(values[..., n:])
+        return cls(tuple(keys), lengths, values[..., :n], inputs, population.sample_period_s, shared, truths=true)
 
     @property
     def units(self) -> tuple[str, ...]:
@@ -104,33 +98,24 @@ class EpisodeBatch:
 
     def head(self, n_samples: int) -> EpisodeBatch:
         """Return the same episodes, cut to so many samples."""
-        lengths, inputs = np.minimum(self.lengths, n_samples), np.ascontiguousarray(self.inputs[:n_samples])
-        shown, lost = (
-            None if self.shown is None else self.shown[:n_samples],
-            None if self.lost is None else self.lost[:n_samples],
-        )
-        truths = None if self.truths is None else self.truths[:n_samples]
-        return replace(
-            self, lengths=lengths, states=self.states[:n_samples], inputs=inputs, shown=shown, lost=lost, truths=truths
-        )
+        return replace(self, lengths=np.minimum(self.lengths, n_samples), **self._signals(np.s_[:n_samples]))
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
         """Return some of the episodes."""
         rows = list(rows)
-        return replace(
-            self,
-            keys=tuple(self.keys[i] for i in rows),
-            lengths=self.lengths[rows],
-            states=self.states[:, rows],
-            inputs=np.ascontiguousarray(self.inputs[:, rows]),
-            parameters={name: values[rows] for name, values in self.parameters.items()},
-            shown=None if self.shown is None else self.shown[:, rows],
-            lost=None if self.lost is None else self.lost[:, rows],
-            truths=None if self.truths is None else self.truths[:, rows],
-        )
+        parameters = {name: values[rows] for name, values in self.parameters.items()}
+        keys = tuple(self.keys[i] for i in rows)
+        signals = self._signals(np.s_[:, rows])
+        return replace(self, keys=keys, lengths=self.lengths[rows], parameters=parameters, **signals)
+
+    def _signals(self, part: Any) -> dict[str, Any]:
+        """Return a part of every signal, by samples or by episodes."""
+        signals = {name: getattr(self, name) for name in ("states", "inputs", "shown", "lost", "truths")}
+        parts = {name: None if signal is None else signal[part] for name, signal in signals.items()}
+        return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
     def first_states(self, history: int = 0) -> Array:
-        """Return what a free run starts from: the first states of every episode, and those that a lifting's delays of up to `history` need.
+        """Return what a simulation starts from: the first states of every episode, with `history` more for delays.
 
         Returns
         -------
@@ -146,13 +131,14 @@ class EpisodeBatch:
         for key, length in zip(self.keys, self.lengths, strict=True):
             if length < history + 1:
                 raise DataError(
-                    f"Free run over {key}: needs {history + 1} samples for delays of up to {history}, found {length}; leave the episode out."
+                    f"Simulation of {key}: needs {history + 1} samples for delays of up to {history}, found {length}; "
+                    "leave the episode out."
                 )
         return np.swapaxes(self.states[: history + 1], 0, 1)
 
 
 def hold_missing(y: Array) -> Array:
-    """Return measurements, shape (n_samples, ...), with the last one that arrived in place of those that are missing, zero before the first."""
+    """Return measurements, (n_samples, ...), with the last that arrived for those that are missing, zero before it."""
     there = np.isfinite(y)
     if there.all():
         return y

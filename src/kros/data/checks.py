@@ -1,4 +1,4 @@
-"""Checks of content: what makes an episode or a population unusable, said in full before anything is computed from it."""
+"""Checks of content: what makes an episode or a population unusable, reported in full before anything is computed."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import math
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from hashlib import sha256
 from numbers import Real
 from typing import Any
 
@@ -16,19 +18,16 @@ import numpy.typing as npt
 from ..core import limits
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened
-from .copies import digest_of, refuse_copies
-from .population import OUTLIERS, Channel, EpisodeKey, Population, Role, TrueChannel
+from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from .recording import title, usable
 
 logger = logging.getLogger(__name__)
-Look = Callable[[EpisodeKey, npt.NDArray[np.float64]], None]
+Array = npt.NDArray[np.float64]
+Look = Callable[[EpisodeKey, Array], None]
 
 ON_NAN = ("error", "drop_episode")
 MIN_SAMPLES = 3  # two consecutive states and one more
-_BEYOND, _LARGEST = (
-    1e3,
-    1e100,
-)  # times the range of 98 % of the samples; the largest number where these stand still, whose square is a number
+WILD = 1e3  # times the size of a channel, from which on a sample is wild
 _ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
@@ -36,40 +35,25 @@ class NonFiniteError(DataError):
     """An episode holds NaN or infinity."""
 
 
-def check_episode(
-    values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
-) -> None:
-    """Check one episode's samples."""
+def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
+    """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
     if values.ndim != 2 or values.shape[1] != len(channels):
-        raise DataError(
-            f"{title(key)}: {len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape "
-            f"{values.shape}; transpose or correct it."
-        )
+        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared"
+        raise DataError(f"{title(key)}: {declared}, found an array of shape {values.shape}; transpose or correct it.")
     if len(values) < MIN_SAMPLES:
-        raise DataError(
-            f"{title(key)}: at least {MIN_SAMPLES} samples are needed, found {len(values)}; leave the episode out or record longer."
-        )
-    if not gaps:
-        if not usable(values).all():
-            check_finite(values, key, channels)
-        check_range(values, key, channels)
-    _check_moving(values, key, channels)
-
-
-def _check_moving(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
-    """Refuse a state that stands still for the whole episode while anything else moves."""
+        need = f"at least {MIN_SAMPLES} samples are needed, found {len(values)}"
+        raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
+    if not gaps and not usable(values).all():
+        check_finite(values, key, channels)
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
-    if not still:
-        return
-    moving = [c.name for i, c in enumerate(channels) if i not in still and not is_constant(values[:, i])]
+    moving = [c.name for i, c in enumerate(channels) if still and i not in still and not is_constant(values[:, i])]
     if moving:
-        raise DataError(
-            f"{title(key)}: state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples while "
-            f"{', '.join(repr(name) for name in moving)} move, so its sensor is stuck or the column is wrong; leave the episode out, or the channel."
-        )
+        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
+        reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
+        raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: npt.NDArray[np.float64]) -> bool:
+def is_constant(column: Array) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
     room = _ROUNDING * abs(column[0])
     lower, upper = column[0] - room, column[0] + room
@@ -77,11 +61,7 @@ def is_constant(column: npt.NDArray[np.float64]) -> bool:
 
 
 def check_finite(
-    values: npt.NDArray[np.float64],
-    key: EpisodeKey,
-    channels: Sequence[Channel],
-    first: int = 0,
-    columns: Iterable[int] | None = None,
+    values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0, columns: Iterable[int] | None = None
 ) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for column in range(len(channels)) if columns is None else columns:
@@ -89,70 +69,90 @@ def check_finite(
         if bad.size:
             kinds = " and ".join(sorted({_kind(v) for v in values[bad, column]}))
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
-            raise NonFiniteError(
-                f"{title(key)}: channel {channels[column].name!r} has {bad.size} {kinds} at {where}; fix the source or set "
-                'data.on_nan = "drop_episode".'
-            )
-
-
-def check_range(values: npt.NDArray[np.float64], key: EpisodeKey, channels: Sequence[Channel]) -> None:
-    """Refuse a sample that is farther from the median than a thousand times the range from the 1st to the 99th percentile."""
-    for i, channel in enumerate(channels):
-        finite = np.flatnonzero(np.isfinite(values[:, i]))
-        column = values[finite, i]
-        if len(column) < MIN_SAMPLES:
-            continue
-        few = np.sort(column[:: max(1, len(column) // 64)])
-        with np.errstate(over="ignore", invalid="ignore"):
-            if np.abs(column[[column.argmin(), column.argmax()]] - few[len(few) // 2]).max() <= _BEYOND * (
-                few[-2] - few[1]
-            ):
-                continue  # a few samples show already that the channel moves as much
-            low, middle, high = np.percentile(column, (1, 50, 99))
-            bad = np.flatnonzero(np.abs(column - middle) > (_BEYOND * (high - low) if high > low else _LARGEST))
-        if bad.size:
-            raise DataError(
-                f"{title(key)}: channel {channel.name!r} is {column[bad[0]]:g} at sample {finite[bad[0]]}, and 98 % of its samples are "
-                f"from {low:g} to {high:g} ({bad.size} such samples); fix the source, or leave the episode out."
-            )
+            advice = 'fix the source or set data.on_nan = "drop_episode"'
+            name = channels[column].name
+            raise NonFiniteError(f"{title(key)}: channel {name!r} has {bad.size} {kinds} at {where}; {advice}.")
 
 
 def _kind(value: float) -> str:
-    return "NaN" if np.isnan(value) else "infinity" if np.isinf(value) else f"above {limits.MAX_VALUE:g}"
+    """Return what an unusable value is."""
+    if np.isnan(value):
+        return "NaN"
+    return "infinity" if np.isinf(value) else f"above {limits.MAX_VALUE:g}"
 
 
-class RestWatch:
-    """Notice inputs and states that never change over all episodes of one unit and condition."""
+@dataclass(frozen=True, eq=False)
+class _Suspects:
+    """Samples of a channel that are far from the others of their episode."""
+
+    key: EpisodeKey
+    channel: int
+    samples: npt.NDArray[np.int64]
+    values: Array
+    quantiles: tuple[float, float, float]  # 1 %, 50 % and 99 % of the episode
+
+    def beyond(self, range_elsewhere: float) -> npt.NDArray[np.int64]:
+        """Return which are wild: |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0."""
+        low, middle, high = self.quantiles
+        size = max(high - low, abs(low), abs(high), range_elsewhere)
+        return np.flatnonzero((np.abs(self.values - middle) > WILD * size) & (size > 0))
+
+
+class GroupWatch:
+    """What only the episodes of one unit and condition tell together: channels that never move, and wild samples.
+
+    A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
+    values, and what it moves by in half of the other episodes.
+    """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
-        self._columns = [(i, c.name, c.role) for i, c in enumerate(channels) if c.role in (Role.INPUT, Role.STATE)]
-        self._resting: dict[int, float] = {}
-        self._seen = 0
+        self._channels = channels
+        self._resting: list[dict[int, float]] = []
+        self._ranges: dict[EpisodeKey, Array] = {}
+        self._suspects: list[_Suspects] = []
 
-    def add(self, values: npt.NDArray[np.float64]) -> None:
-        """Look at one more episode."""
-        resting = {i: float(values[0, i]) for i, _, _ in self._columns if is_constant(values[:, i])}
-        if self._seen:
-            states = {i for i, _, role in self._columns if role is Role.STATE}
-            resting = {i: v for i, v in self._resting.items() if i in resting and (i in states or resting[i] == v)}
-        self._resting = resting
-        self._seen += 1
+    def add(self, key: EpisodeKey, values: Array) -> None:
+        """Look at one more episode, all of whose samples are usable."""
+        roles = [(i, c.role) for i, c in enumerate(self._channels)]
+        signals = [i for i, role in roles if role is not Role.TRUTH and is_constant(values[:, i])]
+        self._resting.append({i: float(values[0, i]) for i in signals})
+        self._ranges[key] = np.ptp(values, axis=0)
+        for i, column in enumerate(values.T):
+            few = np.sort(column[:: max(1, len(column) // 64)])
+            if self._ranges[key][i] <= WILD * (few[-2] - few[1]):
+                continue  # a few samples show already that the channel moves as much
+            outside = max(1, len(column) // 100)  # at each end; one at least, for short episodes
+            low, middle, high = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
+            far = np.flatnonzero(np.abs(column - middle) > WILD * (high - low))
+            if far.size:
+                self._suspects.append(_Suspects(key, i, far, column[far], (low, middle, high)))
 
-    def check(self, unit: str, condition: str) -> None:
-        """Raise DataError where an input or a state never changed."""
-        for i, name, role in self._columns:
-            if i not in self._resting:
-                continue
-            if role is Role.STATE:
-                raise DataError(
-                    f"Unit {unit} ({condition}): state {name!r} stays where it is in each of {self._seen} episodes, in the first at "
-                    f"{self._resting[i]:g}; check the sensor and the column, or leave the unit out."
-                )
-            raise DataError(
-                f"Unit {unit} ({condition}): input {name!r} stays at {self._resting[i]:g} in all {self._seen} "
-                "episodes, so nothing can be learned from it; "
-                "check the column, or remove the channel."
-            )
+    def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
+        """Yield the episodes with wild samples, and where these are."""
+        for s in self._suspects:
+            others = sorted(r[s.channel] for key, r in self._ranges.items() if key != s.key)
+            wild = s.beyond(others[(len(others) - 1) // 2] if others else 0.0)
+            if wild.size:
+                actual = f"{s.values[wild[0]]:g} at sample {s.samples[wild[0]]}"
+                most = f"98 % of its samples are from {s.quantiles[0]:g} to {s.quantiles[2]:g}"
+                name = self._channels[s.channel].name
+                yield s.key, f"channel {name!r} is {actual}, and {most} ({wild.size} such samples)"
+
+    def check(self) -> None:
+        """Raise DataError for wild samples, and for an input or a state that never changed."""
+        for key, problem in self.wild():
+            raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
+        first = self._resting[0] if self._resting else {}
+        for i in sorted(set(first).intersection(*self._resting)):
+            key, channel = next(iter(self._ranges)), self._channels[i]
+            what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays"
+            count = f"{len(self._resting)} episodes"
+            if channel.role is Role.STATE:
+                place = f"where it is in each of {count}, in the first at {first[i]:g}"
+                raise DataError(f"{what} {place}; check the sensor and the column, or leave the unit out.")
+            if all(resting[i] == first[i] for resting in self._resting):
+                place = f"at {first[i]:g} in all {count}, so nothing can be learned from it"
+                raise DataError(f"{what} {place}; check the column, or remove the channel.")
 
 
 def check_names(kind: str, names: Iterable[Any]) -> None:
@@ -161,9 +161,8 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
         if not isinstance(name, str) or not name.strip():
             raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
         if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-            raise DataError(
-                f"The name of a {kind} should hold printable characters in UTF-8 only, found {name!r}; rename it."
-            )
+            wanted = "should hold printable characters in UTF-8 only"
+            raise DataError(f"The name of a {kind} {wanted}, found {name!r}; rename it.")
 
 
 def check_period(period_s: Any, what: str) -> float:
@@ -173,10 +172,8 @@ def check_period(period_s: Any, what: str) -> float:
     except OverflowError:
         seconds = math.inf
     if not 1 / limits.MAX_VALUE < seconds < limits.MAX_VALUE:
-        found = shortened(repr(period_s))
-        raise DataError(
-            f"{what}: the sampling period should be a number of seconds above zero, found {found}; give it in seconds."
-        )
+        wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
+        raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
     return seconds
 
 
@@ -185,97 +182,97 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
     check_names("channel", [c.name for c in channels])
     for kind in ("unit", "condition", "episode"):
         check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
-    twice = [name for name, count in Counter(c.name for c in channels).items() if count > 1]
+    names = [c.name for c in channels]
+    twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
-        raise DataError(
-            f"Channel names should differ, found {twice} more than once in {[c.name for c in channels]}; rename them."
-        )
-    if not any(c.role is Role.STATE for c in channels):
-        raise DataError(
-            f"A population needs at least one channel with role 'state', found {[(c.name, c.role.value) for c in channels]}; declare one."
-        )
-    _check_truths(channels)
+        raise DataError(f"Channel names should differ, found {twice} more than once in {names}; rename them.")
+    states = [c.name for c in channels if c.role is Role.STATE]
+    if not states:
+        roles = [(c.name, c.role.value) for c in channels]
+        raise DataError(f"A population needs at least one channel with role 'state', found {roles}; declare one.")
+    owners = [c.of for c in channels if c.role is Role.TRUTH]
+    wrong = any(bool(c.of) != (c.role is Role.TRUTH) for c in channels)
+    if wrong or len(set(owners)) < len(owners) or not set(owners) <= set(states):
+        wanted = f"says with `of` which state it is the truth of, each of another one of {states}"
+        truths = [(c.name, c.of) for c in channels if c.of or c.role is Role.TRUTH]
+        raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
-    doubled = [key for key, count in Counter(episodes).items() if count > 1]
-    if doubled:
-        raise DataError(
-            f"Duplicate episodes: {doubled[0]} occurs {episodes.count(doubled[0])} times ({len(doubled)} such episodes); "
-            "rename or remove the copies."
-        )
-
-
-def _check_truths(channels: Sequence[Channel]) -> None:
-    """Refuse truths of what is no state, and two of the same."""
-    states, owners = (
-        [c.name for c in channels if c.role is Role.STATE],
-        [getattr(c, "of", "") for c in channels if c.role is Role.TRUTH],
-    )
-    if (
-        set(owners) <= set(states)
-        and len(set(owners)) == len(owners)
-        and all(isinstance(c, TrueChannel) == (c.role is Role.TRUTH) for c in channels)
-    ):
-        return
-    raise DataError(
-        f"A channel with role 'truth' says with `of` which state it is the truth of, each of another one of {states}, found "
-        f"{[(c.name, getattr(c, 'of', '')) for c in channels if isinstance(c, TrueChannel) or c.role is Role.TRUTH]}; correct them."
-    )
+    copies = [(key, count) for key, count in Counter(episodes).items() if count > 1]
+    if copies:
+        actual = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
+        raise DataError(f"Duplicate episodes: {actual}; rename or remove the copies.")
 
 
 def check_population(population: Population, allow_single: bool = False) -> None:
-    """Check what can be told without reading: not empty, no duplicates, a state, a measured state, more than one unit."""
+    """Check what needs no reading: not empty, no duplicates, a state, a measured state, more than one unit."""
     check_structure(population.columns, population.episodes)
     if not population.measured:
         raise DataError(
             f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; "
             "declare measured = true for at least one."
         )
-    if not allow_single:
-        recorded = {key.unit for key in population.episodes}
-        units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
-        if len(units) < 2:
-            raise DataError(
-                f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} "
-                f"({', '.join(units) or 'none'}): uncertainty is the difference "
-                'between units; add recordings of more units, or stop after identification ("--until identify").'
-            )
+    recorded = {key.unit for key in population.episodes}
+    units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
+    if len(units) < 2 and not allow_single:
+        raise DataError(
+            f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} "
+            f"({', '.join(units) or 'none'}): uncertainty is the difference between units; add recordings of more "
+            'units, or stop after identification ("--until identify").'
+        )
 
 
 def scan_digests(
     population: Population, on_nan: str = "error", look: Look | None = None
 ) -> list[tuple[EpisodeKey, str]]:
-    """Read and check every episode, and return those that are left with their digests; `look` is shown the samples of each."""
-    kept = [
-        (key, digest)
-        for _, _, keys in population.groups()
-        for key, _, digest in usable_episodes(population, keys, on_nan, look)
-    ]
-    refuse_copies(kept)
-    return kept
+    """Read and check every episode; return the usable ones with their digests. `look` is called with every episode."""
+    groups = (keys for _, _, keys in population.groups())
+    digests = [(key, digest) for keys in groups for key, _, digest in usable_episodes(population, keys, on_nan, look)]
+    refuse_copies(digests)
+    return digests
 
 
 def usable_episodes(
     population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
-) -> Iterator[tuple[EpisodeKey, npt.NDArray[np.float64], str]]:
-    """Yield the episodes of one unit and condition that pass all checks, all columns of their samples and their digest."""
+) -> Iterator[tuple[EpisodeKey, Array, str]]:
+    """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
     if on_nan not in ON_NAN:
         raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
-    columns = population.columns
-    watch = RestWatch(columns)
-    key = None
+    watch = GroupWatch(population.columns)
     for key in keys:
         try:
             values = population.source(key)
-            check_episode(values, key, columns)
+            check_episode(values, key, population.columns)
         except NonFiniteError as error:
             if on_nan == "error":
                 raise
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
-        watch.add(values)
+        watch.add(key, values)
         if look is not None:
             look(key, values)
         yield key, values, digest_of(values)
-    if key is not None:
-        watch.check(key.unit, key.condition)
+    watch.check()
+
+
+def digest_of(values: Array) -> str:
+    """Return the digest of all samples of an episode, shape (n_samples, n_channels)."""
+    values = np.ascontiguousarray(values) + 0.0  # one zero
+    digest = sha256(repr(values.shape).encode())
+    digest.update(values.data)
+    return digest.hexdigest()
+
+
+def copies_among(digests: Iterable[tuple[EpisodeKey, str]]) -> Iterator[tuple[EpisodeKey, EpisodeKey]]:
+    """Yield the episodes that are copies of earlier ones, with these."""
+    first: dict[str, EpisodeKey] = {}
+    for key, digest in digests:
+        if first.setdefault(digest, key) != key:
+            yield key, first[digest]
+
+
+def refuse_copies(digests: Iterable[tuple[EpisodeKey, str]]) -> None:
+    """Refuse copies, which put test episodes into training and one machine's data into another."""
+    for key, other in copies_among(digests):
+        reason = "a copy leaks test episodes into training and makes units look alike"
+        raise DataError(f"{title(key)} is a copy of {other}, sample by sample; {reason}, so remove one of them.")

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cached_property, lru_cache
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,6 @@ DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
 EpisodeSource = Callable[["EpisodeKey"], npt.NDArray[np.float64]]
 Source = TypeVar("Source")
-AnyChannel = TypeVar("AnyChannel", bound="HasRole")
 
 
 class Role(str, Enum):
@@ -40,15 +39,7 @@ class Role(str, Enum):
 
     STATE = "state"
     INPUT = "input"
-    TRUTH = "truth"  # what a state really was: for judging only
-
-
-class HasRole(Protocol):
-    """A channel, or what describes one."""
-
-    @property
-    def role(self) -> Role:
-        """What the channel is to the model."""
+    TRUTH = "truth"  # what a state really was: for evaluation only
 
 
 @dataclass(frozen=True)
@@ -63,6 +54,8 @@ class Channel:
         Unit of measure, for example ``rad/s``; empty where unknown.
     measured : bool
         Whether a state is available at run time; synthesis uses exactly those as ``y``.
+    of : str
+        For the role ``truth``: the state that it is the truth of, in the same unit of measure.
 
     Examples
     --------
@@ -74,28 +67,10 @@ class Channel:
     role: Role
     unit: str = ""
     measured: bool = False
+    of: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "role", member(Role, self.role, f"Channel {self.name}: the role"))
-
-
-@dataclass(frozen=True)
-class TrueChannel(Channel):
-    """What a recorded state really was, from a simulator or a better sensor; it judges estimates and enters nothing else.
-
-    Parameters
-    ----------
-    of : str
-        The state that it is the truth of, in the same unit of measure.
-
-    Examples
-    --------
-    >>> from kros.data import Role, TrueChannel
-    >>> TrueChannel("true velocity", Role.TRUTH, "rad/s", of="velocity").of
-    'velocity'
-    """
-
-    of: str = ""
 
 
 @dataclass(frozen=True)
@@ -146,19 +121,16 @@ def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
     return source if restricted is None else restricted(keys)
 
 
-def columns_in_order(channels: Iterable[AnyChannel]) -> tuple[AnyChannel, ...]:
-    """Return channels, or what describes them, in the order of a source's columns: states, inputs, truths."""
-    roles = list(Role)
-    return tuple(sorted(channels, key=lambda c: roles.index(c.role)))
+def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
+    """Return what has a `role` in the order of a source's columns: states, inputs, truths."""
+    return tuple(sorted(channels, key=lambda c: list(Role).index(c.role)))
 
 
 def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
     columns = tuple(columns)
-    return {
-        "channels": tuple(c for c in columns if c.role is not Role.TRUTH),
-        "truths": tuple(c for c in columns if c.role is Role.TRUTH),
-    }
+    truths = tuple(c for c in columns if c.role is Role.TRUTH)
+    return {"channels": tuple(c for c in columns if c not in truths), "truths": truths}
 
 
 @dataclass(frozen=True)
@@ -185,10 +157,10 @@ class Population:
         Returns an episode's samples, float64, shape (n_samples, n_channels + n_truths).
     metadata : mapping
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
-    truths : tuple of TrueChannel
-        Further columns of the source, behind the inputs: what some states really were. No model and no observer sees them.
+    truths : tuple of Channel
+        Further columns of the source, behind the inputs: what some states really were. For evaluation only.
     scaling : mapping of str to Scaling
-        The columns that channels were read from, and how; a channel that is not named is the column of its name, as it is.
+        The columns that channels were read from, and how; a channel that is not named is the column of its name.
 
     Examples
     --------
@@ -208,16 +180,16 @@ class Population:
     episodes: tuple[EpisodeKey, ...]
     source: EpisodeSource
     metadata: Mapping[str, Any] = field(default_factory=dict)
-    truths: tuple[TrueChannel, ...] = ()
+    truths: tuple[Channel, ...] = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
 
     def __repr__(self) -> str:
-        """Say how much was recorded of what."""
         counts = {"unit": len(self.units), "condition": len(self.conditions), "episode": len(self.episodes)}
         sizes = ", ".join(f"{count} {what}{'s' * (count != 1)}" for what, count in counts.items())
         states = ", ".join(f"{s} (measured)" if s in self.measured else s for s in self.states)
         true = f"; true {', '.join(t.of for t in self.truths)}" if self.truths else ""
-        return f"Population({sizes} every {self.sample_period_s:g} s; states {states}; inputs {', '.join(self.inputs) or 'none'}{true})"
+        channels = f"states {states}; inputs {', '.join(self.inputs) or 'none'}{true}"
+        return f"Population({sizes} every {self.sample_period_s:g} s; {channels})"
 
     @property
     def columns(self) -> tuple[Channel, ...]:
@@ -258,9 +230,8 @@ class Population:
         """Return one unit's facts."""
         if unit_id in self._unit_positions:
             return self.units[self._unit_positions[unit_id]]
-        raise DataError(
-            f"Asked for unit {unit_id!r}; the population has {', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}."
-        )
+        known = f"{', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}"
+        raise DataError(f"Asked for unit {unit_id!r}; the population has {known}.")
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a unit, a condition or both."""
@@ -273,11 +244,10 @@ class Population:
         return self.read_with_truths(key)[0]
 
     def read_with_truths(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-        """Read one episode, shape (n_samples, n_channels), and what its states really were, shape (n_samples, n_truths)."""
+        """Read one episode, shape (n_samples, n_channels), and what its states really were, (n_samples, n_truths)."""
         values, n = self.source(key), len(self.channels)
-        return np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values, values[
-            :, n : n + len(self.truths)
-        ]
+        channels = np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values
+        return channels, values[:, n : n + len(self.truths)]
 
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
@@ -287,14 +257,12 @@ class Population:
 
     def select(self, units: Iterable[str] | None = None, conditions: Iterable[str] | None = None) -> Population:
         """Return the population restricted to some units or conditions; nothing is read."""
-        wanted = tuple(dict.fromkeys(self.unit_ids if units is None else units))
-        allowed = tuple(dict.fromkeys(self.conditions if conditions is None else conditions))
+        wanted = dict.fromkeys(self.unit_ids if units is None else units)
+        allowed = dict.fromkeys(self.conditions if conditions is None else conditions)
         positions = sorted(i for u in wanted for c in allowed for i in self._positions.get((u, c), ()))
-        kept = sorted(self._unit_positions[u] for u in wanted if u in self._unit_positions)
         episodes = tuple(self.episodes[i] for i in positions)
-        return replace(
-            self, units=tuple(self.units[i] for i in kept), episodes=episodes, source=restrict(self.source, episodes)
-        )
+        retained = tuple(unit for unit in self.units if unit.id in wanted)
+        return replace(self, units=retained, episodes=episodes, source=restrict(self.source, episodes))
 
     def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
         """Iterate over (unit, condition, episodes)."""
@@ -303,11 +271,11 @@ class Population:
 
     @cached_property
     def _positions(self) -> dict[tuple[str, str], list[int]]:
-        """Where the episodes of each unit and condition stand: asking for one group does not walk through a million episodes."""
-        found: dict[tuple[str, str], list[int]] = {}
+        """Positions of the episodes of each unit and condition."""
+        positions: dict[tuple[str, str], list[int]] = {}
         for i, key in enumerate(self.episodes):
-            found.setdefault((key.unit, key.condition), []).append(i)
-        return found
+            positions.setdefault((key.unit, key.condition), []).append(i)
+        return positions
 
     @cached_property
     def _unit_positions(self) -> dict[str, int]:
@@ -328,29 +296,27 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
     --------
     >>> import numpy as np
     >>> import kros
-    >>> population = kros.from_arrays({"a": [np.ones((5, 2))] * 3}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [np.ones((5, 2))] * 3}, sample_period_s=0.01, **names)
     >>> split = kros.data.split_episodes(population)["a", "default"]
     >>> len(split.train), len(split.test)
     (2, 1)
     """
-    named = None if test is None else set(test)
-    splits = {}
+    named, splits = None if test is None else set(test), {}
     for unit, condition, keys in population.groups():
+        where = f"Splitting the episodes of unit {unit} ({condition})"
         ordered = sorted(keys, key=lambda k: natural_key(k.episode))
         if len(ordered) < 2:
             raise DataError(
-                f"Splitting the episodes of unit {unit} ({condition}) into training and test needs at least two, found {len(ordered)}; "
+                f"{where} into training and test needs at least two, found {len(ordered)}; "
                 "record more, or leave the unit out."
             )
-        held_out = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
-        split = Split(
-            tuple(k for k in ordered if k.episode not in held_out), tuple(k for k in ordered if k.episode in held_out)
-        )
-        if not split.train or not split.test:
+        names = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
+        train, tested = (tuple(k for k in ordered if (k.episode in names) is part) for part in (False, True))
+        if not train or not tested:
             raise DataError(
-                f"Splitting the episodes of unit {unit} ({condition}): split.test = {sorted(held_out, key=natural_key)} "
-                f"leaves {len(split.train)} for training and "
-                f"{len(split.test)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
+                f"{where}: split.test = {sorted(names, key=natural_key)} leaves {len(train)} for training and "
+                f"{len(tested)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
             )
-        splits[unit, condition] = split
+        splits[unit, condition] = Split(train, tested)
     return splits

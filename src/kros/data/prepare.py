@@ -1,16 +1,19 @@
-"""Lazy preparation, and how every reader makes its population: recordings, then steps, then checks."""
+"""Lazy preparation: how every reader makes its population of recordings, steps and checks, and what identifies one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
-from .checks import check_episode, check_period, check_range, check_structure
+from .checks import check_episode, check_period, check_structure
 from .population import (
     Channel,
     EpisodeKey,
@@ -59,8 +62,6 @@ class PreparedSource:
         if not any(step.makes_even for step in self.steps):
             where = self.recordings.where(key) if isinstance(self.recordings, Recordings) else ""
             check_even(recording, self.period_s, self.reference, where)
-        if self.steps and not self.gaps:
-            check_range(recording.values, key, self.channels)  # before steps spread a wrong sample
         channels, period = self.channels, self.period_s
         for step in self.steps:
             recording = step.apply(recording, channels, period)
@@ -75,14 +76,7 @@ class PreparedSource:
 
 def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
     """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
-    return (
-        natural_key(key.unit),
-        key.unit,
-        natural_key(key.condition),
-        key.condition,
-        natural_key(key.episode),
-        key.episode,
-    )
+    return tuple((natural_key(name), name) for name in (key.unit, key.condition, key.episode))
 
 
 def assemble(
@@ -95,37 +89,26 @@ def assemble(
     steps: Iterable[Step] = (),
     scaling: Scalings | None = None,
 ) -> Population:
-    """Make the population that a reader found: natural order, one sampling period, steps declared, names checked."""
+    """Make the population of a reader: natural order, one sampling period, steps declared, names checked."""
     check_structure(channels, list(recordings.places))
     if channels != columns_in_order(channels):
-        raise DataError(
-            f"Channels should list states before inputs, and truths last, found {[(c.name, c.role.value) for c in channels]}; reorder them."
-        )
+        roles = [(c.name, c.role.value) for c in channels]
+        raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
     episodes = tuple(sorted(recordings.places, key=episode_order))
     facts = {unit.id: unit for unit in units}
-    found = [facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes)]
-    first = episodes[0]
-    period = check_period(
-        sample_period_s if sample_period_s is not None else estimate_period(recordings(first)), "Population"
+    known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
+    period = estimate_period(recordings(episodes[0])) if sample_period_s is None else sample_period_s
+    period = check_period(period, "Population")
+    source = PreparedSource(recordings, channels, period, episodes[0])
+    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {})}
+    population = Population(
+        sample_period_s=period, units=known, episodes=episodes, source=source, **about, **part_columns(channels)
     )
-    source = PreparedSource(recordings, channels, period, first)
-    parts = part_columns(channels)
-    return prepare(
-        Population(
-            sample_period_s=period,
-            units=tuple(found),
-            episodes=episodes,
-            source=source,
-            metadata=dict(metadata or {}),
-            scaling=dict(scaling or {}),
-            **parts,
-        ),
-        steps,
-    )
+    return prepare(population, steps)
 
 
 def with_gaps(population: Population) -> Population:
-    """Return recordings as a machine gives them: samples that are NaN or infinite are kept, for an observer that knows what to do with them."""
+    """Return recordings as a machine gives them, with samples that are NaN or infinite, for a running observer."""
     source = population.source
     return replace(population, source=replace(source, gaps=True)) if isinstance(source, PreparedSource) else population
 
@@ -161,17 +144,72 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
         return population
     channels, period, scaling = population.columns, population.sample_period_s, population.scaling
     for step in added:
-        channels, period, scaling = (
-            step.channels_after(channels),
-            step.period_after(period),
-            step.scaling_after(scaling),
-        )
+        channels, period = step.channels_after(channels), step.period_after(period)
+        scaling = step.scaling_after(scaling)
     check_structure(channels, population.episodes)
     source = population.source
-    if isinstance(source, PreparedSource):
-        source = replace(source, steps=source.steps + added)
-    else:
-        source = PreparedSource(
-            EvenRecordings(source), population.columns, population.sample_period_s, population.episodes[0], added
-        )
+    if not isinstance(source, PreparedSource):
+        first, declared = population.episodes[0], (population.columns, population.sample_period_s)
+        source = PreparedSource(EvenRecordings(source), *declared, first)
+    source = replace(source, steps=source.steps + added)
     return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))
+
+
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A source whose columns are divided by sizes, shape (n_columns,); nothing is copied."""
+
+    source: EpisodeSource
+    sizes: npt.NDArray[np.float64]
+
+    def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+        """Return the samples of an episode, shape (n_samples, n_columns)."""
+        return np.asarray(self.source(key) / self.sizes)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
+        """Return the same for fewer episodes."""
+        return Scaled(restrict(self.source, keys), self.sizes)
+
+
+def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
+    """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
+    owners = [c.of or c.name for c in population.columns]
+    factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
+    columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
+    return replace(population, source=Scaled(population.source, factors), **part_columns(columns))
+
+
+def mark_of(*content: Any) -> str:
+    """Return a digest of plain content, dataclasses among it by their `repr`."""
+    return hashlib.sha256(repr(content).encode()).hexdigest()
+
+
+def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
+    """Return what the samples of every group follow from, without reading; None where the recordings are in no file.
+
+    These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
+    """
+    about: list[Any] = []
+    while isinstance(source, PreparedSource | EvenRecordings):
+        if isinstance(source, PreparedSource):
+            about.append((source.channels, source.period_s, source.steps, source.gaps))
+        source = source.recordings if isinstance(source, PreparedSource) else source.source
+    if not isinstance(source, Recordings):
+        return [None for _ in groups]
+    settings = [(f.name, getattr(source, f.name)) for f in fields(source) if f.name != "places"]
+    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, type(source).__name__, settings, declared)
+
+    def mark(keys: Sequence[EpisodeKey]) -> str | None:
+        files = [source.file(source.places[key]) for key in keys]
+        rows = [
+            (key, source.places[key], stamp(file)) for key, file in zip(keys, files, strict=True) if file is not None
+        ]
+        return mark_of(how, rows) if len(rows) == len(keys) else None
+
+    return [mark(keys) for keys in groups]
+
+
+def _stamp(file: Path) -> tuple[int, int]:
+    """Return size and time of change of a file."""
+    status = file.stat()
+    return status.st_size, status.st_mtime_ns

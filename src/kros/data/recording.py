@@ -31,10 +31,15 @@ class Recording:
     values: Float  # shape (n_samples, n_channels)
     time_s: Float | None = None  # shape (n_samples,), s; None where the samples are known to be even
 
+    def cut(self, start: int, stop: int) -> Recording:
+        """Return samples `start` to `stop - 1`."""
+        time = None if self.time_s is None else self.time_s[start:stop]
+        return replace(self, values=self.values[start:stop], time_s=time)
+
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Episodes as a reader found them, read one at a time; what reads a format overrides `read`. Can be pickled when `places` can."""
+    """Episodes of a reader, read one at a time; a format overrides `read`. Can be pickled when `places` can."""
 
     places: Mapping[EpisodeKey, Any]  # where each episode is
 
@@ -43,12 +48,14 @@ class Recordings:
         raise NotImplementedError
 
     def __call__(self, key: EpisodeKey) -> Recording:
-        """Return one episode, or say that this source does not have it."""
+        """Return one episode, without a last sample that repeats the stamp before it, as stopped recorders write."""
         if key not in self.places:
-            raise DataError(
-                f"Asked for {key}; this source has {len(self.places)} other episodes; take keys from population.episodes."
-            )
-        return without_repeated_end(self.read(key, self.places[key]))
+            others = f"this source has {len(self.places)} other episodes"
+            raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
+        recording = self.read(key, self.places[key])
+        time = recording.time_s
+        repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
+        return recording.cut(0, len(recording.values) - 1) if repeated else recording
 
     def where(self, key: EpisodeKey) -> str:
         """Return in which file an episode is, for messages; nothing where it is in none."""
@@ -56,20 +63,12 @@ class Recordings:
         return "" if file is None else f" in {file}"
 
     def file(self, place: Any) -> Path | None:
-        """Return the one file that an episode is in; None where it is in none, or cannot be told."""
+        """Return the one file that an episode is in, where it is in one."""
         return None
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> Self:
         """Return the same for fewer episodes, cheaper to send to another process."""
         return replace(self, places={key: self.places[key] for key in keys})
-
-
-def without_repeated_end(recording: Recording) -> Recording:
-    """Drop the last sample where it repeats the stamp before it, as recorders write when they are stopped."""
-    time = recording.time_s
-    if time is None or len(time) < 2 or time[-1] != time[-2]:
-        return recording
-    return replace(recording, values=recording.values[:-1], time_s=time[:-1])
 
 
 def usable(values: Float) -> npt.NDArray[np.bool_]:
@@ -89,24 +88,17 @@ def some(names: Sequence[str], most: int = 4) -> str:
 
 def estimate_period(recording: Recording) -> float:
     """Return the median time step, rounded to six digits so that 0.0010000000000000009 s reads 0.001 s."""
-    time = recording.time_s
-    if time is None or len(time) < 2:
-        found = 0 if time is None else len(time)
-        raise DataError(
-            f"{title(recording.key)}: the sampling period needs at least two samples with time, found {found}; leave the episode out."
-        )
+    name, time = title(recording.key), np.zeros(0) if recording.time_s is None else recording.time_s
+    if len(time) < 2:
+        need = "the sampling period needs at least two samples with time"
+        raise DataError(f"{name}: {need}, found {len(time)}; leave the episode out.")
     steps = np.diff(time)
-    shortest, longest = _six_digits(steps.min()), _six_digits(steps.max())
-    period = shortest if shortest == longest else _six_digits(np.median(steps))  # rounding keeps order
+    shortest, longest = (float(f"{step:.6g}") for step in (steps.min(), steps.max()))
+    period = shortest if shortest == longest else float(f"{np.median(steps):.6g}")  # rounding keeps order
     if not period > 0:
-        raise DataError(
-            f"{title(recording.key)}: the median time step is {period:g} s; name the column that holds time, in seconds and increasing."
-        )
+        advice = "name the column that holds time, in seconds and increasing"
+        raise DataError(f"{name}: the median time step is {period:g} s; {advice}.")
     return period
-
-
-def _six_digits(number: float) -> float:
-    return float(f"{number:.6g}")
 
 
 def check_increasing(recording: Recording, where: str = "") -> None:
@@ -118,8 +110,8 @@ def check_increasing(recording: Recording, where: str = "") -> None:
     if bad.size:
         k = int(bad[0])
         raise DataError(
-            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} "
-            f"({bad.size} such steps); remove repeated or disordered samples."
+            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
+            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); remove repeated or disordered samples."
         )
 
 
@@ -129,20 +121,20 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
     if time is None or len(time) < 2:
         return
     check_increasing(recording, where)
-    steps = np.diff(time)
-    own = estimate_period(recording)
-    deviation = np.abs(steps - own)
+    steps, period = np.diff(time), estimate_period(recording)
+    deviation = np.abs(steps - period)
     worst = int(deviation.argmax())
-    if deviation[worst] > TIME_TOLERANCE * own:
-        count = int(np.count_nonzero(deviation > TIME_TOLERANCE * own))
+    step = 'declare [[data.prepare]] step = "resample"'
+    if deviation[worst] > TIME_TOLERANCE * period:
+        count = np.count_nonzero(deviation > TIME_TOLERANCE * period)
         raise DataError(
-            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {own:g} s by more than "
-            f"{TIME_TOLERANCE:g} of it, the worst "
-            f'{steps[worst]:g} s at sample {worst}; declare [[data.prepare]] step = "resample", period_s = {own:.3g}, or fix the source.'
+            f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {period:g} s by "
+            f"more than {TIME_TOLERANCE:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
+            f"period_s = {period:.3g}, or fix the source."
         )
     mean = float((time[-1] - time[0]) / len(steps))
     if abs(mean - period_s) > max(PERIOD_TOLERANCE, TIME_TOLERANCE / len(steps)) * period_s:
         raise DataError(
-            f"Two sampling periods: {period_s:g} s in {reference} and {own:g} s in {recording.key}{where}; a population has one, "
-            f'declare [[data.prepare]] step = "resample", period_s = {max(own, period_s):g}, or leave one out.'
+            f"Two sampling periods: {period_s:g} s in {reference} and {period:g} s in {recording.key}{where}; a "
+            f"population has one, {step}, period_s = {max(period, period_s):g}, or leave one out."
         )

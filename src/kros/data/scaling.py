@@ -8,15 +8,13 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Scaling:
-    """From a column of the original recordings to a channel: ``channel[k] = factor * column[k + lag_samples]``, plus what `offset` says."""
+    """From a column as recorded to a channel: ``channel[k] = factor * column[k + lag_samples]``, plus `offset`."""
 
     column: str | int | None  # name in the header, or number from 1; none where it differs between units
     factor: float = 1.0
     lag_samples: int = 0  # samples by which the column lagged behind the others
     offset: str = ""  # what was added in every episode, in words; empty where nothing was
-    converted: float = (
-        1.0  # the part of the factor that is in the files that were read, since recordings were converted
-    )
+    converted: float = 1.0  # the part of the factor that is in the files already, since recordings were converted
 
 
 Scalings = Mapping[str, Scaling]

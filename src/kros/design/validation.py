@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
-from ..data.scaled import scale_population
+from ..data.prepare import scale_population
 from ..evaluate import error_rms
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..core.errors import IdentificationError
 from ..core.work import Work
-from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
+from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
 

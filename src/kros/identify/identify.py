@@ -20,8 +20,8 @@ from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
 from ..core.work import Work
-from ..data.marks import mark_of
 from ..data.population import EpisodeKey, Population
+from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibrate import calibrate
@@ -108,7 +108,7 @@ def identify(
     chosen, work = IdentifySettings.of(settings, "Identify"), work or Work()
     if facts is None:
         check_usable(population, test, identify_on, single_allowed=True)
-        population, facts = survey(population, test, identify_on, on_nan, work=work)
+        population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
     known = calibration if isinstance(calibration, PhaseCalibration) else None
     declared = CalibrationSettings.of({} if known is not None else calibration or {}, "Calibrate")
     if not isinstance(lifting, Lifting):

@@ -81,7 +81,8 @@ class FilterBank:
         sizes = (self.start.shape, self.forget.shape, self.shares.shape[1:], self.reach.shape)
         if sizes != ((n, columns), (recorded,), (recorded,), (measured,)) or not 0 <= self.filters <= n - 2 * recorded:
             raise DimensionError(
-                f"Observer {name}: its filter bank should have a start {(n, columns)} and {recorded} values of forget and shares and {measured} of reach, found {sizes}, and "
+                f"Observer {name}: its filter bank should have a start {(n, columns)}, {recorded} values of forget and shares "
+                f"and {measured} of reach, found {sizes}, and "
                 f"at most {n - 2 * recorded} filters, found {self.filters}."
             )
 

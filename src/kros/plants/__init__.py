@@ -3,14 +3,14 @@
 Examples
 --------
 >>> from kros.plants import DcMotorPopulation
->>> DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0).simulate().population
-Population(2 units, 1 condition, 2 episodes every 0.002 s; states position (measured), velocity, current; inputs voltage; true velocity, current)
+>>> DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0).simulate().population.states
+('position', 'velocity', 'current')
 """
 
+from .batch import SimulatedPopulation
 from .dc_motor import DcMotorPopulation
 from .harmonic_drive.population import HarmonicDrivePopulation
 from .pendulum import PendulumPopulation
-from .simulated import SimulatedPopulation
 
 PLANTS = {"harmonic-drive": HarmonicDrivePopulation, "pendulum": PendulumPopulation, "dc-motor": DcMotorPopulation}
 

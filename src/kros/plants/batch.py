@@ -1,57 +1,133 @@
-"""What small plants with one input have in common: drawn parameters, episodes with one pseudorandom input each, sensors, and one planted outlier."""
+"""What simulated populations have in common: recordings with their truth, drawn parameters, an outlier, sensors."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import ClassVar, Generic
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
-from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, TrueChannel, Unit
-from .simulated import SimulatedEpisodes, SimulatedPopulation, T
+from ..core.errors import ConfigError, DataError
+from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
 
 Array = npt.NDArray[np.float64]
 
 SUBSTEPS = 2
 COUNT_RAD = 2 * np.pi / 4096  # of the encoder
 INPUT_STREAM, UNIT_STREAM, OUTLIER_STREAM, NOISE_STREAM = range(4)  # first words of spawn keys
-_LEAST = {"n_units": 1, "n_episodes": 1, "seconds": 1.0, "seed": 0, "spread": 0.0, "outlier_severity": 0.0}
+_LIMITS: dict[str, tuple[float, float]] = {
+    "n_units": (1, 998_998),
+    "n_episodes": (1, 1000),
+    "seed": (0, 2**63),
+    "spread": (0, 5),
+    "outlier_severity": (0, 2),
+}
+
+
+T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedPopulation(Generic[T]):
+    """Recordings and what is true about them.
+
+    Parameters
+    ----------
+    population : Population
+        Ready for identification, as a reader yields it.
+    raw : Population
+        As recorded, before preparation; the same as `population` where a plant needs none.
+    truth : object with ``as_dict()``
+
+    Examples
+    --------
+    >>> from kros.plants import DcMotorPopulation
+    >>> simulated = DcMotorPopulation(n_units=2, n_episodes=1, seconds=1.0, seed=3).simulate()
+    >>> list(simulated.truth.as_dict()["units"])
+    ['001', '002']
+    """
+
+    population: Population
+    raw: Population
+    truth: T
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedEpisodes:
+    """Source of raw episodes in memory, which can be pickled."""
+
+    parts: Mapping[EpisodeKey, tuple[Array, ...]]
+
+    def __call__(self, key: EpisodeKey) -> Array:
+        """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
+        if key not in self.parts:
+            known = f"the simulation has {len(self.parts)} episodes, first {next(iter(self.parts), None)}"
+            raise DataError(f"Asked for {key}; {known}; take keys from population.episodes.")
+        return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> SimulatedEpisodes:
+        """Return the same for fewer episodes, cheaper to send to another process."""
+        return SimulatedEpisodes({key: self.parts[key] for key in keys})
 
 
 @dataclass(frozen=True)
-class Batch(ABC, Generic[T]):
-    """Settings of a simulated batch."""
+class BatchSettings:
+    """Settings of every simulated batch."""
 
-    n_units: int = 8  # Units of the population, the outlier not counted
+    n_units: int = 8  # units of the population, the outlier not counted
     n_episodes: int = 10
-    seconds: float = 20.0  # s; Length of an episode
-    seed: int = 0  # The same seed gives the same recordings; unit `k` does not depend on `n_units`
-    spread: float = 1.0  # Scales the relative deviations of the parameters
-    outlier: bool = False  # Add one unit that is badly made, serial 000, group "outliers"
+    seconds: float = 20.0  # s; length of an episode
+    seed: int = 0  # the same seed gives the same recordings; unit `k` does not depend on `n_units`
+    spread: float = 1.0  # scales the relative deviations of the parameters
+    outlier: bool = False  # add one unit that is badly made, serial of zeros, group "outliers"
     outlier_severity: float = 1.0
 
     plant: ClassVar[str]
-    channels: ClassVar[tuple[Channel, ...]]
-    truths: ClassVar[tuple[TrueChannel, ...]] = ()
-    sample_period_s: ClassVar[float]
-    noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
-    nominal: ClassVar[Mapping[str, float]]
-    deviation: ClassVar[Mapping[str, float]]  # of the logarithms
-    outlier_log_factors: ClassVar[Mapping[str, float]]
+    least_seconds: ClassVar[float] = 1.0
 
     def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            if not getattr(self, name) >= least:
-                raise ConfigError(
-                    f"Simulated {self.plant}: {name} = {getattr(self, name)} is out of range; use at least {least}."
-                )
+        for name, (low, high) in (_LIMITS | {"seconds": (self.least_seconds, 3600)}).items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ConfigError(f"Simulated {self.plant}: {name} = {value} is out of range; use {low} to {high}.")
+
+    def random(self, *stream: int) -> np.random.Generator:
+        """Return the generator of one stream of random numbers."""
+        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
+
+
+@dataclass(frozen=True, eq=False)
+class UnitTruth:
+    """True parameters, each an array of shape (n_units,)."""
+
+    unit_ids: tuple[str, ...]  # order of the unit axis
+    plant: ClassVar[str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all parameters, ready for JSON: one entry per unit."""
+        names = [f.name for f in fields(self) if f.name != "unit_ids"]
+        values = {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)}
+        return {"plant": self.plant, "units": values}
+
+
+P = TypeVar("P", bound=UnitTruth)
+
+
+class Batch(BatchSettings, ABC, Generic[P]):
+    """A batch of small plants with one pseudorandom input; the first state is seen by an encoder."""
+
+    channels: ClassVar[tuple[Channel, ...]]
+    truths: ClassVar[tuple[Channel, ...]] = ()
+    sample_period_s: ClassVar[float]
+    noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
+    parameters: ClassVar[Mapping[str, tuple[float, float]]]  # nominal value, deviation of its logarithm at spread 1
+    outlier_log_factors: ClassVar[Mapping[str, float]]
 
     @abstractmethod
-    def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> T:
+    def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> P:
         """Return the plant of some units, from parameters of shape (n_units,)."""
 
     @abstractmethod
@@ -59,55 +135,46 @@ class Batch(ABC, Generic[T]):
         """Draw the input of an episode, shape (n_samples,)."""
 
     @abstractmethod
-    def respond(self, truth: T, inputs: Array) -> Array:
-        """Return states from rest, shape (n_states, n_units, n_episodes, n_samples), for inputs of shape (n_episodes, n_samples)."""
+    def respond(self, truth: P, inputs: Array) -> Array:
+        """Return states from rest, (n_states, n_units, n_episodes, n_samples), for inputs (n_episodes, n_samples)."""
 
-    def simulate(self) -> SimulatedPopulation[T]:
+    def simulate(self) -> SimulatedPopulation[P]:
         """Simulate all episodes of all units."""
         units, truth = self._units()
         n_samples = round(self.seconds / self.sample_period_s)
-        inputs = np.stack([self.reference(self._rng(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
+        inputs = np.stack([self.reference(self.random(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
         states = self.respond(truth, inputs)
         names = [c.name for c in self.channels]
         true = states[[names.index(t.of) for t in self.truths]]
-        for u, unit in enumerate(units):
-            for e in range(self.n_episodes):
-                noise = self._rng(NOISE_STREAM, int(unit.id), e).standard_normal((len(self.noise), n_samples))
-                states[1 : 1 + len(noise), u, e] += np.array(self.noise)[:, None] * noise
+        keys = {
+            EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)): (u, e)
+            for u, unit in enumerate(units)
+            for e in range(self.n_episodes)
+        }
+        for key, at in keys.items():
+            noise = self.random(NOISE_STREAM, int(key.unit), at[1]).standard_normal((len(self.noise), n_samples))
+            states[1 : 1 + len(noise), *at] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        keys = tuple(EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)) for unit in units for e in range(self.n_episodes))
-        source = SimulatedEpisodes(
-            {
-                key: (states[:, u, e], inputs[e, None], true[:, u, e])
-                for key, (u, e) in zip(keys, np.ndindex(len(units), self.n_episodes), strict=True)
-            }
-        )
-        population = Population(
-            self.channels, self.sample_period_s, units, keys, source, {"plant": self.plant}, self.truths
-        )
+        source = SimulatedEpisodes({k: (states[:, u, e], inputs[e, None], true[:, u, e]) for k, (u, e) in keys.items()})
+        facts = (self.sample_period_s, units, tuple(keys), source, {"plant": self.plant}, self.truths)
+        population = Population(self.channels, *facts)
         return SimulatedPopulation(population, population, truth)
 
-    def _units(self) -> tuple[tuple[Unit, ...], T]:
+    def _units(self) -> tuple[tuple[Unit, ...], P]:
+        """Draw the units, and the outlier in front of them."""
         units = [Unit(f"{k + 1:03d}", "population") for k in range(self.n_units)]
-        drawn = [self._draw(self._rng(UNIT_STREAM, k)) for k in range(self.n_units)]
+        drawn = [self._draw(self.random(UNIT_STREAM, k)) for k in range(self.n_units)]
         if self.outlier:
-            bad = self._draw(self._rng(OUTLIER_STREAM))
+            bad = self._draw(self.random(OUTLIER_STREAM))
+            factors = {n: np.exp(self.outlier_severity * self.outlier_log_factors.get(n, 0.0)) for n in bad}
             units.insert(0, Unit("000", OUTLIERS))
-            drawn.insert(
-                0, {n: v * np.exp(self.outlier_severity * self.outlier_log_factors.get(n, 0.0)) for n, v in bad.items()}
-            )
-        return tuple(units), self.truth(
-            tuple(u.id for u in units), {n: np.array([d[n] for d in drawn]) for n in self.nominal}
-        )
+            drawn.insert(0, {n: v * factors[n] for n, v in bad.items()})
+        values = {n: np.array([d[n] for d in drawn]) for n in self.parameters}
+        return tuple(units), self.truth(tuple(u.id for u in units), values)
 
     def _draw(self, rng: np.random.Generator) -> dict[str, float]:
-        return {
-            n: v * float(np.exp(self.spread * self.deviation[n] * rng.standard_normal()))
-            for n, v in self.nominal.items()
-        }
-
-    def _rng(self, *stream: int) -> np.random.Generator:
-        return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=stream))
+        kinds = self.parameters.items()
+        return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}
 
 
 def runge_kutta(
@@ -117,7 +184,7 @@ def runge_kutta(
     period_s: float,
     held: Callable[[Array], Array] = lambda x: x,
 ) -> Array:
-    """Integrate by the method of order four, inputs held between samples, shape (n_states, n_units, n_episodes, n_samples)."""
+    """Integrate by the method of order four, inputs held, shape (n_states, n_units, n_episodes, n_samples)."""
     out = np.empty((inputs.shape[1], *start.shape))
     x, h = start, period_s / SUBSTEPS
     for k in range(len(out)):

@@ -4,21 +4,22 @@
     J dw/dt = k i - b w - c tanh(w / w_s)
       dp/dt = w
 
-The input `v` is a pseudorandom voltage; every level is followed by its opposite, so that the shaft comes back. Position comes from an encoder,
-velocity and current from noisy sensors. `tanh(velocity)` lifts the Coulomb friction exactly.
+The input `v` is a pseudorandom voltage; every level is followed by its opposite, so that the shaft comes back.
+Position comes from an encoder, velocity and current from noisy sensors. `tanh(velocity)` lifts the Coulomb friction
+exactly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..data.population import Channel, Role, TrueChannel
-from .batch import Batch, runge_kutta
+from ..data.population import Channel, Role
+from .batch import Batch, UnitTruth, runge_kutta
 
 Array = npt.NDArray[np.float64]
 
@@ -29,21 +30,13 @@ CURRENT_LIMIT_A = 8.0
 SLIP_RAD_S = 1.0  # w_s: below it friction is viscous
 HOLD_SAMPLES = (50, 200)  # shortest and longest level of the input
 VOLTAGE_V = 12.0
-NOMINAL = {
-    "resistance": 1.0,
-    "inductance": 5e-3,
-    "torque_constant": 0.05,
-    "inertia": 1e-4,
-    "viscous": 1e-4,
-    "coulomb": 1e-2,
-}
-DEVIATION = {
-    "resistance": 0.05,
-    "inductance": 0.08,
-    "torque_constant": 0.05,
-    "inertia": 0.05,
-    "viscous": 0.15,
-    "coulomb": 0.15,
+PARAMETERS = {  # nominal value, relative deviation
+    "resistance": (1.0, 0.05),
+    "inductance": (5e-3, 0.08),
+    "torque_constant": (0.05, 0.05),
+    "inertia": (1e-4, 0.05),
+    "viscous": (1e-4, 0.15),
+    "coulomb": (1e-2, 0.15),
 }
 OUTLIER_LOG_FACTORS = {"torque_constant": -0.25, "viscous": 0.8, "coulomb": 1.0}  # a tired magnet and a dry bearing
 CHANNELS = (
@@ -52,47 +45,37 @@ CHANNELS = (
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
-TRUTHS = tuple(
-    TrueChannel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3]
-)  # what the noisy sensors see
+# what the noisy sensors see
+TRUTHS = tuple(Channel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3])
 
 
 @dataclass(frozen=True, eq=False)
-class DcMotorTruth:
+class DcMotorTruth(UnitTruth):
     """True parameters of the motors."""
 
-    unit_ids: tuple[str, ...]  # order of the unit axis
     resistance: Array  # shape (n_units,), ohm
     inductance: Array  # shape (n_units,), H
     torque_constant: Array  # shape (n_units,), N m/A; also the constant of the back electromotive force, V s/rad
     inertia: Array  # shape (n_units,), kg m^2
     viscous: Array  # shape (n_units,), N m s/rad
     coulomb: Array  # shape (n_units,), N m
+    plant: ClassVar[str] = "dc-motor"
 
     def respond(self, voltage: Array) -> Array:
-        """Simulate all motors from rest, without sensors; voltage held between samples, shape (3, n_units, n_episodes, n_samples)."""
+        """Simulate all motors from rest, without sensors, shape (3, n_units, n_episodes, n_samples)."""
         start = np.zeros((3, len(self.unit_ids), len(voltage)))
         return runge_kutta(self._rates, start, voltage, SAMPLE_PERIOD_S, _limited)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return all parameters, ready for JSON: one entry per unit."""
-        names = [f.name for f in fields(self) if f.name != "unit_ids"]
-        return {
-            "plant": "dc-motor",
-            "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)},
-        }
-
     def _rates(self, x: Array, voltage: Array) -> Array:
-        R, L, k, J, b, c = (
-            p[:, None]
-            for p in (self.resistance, self.inductance, self.torque_constant, self.inertia, self.viscous, self.coulomb)
-        )
+        R, L, k, J, b, c = (getattr(self, name)[:, None] for name in PARAMETERS)
         _, w, i = x
         return np.stack([w, (k * i - b * w - c * np.tanh(w / SLIP_RAD_S)) / J, (voltage - R * i - k * w) / L])
 
 
 class DcMotorPopulation(Batch[DcMotorTruth]):
-    """Settings of a simulated batch of DC motors, see `Batch`; a spread of 1 means 5 to 15 percent, the outlier has a tired magnet and a dry bearing.
+    """Settings of a simulated batch of DC motors, see `BatchSettings`; a spread of 1 means deviations of 5 to 15 %.
+
+    The outlier has a tired magnet and a dry bearing.
 
     Examples
     --------
@@ -104,7 +87,7 @@ class DcMotorPopulation(Batch[DcMotorTruth]):
 
     plant = "dc-motor"
     channels, truths, sample_period_s, noise = CHANNELS, TRUTHS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)
-    nominal, deviation, outlier_log_factors = NOMINAL, DEVIATION, OUTLIER_LOG_FACTORS
+    parameters, outlier_log_factors = PARAMETERS, OUTLIER_LOG_FACTORS
 
     def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> DcMotorTruth:
         """Return the motors."""

@@ -2,28 +2,28 @@
 
     d2 theta / dt2 = -a sin(theta) - b d theta / dt + g u
 
-The input `u` is a pseudorandom staircase, held between samples. Position comes from an encoder, velocity from a noisy sensor.
+The input `u` is a pseudorandom staircase, held between samples. Position comes from an encoder, velocity from a noisy
+sensor.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..data.population import Channel, Role
-from .batch import Batch, runge_kutta
+from .batch import Batch, UnitTruth, runge_kutta
 
 Array = npt.NDArray[np.float64]
 
 SAMPLE_PERIOD_S = 0.01
 VELOCITY_NOISE = 0.01  # rad/s, standard deviation
 HOLD_SAMPLES = (20, 120)  # shortest and longest stair of the input
-NOMINAL = {"gravity": 20.0, "damping": 0.8, "gain": 6.0}
-DEVIATION = {"gravity": 0.08, "damping": 0.15, "gain": 0.08}
+PARAMETERS = {"gravity": (20.0, 0.08), "damping": (0.8, 0.15), "gain": (6.0, 0.08)}  # nominal value, relative deviation
 OUTLIER_LOG_FACTORS = {"gravity": -0.3, "damping": 1.2, "gain": -0.3}
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
@@ -33,30 +33,24 @@ CHANNELS = (
 
 
 @dataclass(frozen=True, eq=False)
-class PendulumTruth:
+class PendulumTruth(UnitTruth):
     """True parameters of the pendulums."""
 
-    unit_ids: tuple[str, ...]  # order of the unit axis
     gravity: Array  # shape (n_units,), 1/s^2; square of the small-angle natural frequency
     damping: Array  # shape (n_units,), 1/s
     gain: Array  # shape (n_units,), rad/s^2 per unit of input
+    plant: ClassVar[str] = "pendulum"
 
     def acceleration(self, position: Array, velocity: Array, torque: Array) -> Array:
         """Angular acceleration of every unit in its own state, rad/s^2; the unit axis is the first of all arrays."""
         a, b, g = (x.reshape((-1,) + (1,) * (np.ndim(position) - 1)) for x in (self.gravity, self.damping, self.gain))
         return -a * np.sin(position) - b * velocity + g * torque
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return all parameters, ready for JSON: one entry per unit."""
-        names = [f.name for f in fields(self) if f.name != "unit_ids"]
-        return {
-            "plant": "pendulum",
-            "units": {u: {n: float(getattr(self, n)[i]) for n in names} for i, u in enumerate(self.unit_ids)},
-        }
-
 
 class PendulumPopulation(Batch[PendulumTruth]):
-    """Settings of a simulated batch of pendulums, see `Batch`; a spread of 1 means deviations of 8 to 15 percent, the outlier has a stiff joint.
+    """Settings of a simulated batch of pendulums, see `BatchSettings`; a spread of 1 means deviations of 8 to 15 %.
+
+    The outlier has a stiff joint.
 
     Examples
     --------
@@ -67,7 +61,7 @@ class PendulumPopulation(Batch[PendulumTruth]):
 
     plant = "pendulum"
     channels, sample_period_s, noise = CHANNELS, SAMPLE_PERIOD_S, (VELOCITY_NOISE,)
-    nominal, deviation, outlier_log_factors = NOMINAL, DEVIATION, OUTLIER_LOG_FACTORS
+    parameters, outlier_log_factors = PARAMETERS, OUTLIER_LOG_FACTORS
 
     def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> PendulumTruth:
         """Return the pendulums."""

@@ -1,40 +1,29 @@
-"""How a text file of numbers is written: encoding, delimiter, decimal point, header, rows of units and the rows before them."""
+"""How a text file of numbers is written: encoding, delimiter, decimal point, header and rows of units."""
 
 from __future__ import annotations
 
 import codecs
 import csv
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.errors import DataError
-from ..readers.csvfile import ABSENT, Dialect, opened
-from ..readers.timestamps import CLOCK, DATES, pattern
+from ..readers.csvfile import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
 from .measures import is_unit_row
 
-HEAD_BYTES, ROWS, SPREAD = 1 << 18, 60, 200
+HEAD_BYTES = 1 << 18
+ROWS = 60  # first rows of numbers that are looked at closely
+SPREAD = 200  # further lines, spread over the head of a file: machines rest at first, and zeros have no decimal point
+_ABOVE = 20  # lines that may stand before the header
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
-_NO_NUMBER = {
-    "",
-    "nan",
-    "+nan",
-    "-nan",
-    "null",
-    "none",
-    "na",
-    "n/a",
-    "inf",
-    "-inf",
-    "+inf",
-    "#n/a",
-    *(a.lower() for a in ABSENT),
-}
-_TIME = re.compile(
-    rf"^\s*(?:(?:{'|'.join(re.sub(r'[?]P<[a-z]+>', '?:', d) for d in DATES.values())})[T ]\s*)?{re.sub(r'[?]P<[a-z]+>', '?:', CLOCK)}\s*$"
-)
+_ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
+_NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
+_UNNAMED = {name: re.sub(r"[?]P<[a-z]+>", "?:", text) for name, text in {"clock": CLOCK, **DATES}.items()}
+_TIME = re.compile(rf"^\s*(?:(?:{'|'.join(_UNNAMED[order] for order in DATES)})[T ]\s*)?{_UNNAMED['clock']}\s*$")
 
 
 @dataclass(frozen=True)
@@ -52,40 +41,28 @@ class TableHead:
 
     def is_numeric(self, column: int) -> bool:
         """Tell whether a column holds numbers."""
-        cells = self.cells(column)
-        decimal = self.dialect.decimal
-        return any(_is_number(c, decimal) for c in cells) and all(
-            _is_number(c, decimal) or c.lower() in _NO_NUMBER for c in cells
-        )
+        cells = [c for c in self.cells(column) if c.lower() not in _NO_NUMBER]
+        return bool(cells) and all(_is_number(c, self.dialect.decimal) for c in cells)
 
     def timestamp(self, column: int) -> str | None:
         """Return the order of the date where a column holds timestamps, or None."""
         cells = [c for c in self.cells(column) if c]
-        fitting = [order for order in DATES if cells and all(re.match(pattern(order), c) for c in cells)]
-        return fitting[0] if fitting else None
+        fitting = (order for order in DATES if all(re.match(timestamp_pattern(order), c) for c in cells))
+        return next(fitting, None) if cells else None
 
 
 def look_at(path: Path) -> TableHead:
-    """Return how a text file is written."""
+    """Return how a text file is written: the reading with most rows of numbers of equal width."""
     content = _head(path)
     encoding = encoding_of(content)
     lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
-    if len(content) >= HEAD_BYTES:
-        lines = lines[:-1]
-    if encoding == "utf-8-sig":
-        encoding = "utf-8"
-    best: tuple[tuple[int, int], str, str, list[list[str]]] | None = None
-    for delimiter, decimal in MARKS:
-        rows = _rows(lines, delimiter)
-        score = _score(rows, decimal)
-        if best is None or score > best[0]:
-            best = score, delimiter, decimal, rows
-    if best is None or best[0][0] < 2:
-        raise DataError(
-            f"Reading {path}: no rows of numbers were found in its first {len(lines)} lines; is it a recording?"
-        )
-    _, delimiter, decimal, rows = best
-    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding))
+    lines = lines[:-1] if len(content) >= HEAD_BYTES else lines
+    readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
+    rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
+    if _score(rows, decimal)[0] < 2:
+        actual = f"no rows of numbers were found in its first {len(lines)} lines"
+        raise DataError(f"Reading {path}: {actual}; is it a recording?")
+    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding.removesuffix("-sig")))
 
 
 def encoding_of(content: bytes) -> str:
@@ -94,16 +71,13 @@ def encoding_of(content: bytes) -> str:
         return "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
-    try:
-        codecs.getincrementaldecoder("utf-8")().decode(content)
-        return "utf-8"
-    except UnicodeDecodeError:
-        pass
-    try:
-        content.decode("cp1252")
-        return "cp1252"
-    except UnicodeDecodeError:
-        return "latin-1"
+    for name in ("utf-8", "cp1252"):
+        try:
+            codecs.getincrementaldecoder(name)().decode(content)  # the last character may be cut
+            return name
+        except UnicodeDecodeError:
+            continue
+    return "latin-1"
 
 
 def _head(path: Path) -> bytes:
@@ -115,70 +89,54 @@ def _head(path: Path) -> bytes:
 
 
 def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:
+    """Cut the first lines, and some of the others, into cells."""
+    first, rest = lines[: _ABOVE + ROWS], lines[_ABOVE + ROWS :]
     rows = []
-    first, rest = lines[: 20 + ROWS], lines[20 + ROWS :]
-    for line in [
-        *first,
-        *rest[:: max(1, len(rest) // SPREAD)],
-    ]:  # machines rest at first, and zeros have no decimal point
+    for line in (*first, *rest[:: max(1, len(rest) // SPREAD)]):
         try:
-            rows.append([c.strip() for c in next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])])
+            cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
         except csv.Error:
-            rows.append([])
+            cells = []
+        rows.append([c.strip() for c in cells])
     return rows
 
 
 def _is_number(cell: str, decimal: str) -> bool:
-    return bool(_NUMBER.match(cell)) and ("," not in cell if decimal == "." else "." not in cell)
+    return bool(_NUMBER.match(cell)) and ("," if decimal == "." else ".") not in cell
 
 
 def _is_data(row: Sequence[str], decimal: str) -> bool:
-    """Tell whether a row holds numbers: no cell of more than a tenth is text, but for a note or a date."""
+    """Tell whether a row holds numbers: at most half of its cells are text that is no time."""
     cells = [c for c in row if c.lower() not in _NO_NUMBER]
     numbers = sum(_is_number(c, decimal) or bool(_TIME.match(c)) for c in cells)
     return len(row) > 1 and numbers >= 1 and 2 * numbers >= len(cells)
 
 
+def _width(rows: Sequence[Sequence[str]]) -> int:
+    """Return the commonest number of cells."""
+    return Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
+
+
 def _score(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, int]:
-    """Return how many rows of equal width hold numbers, and how many numbers with a decimal point they hold."""
+    """Return how many rows of equal width hold numbers, and how many numbers they hold, those with a point twice."""
     data = [r for r in rows if _is_data(r, decimal)]
-    if not data:
-        return 0, 0
-    widths = [len(r) for r in data]
-    width = max(set(widths), key=widths.count)
-    same = [r for r in data if len(r) == width]
-    return len(same), sum(_is_number(c, decimal) and decimal in c for r in same for c in r) + sum(
-        _is_number(c, decimal) for r in same for c in r
-    )
+    same = [r for r in data if len(r) == _width(data)]
+    return len(same), sum(1 + (decimal in c) for r in same for c in r if _is_number(c, decimal))
 
 
 def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
+    """Tell header, row of units and numbers apart."""
     data = [i for i, r in enumerate(rows) if _is_data(r, dialect.decimal)]
-    widths = [len(rows[i]) for i in data]
-    width = max(set(widths), key=widths.count)
+    width = _width([rows[i] for i in data])
     first = next(i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data))
     cells = tuple(tuple(rows[i]) for i in data if i >= first)[:ROWS]
-    above = [
-        i
-        for i in range(first)
-        if 2 * sum(bool(c) for c in rows[i]) >= sum(bool(c) for c in cells[0]) and abs(len(rows[i]) - width) <= 1
-    ]
+    written = sum(bool(c) for c in cells[0])
+    above = [i for i in range(first) if 2 * sum(map(bool, rows[i])) >= written and abs(len(rows[i]) - width) <= 1]
+    blank = ("",) * width
     if not above:
-        return TableHead(
-            replace(dialect, header=False, skip_rows=first),
-            tuple(str(i + 1) for i in range(width)),
-            ("",) * width,
-            cells,
-        )
-    header, units = above[-1], [""] * width
-    unit_rows = [i for i in above[1:] if is_unit_row(rows[i])]
-    if unit_rows:
-        header = above[above.index(unit_rows[0]) - 1]
-        units = rows[unit_rows[0]]
-    fields = tuple((rows[header] + [""] * width)[:width])
-    return TableHead(
-        replace(dialect, skip_rows=header, unit_rows=first - header - 1),
-        fields,
-        tuple((units + [""] * width)[:width]),
-        cells,
-    )
+        numbers = tuple(str(i + 1) for i in range(width))
+        return TableHead(replace(dialect, header=False, skip_rows=first), numbers, blank, cells)
+    unit_row = next((i for i in above[1:] if is_unit_row(rows[i])), None)
+    header = above[-1] if unit_row is None else above[above.index(unit_row) - 1]
+    fields, units = ((*row, *blank)[:width] for row in (rows[header], () if unit_row is None else rows[unit_row]))
+    return TableHead(replace(dialect, skip_rows=header, unit_rows=first - header - 1), fields, units, cells)

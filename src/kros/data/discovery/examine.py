@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,21 +12,30 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.work import Work
-from ..alerts import period_alerts
-from ..checks import MIN_SAMPLES, check_range, is_constant
-from ..copies import copies_among, digest_of
+from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import Channel, EpisodeKey, Population, Role
 from ..prepare import PreparedSource
-from ..recording import TIME_TOLERANCE, title, usable
+from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, check_increasing, title
 
 Array = npt.NDArray[np.float64]
-GAP = 10.0  # median steps that a step may take before it counts as a gap, as in the step `resample`
-MANY, BRIDGED = (
-    5,
-    50.0,
-)  # where a fifth of the episodes or more have gaps, those of up to so many median steps are bridged
-_LONG_REST = 0.2  # of an episode, from which on a signal that stands still while others move is worth a word
-_SLOWER = 1.5
+
+
+@dataclass(frozen=True)
+class DiscoveryRule:
+    """What recordings are judged by before a study exists."""
+
+    looked_at: int = 15  # files whose first lines say how all are written
+    sampled: int = 6  # files whose numbers say what columns are
+    pieces: int = 5  # episodes that a single long recording is cut into
+    shortest_piece: int = 200  # samples that each of them needs
+    gap: float = 10.0  # median steps that a step may take before it is a gap, as in the step `resample`
+    bridged: float = 50.0  # median steps of the longest gap that is bridged
+    often: float = 0.2  # share of episodes with gaps, from which on gaps are bridged
+    long_rest: float = 0.2  # of an episode, from which on a signal that stands still while others move is reported
+    slower: float = 1.5  # times the median period, from which on an episode was sampled too slowly
+
+
+RULE = DiscoveryRule()
 
 
 @dataclass(frozen=True)
@@ -37,16 +46,11 @@ class EpisodeLook:
     wrong: str = ""  # why it cannot be used, or nothing
     doubts: tuple[str, ...] = ()  # what is odd about it
     n_samples: int = 0
-    period_s: float = np.nan  # median step of time; NaN where there is no column of time
-    uneven: tuple[float, int] | None = (
-        None  # largest relative deviation of a step of time, and the sample before it, where time is uneven
-    )
+    period_s: float = np.nan  # median step of time
+    uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
+    gap: tuple[float, int] = (0.0, 0)  # longest step of time, s, where it is a gap, and the sample before it
     nan: bool = False
-    gap: tuple[float, int] | None = (
-        None  # or None; Longest step of time, s, where it is a gap, and the sample before it
-    )
     digest: str = ""
-    alerts: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -57,9 +61,7 @@ class Examined:
     doubts: tuple[str, ...]  # what else looks wrong
     resample_s: float | None  # period to resample to, where time is uneven
     nan: tuple[EpisodeKey, ...]  # episodes with NaN or infinity
-    counts: Counter[tuple[str, str]] = field(
-        default_factory=Counter
-    )  # episodes that can be used, by unit and condition
+    counts: Counter[tuple[str, str]] = field(default_factory=Counter)  # usable episodes by unit and condition
     shortest: int = 0  # samples of the shortest of them
     max_gap_s: float | None = None  # longest gap to bridge, where many episodes have gaps
     uneven: tuple[EpisodeKey, int] | None = None  # where time is most uneven
@@ -68,128 +70,92 @@ class Examined:
 def examine(population: Population, work: Work | None = None) -> Examined:
     """Read every episode once, as it was recorded."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
-    seen = [s for found in (work or Work()).map("look", _look, tasks) for s in found]
-    wrong = {s.key: s.wrong for s in seen if s.wrong}
-    good = [s for s in seen if not s.wrong]
-    median = float(np.median([s.period_s for s in good])) if good else np.nan
-    slow = {
-        s.key: f"sampled every {s.period_s:.3g} s, the others every {median:.3g} s"
-        for s in good
-        if s.period_s > _SLOWER * median
-    }
-    wrong |= slow
-    broken = {s.key: s.gap for s in good if s.gap is not None and s.key not in wrong}
-    bridged = (
-        max((g for g, _ in broken.values() if g <= BRIDGED * median), default=0.0)
-        if MANY * len(broken) > len(good)
-        else 0.0
-    )
-    wrong |= {key: f"a gap of {g:.3g} s after sample {k}" for key, (g, k) in broken.items() if g > bridged}
-    good = [s for s in good if s.key not in wrong]
-    for key, other in copies_among((s.key, s.digest) for s in good if s.digest):
-        wrong.setdefault(key, f"a copy of {other}")
-    good = [s for s in good if s.key not in wrong]
-    different = any(abs(s.period_s - median) > 1e-4 * median for s in good)
-    resample = float(f"{median:.3g}") if any(s.uneven is not None for s in good) or different else None
-    n_bridged = sum(s.gap is not None for s in good)
-    told = (
-        [f"{n_bridged} episodes have gaps, of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"]
-        if n_bridged
-        else []
-    )
-    doubts = told + [d for s in good for d in s.doubts] + list(dict.fromkeys(a for s in good for a in s.alerts))
-    max_gap = float(f"{1.01 * bridged:.3g}") if n_bridged else None
-    counts = Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
-    shortest = min((s.n_samples for s in good), default=0)
-    worst = max((s for s in good if s.uneven is not None), key=lambda s: s.uneven or (0.0, 0), default=None)
-    uneven = None if worst is None or worst.uneven is None else (worst.key, worst.uneven[1])
+    looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
+    usable_looks = [s for s in looks if not s.wrong]
+    median = float(np.median([s.period_s for s in usable_looks])) if usable_looks else np.nan
+    gaps = [s.gap[0] for s in usable_looks if s.gap[0] and s.period_s <= RULE.slower * median]
+    many = len(gaps) > RULE.often * len(usable_looks)
+    bridged = max((g for g in gaps if many and g <= RULE.bridged * median), default=0.0)
+    wrong = {s.key: problem for s in looks if (problem := _problem(s, median, bridged))}
+    for key, other in copies_among((s.key, s.digest) for s in looks if s.digest and s.key not in wrong):
+        wrong[key] = f"a copy of {other}"
+    good = [s for s in looks if s.key not in wrong]
+    n_bridged = sum(s.gap[0] > 0 for s in good)
+    doubts = [d for s in good for d in s.doubts]
+    if n_bridged:
+        how = f"of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"
+        doubts.insert(0, f"{n_bridged} episodes have gaps, {how}")
+    worst = max((s for s in good if s.uneven[0]), key=lambda s: s.uneven, default=None)
+    different = any(abs(s.period_s - median) > PERIOD_TOLERANCE * median for s in good)
     return Examined(
-        wrong, tuple(doubts), resample, tuple(s.key for s in good if s.nan), counts, shortest, max_gap, uneven
+        wrong,
+        tuple(doubts),
+        resample_s=float(f"{median:.3g}") if worst is not None or different else None,
+        nan=tuple(s.key for s in good if s.nan),
+        counts=Counter((s.key.unit, s.key.condition) for s in good if not s.nan),
+        shortest=min((s.n_samples for s in good), default=0),
+        max_gap_s=float(f"{1.01 * bridged:.3g}") if n_bridged else None,
+        uneven=None if worst is None else (worst.key, worst.uneven[1]),
     )
+
+
+def _problem(look: EpisodeLook, median: float, bridged: float) -> str:
+    """Return why an episode cannot be used beside the others, or nothing."""
+    if look.wrong:
+        return look.wrong
+    if look.period_s > RULE.slower * median:
+        return f"sampled every {look.period_s:.3g} s, the others every {median:.3g} s"
+    gap, sample = look.gap
+    return f"a gap of {gap:.3g} s after sample {sample}" if gap > bridged else ""
 
 
 def _look(population: Population) -> list[EpisodeLook]:
     """Look at the episodes of one unit and condition, in a worker."""
     source: Any = population.source
-    recordings = source.recordings if isinstance(source, PreparedSource) else None
-    found = []
-    for i, key in enumerate(population.episodes):
+    looks, watch = {}, GroupWatch(population.columns)
+    for key in population.episodes:
+        looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
-            if recordings is None:
-                found.append(
-                    _looked(key, population.source(key), None, population.columns, population.sample_period_s, i == 0)
-                )
-            else:
-                recording = recordings(key)
-                found.append(
-                    _looked(
-                        key, recording.values, recording.time_s, population.columns, population.sample_period_s, i == 0
-                    )
-                )
+            recording = source.recordings(key) if isinstance(source, PreparedSource) else Recording(key, source(key))
+            values = recording.values
+            check_increasing(recording)
+            looks[key] = look = _timed(replace(looks[key], n_samples=len(values)), recording.time_s)
+            check_episode(values, key, population.columns)
+            doubts = tuple(_rests(key, values, population.columns))
+            looks[key] = replace(look, doubts=doubts, digest=digest_of(values))
+            watch.add(key, values)
+        except NonFiniteError as error:
+            looks[key] = replace(looks[key], nan=True, doubts=(str(error),))
         except DataError as error:
-            found.append(EpisodeLook(key, str(error)))
-    return found
+            looks[key] = replace(looks[key], wrong=str(error))
+    return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())
 
 
-def _looked(
-    key: EpisodeKey, values: Array, time: Array | None, channels: Sequence[Channel], period_s: float, first: bool
-) -> EpisodeLook:
-    n = len(values)
-    if n < MIN_SAMPLES:
-        return EpisodeLook(key, f"has {n} samples", n_samples=n)
-    period, gap = period_s, None
-    uneven: tuple[float, int] | None = None
-    if time is not None:
-        steps = np.diff(time)
-        backwards = np.flatnonzero(~(steps > 0))
-        if backwards.size:
-            k = int(backwards[0])
-            return EpisodeLook(
-                key,
-                f"time stands still or runs back at sample {k} ({time[k]:g} s, then {time[k + 1]:g} s), {backwards.size} times",
-                n_samples=n,
-            )
-        period = float(np.median(steps))
-        worst = int(steps.argmax())
-        gap = (float(steps[worst]), worst) if steps[worst] > GAP * period else None
-        deviation = np.abs(steps - period) / period
-        uneven = (float(deviation.max()), int(deviation.argmax())) if deviation.max() > TIME_TOLERANCE else None
-    if not usable(values).all():
-        bad = np.count_nonzero(~usable(values), axis=0)
-        names = ", ".join(f"{c.name!r} ({count})" for c, count in zip(channels, bad, strict=True) if count)
-        return EpisodeLook(
-            key, "", (f"{title(key)}: no number in some samples of {names}",), n, period, uneven, True, gap
-        )
-    check_range(values, key, channels)
-    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
-    if still and len(still) < sum(not is_constant(values[:, i]) or i in still for i in range(len(channels))):
-        stuck = channels[still[0]].name
-        return EpisodeLook(
-            key,
-            f"state {stuck!r} stays at {values[0, still[0]]:g} in all samples while others move: a stuck sensor",
-            n_samples=n,
-        )
-    alerts = period_alerts(values, channels, period) if first else ()
-    return EpisodeLook(
-        key, "", tuple(_rests(key, values, channels)), n, period, uneven, False, gap, digest_of(values), alerts
-    )
+def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
+    """Return a look with what the steps of time say."""
+    if time is None or len(time) < 2:
+        return look
+    steps = np.diff(time)
+    period, longest = float(np.median(steps)), int(steps.argmax())
+    deviation = np.abs(steps - period) / period
+    worst = int(deviation.argmax())
+    uneven = (float(deviation[worst]), worst) if deviation[worst] > TIME_TOLERANCE else look.uneven
+    gap = (float(steps[longest]), longest) if steps[longest] > RULE.gap * period else look.gap
+    return replace(look, period_s=period, uneven=uneven, gap=gap)
 
 
 def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:
-    """Say where a state stands still for long while other states move a good part of their range."""
+    """Report where a state stands still for long while other states move a good part of their range."""
     states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
-    ranges, found = np.ptp(values, axis=0), []
+    ranges, texts = np.ptp(values, axis=0), []
     for i in states:
-        changes = np.flatnonzero(np.diff(values[:, i]) != 0)
-        ends = np.concatenate([[-1], changes, [len(values) - 1]])
+        ends = np.concatenate([[-1], np.flatnonzero(np.diff(values[:, i]) != 0), [len(values) - 1]])
         longest = int(np.diff(ends).argmax())
         start, stop = int(ends[longest]) + 1, int(ends[longest + 1]) + 1
-        if stop - start < max(50, _LONG_REST * len(values)):
+        if stop - start < max(50, RULE.long_rest * len(values)):
             continue
         moving = [channels[j].name for j in states if j != i and np.ptp(values[start:stop, j]) > 0.2 * ranges[j] > 0]
         if moving:
-            name = channels[i].name
-            found.append(
-                f"{title(key)}: {name!r} stays at {values[start, i]:g} from sample {start} to {stop - 1} while {', '.join(moving)} move"
-            )
-    return found
+            rest = f"{channels[i].name!r} stays at {values[start, i]:g} from sample {start} to {stop - 1}"
+            texts.append(f"{title(key)}: {rest} while {', '.join(moving)} move")
+    return texts

@@ -1,7 +1,8 @@
-"""Unit, condition, episode and group from the names of files: a regular expression that says which part of a path is what.
+"""Unit, condition, episode and group from the names of files, as a regular expression on their paths.
 
-A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart by the word that it begins
-with or that stands before it (``run_3``), by what conditions are called, and else by its place: units before episodes.
+A path is cut into words at ``/ _ - .`` and spaces. What is the same in all paths is text; what differs is told apart
+by the word that it begins with or that stands before it (``run_3``), by what conditions are called, and else by its
+place: units before episodes.
 """
 
 from __future__ import annotations
@@ -14,22 +15,26 @@ from ..population import OUTLIERS
 
 UNIT, CONDITION, EPISODE, GROUP = "unit", "condition", "episode", "group"
 _WORDS = {
-    UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder pump valve design "
-    "joint sample specimen antrieb maschine "
-    "geraet gerät pruefling prüfling einheit anlage moteur machine moteur variateur part id",
-    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung versuch lauf "
-    "aufnahme essai mesure meas nr no",
+    UNIT: "act actuator gear unit drive motor cell battery pack machine device dev serial sn rig robot axis cylinder "
+    "pump valve design joint sample specimen antrieb maschine geraet gerät pruefling prüfling einheit anlage moteur "
+    "variateur part id",
+    EPISODE: "run rec recording episode ep trial test exp experiment take log trajectory traj measurement messung "
+    "versuch lauf aufnahme essai mesure meas nr no",
     CONDITION: "condition cond load config mode case temp last bedingung zustand charge",
 }
+_ROLE_OF = {word: role for role, words in _WORDS.items() for word in words.split()}
 _STATES = """
-load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast leerlauf leer kalt heiss heiß
-belastet unbelastet mitlast charge vide froid chaud forward reverse
+load loaded noload unloaded idle empty full hot cold warm cool new worn dry wet on off last ohnelast leerlauf leer kalt
+heiss heiß belastet unbelastet mitlast charge vide froid chaud forward reverse
 """
 _CONDITIONS = set(_STATES.split())
 _MEASURE = re.compile(
     r"^\d+(?:[.,]\d+)?(?:bar|mbar|psi|kpa|degc|°c|c|k|kg|g|n|nm|v|a|rpm|hz|mm|m|percent|pct|%)$", re.IGNORECASE
 )
 _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
+_DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
+_ENDING = re.compile(r"(.*?)((?:\.(?:csv|tsv|txt|dat|parquet))(?:\.gz)?)$", re.IGNORECASE)
+Roles = list[str | None]
 
 
 @dataclass(frozen=True)
@@ -37,176 +42,169 @@ class FileNames:
     """What the paths of a folder say."""
 
     pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
-    sure: bool  # whether words in the names said so; false where places alone decided
-    other: str | None = None  # a second expression that fits the names as well: episodes of one unit in place of units
+    sure: bool  # whether words in the names decided; false where places alone did
+    other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
+
+
+@dataclass(frozen=True)
+class _Cut:
+    """Paths cut into words: `rows` with a word for every place, `marks` with what is between places, path by path."""
+
+    rows: list[list[str]]
+    marks: list[list[str]]
+
+    @classmethod
+    def of(cls, parts: Sequence[Sequence[str]]) -> _Cut:
+        """Return the cut of words that alternate with marks."""
+        return cls([list(p[::2]) for p in parts], [list(p[1::2]) for p in parts])
+
+    @property
+    def columns(self) -> list[tuple[str, ...]]:
+        """The words at every place."""
+        return list(zip(*self.rows, strict=True))
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
     """Return the expression that tells the files of a folder apart."""
-    stems, ending = _without_ending(paths)
+    parts = [match.groups() if (match := _ENDING.match(p)) else (p, "") for p in paths]
+    endings = sorted({re.escape(ending) for _, ending in parts if ending})
+    ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
+    stems = [stem for stem, _ in parts]
     for cut in (_words(stems), _aligned(stems), _whole(stems)):
         if cut is None:
             continue
-        rows, marks = cut
-        roles, sure = _roles(rows, marks)
-        pattern = _pattern(rows, marks, roles, ending)
+        roles, sure = _roles(cut.columns)
+        pattern = _pattern(cut, roles, ending)
         if _tells_apart(pattern, paths):
-            numbered = (
-                not sure
-                and roles.count(UNIT) == 1
-                and not {EPISODE, GROUP} & set(roles)
-                and _counts([r[roles.index(UNIT)] for r in rows])
-            )
-            other = [EPISODE if r == UNIT else r for r in roles]
-            return FileNames(pattern, sure, _pattern(rows, marks, other, ending) if numbered else None)
+            alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
+            numbered = alone and _counts(cut.columns[roles.index(UNIT)])
+            episodes: Roles = [EPISODE if role == UNIT else role for role in roles]
+            return FileNames(pattern, sure, _pattern(cut, episodes, ending) if numbered else None)
     return FileNames(rf"^(?P<unit>.+){ending}$", False)
 
 
 def _counts(words: Sequence[str]) -> bool:
     """Tell whether words are one text with the numbers from 0 or 1 on, which may number units or episodes."""
-    found = [re.fullmatch(r"(\D*)(\d+)", w) for w in words]
-    if len(words) < 2 or not all(found) or len({m[1] for m in found if m}) > 1:
-        return False
-    numbers = sorted({int(m[2]) for m in found if m})
-    return numbers[0] in (0, 1) and len(numbers) > 1 and numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+    matches = [match for w in words if (match := re.fullmatch(r"(\D*)(\d+)", w))]
+    numbers = sorted({int(match[2]) for match in matches})
+    alike = len(matches) == len(words) and len({match[1] for match in matches}) == 1
+    return alike and len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
-def _nested(columns: list[tuple[str, ...]], outer: int, inner: int) -> bool:
-    """Tell whether the words at a place without numbers are labels of units: each unit at `inner`, a numbered word, has one, and a label has several."""
-    values, labels = set(columns[inner]), set(columns[outer])
-    pairs = set(zip(columns[outer], columns[inner], strict=True))
-    return (
-        len(labels) < len(values) == len(pairs)
-        and all(re.search(r"\d", v) for v in values)
-        and not any(re.search(r"\d", v) for v in labels)
-    )
-
-
-def _without_ending(paths: Sequence[str]) -> tuple[list[str], str]:
-    found = [re.match(r"(.*?)((?:\.(?:csv|tsv|txt|dat|parquet))(?:\.gz)?)$", p, re.IGNORECASE) for p in paths]
-    endings = sorted({m[2] for m in found if m})
-    ending = re.escape(endings[0]) if len(endings) == 1 else f"(?:{'|'.join(re.escape(e) for e in endings)})"
-    return [m[1] if m else p for m, p in zip(found, paths, strict=True)], ending
-
-
-def _words(stems: Sequence[str]) -> tuple[list[list[str]], list[list[str]]] | None:
+def _words(stems: Sequence[str]) -> _Cut | None:
     """Cut into words; a number with a decimal point, or a version, stays whole."""
     for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)"):
         parts = [re.split(marks, s) for s in stems]
-        if len({len(p) for p in parts}) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
-            return [p[::2] for p in parts], [p[1::2] for p in parts]
+        if len(set(map(len, parts))) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
+            return _Cut.of(parts)
     return None
 
 
-def _aligned(stems: Sequence[str]) -> tuple[list[list[str]], list[list[str]]] | None:
-    """Cut into words, where some paths have more of them: what all begin with, and as many words at the end as all have."""
+def _aligned(stems: Sequence[str]) -> _Cut | None:
+    """Cut into words where some paths have more: what all begin with, and as many words at the end as all have."""
     parts = [re.split(r"([/_ ]+)", s) for s in stems]
-    fewest = min(len(p) for p in parts)
-    head = 0
+    fewest, head = min(map(len, parts)), 0
     while head + 1 < fewest and len({tuple(p[head : head + 2]) for p in parts}) == 1:
         head += 2
     tail = fewest - head - 1
     cut = [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts]
-    return ([c[::2] for c in cut], [c[1::2] for c in cut]) if tail > 0 else None
+    return _Cut.of(cut) if tail > 0 else None
 
 
-def _whole(stems: Sequence[str]) -> tuple[list[list[str]], list[list[str]]] | None:
+def _whole(stems: Sequence[str]) -> _Cut | None:
     """Cut into folders and the first word of the name, where that is all that paths have in common."""
     parts = [re.split(r"(/)", s) for s in stems]
-    if len({len(p) for p in parts}) != 1:
+    if len(set(map(len, parts))) != 1:
         return None
-    last = [re.match(r"([^_\- ]+)([_\- ]+)(.+)$", p[-1]) for p in parts]
-    if all(last):
-        parts = [[*p[:-1], m[1], m[2], m[3]] for p, m in zip(parts, last, strict=True) if m]
-    return [p[::2] for p in parts], [p[1::2] for p in parts]
+    last = [match.groups() for p in parts if (match := re.match(r"([^_\- ]+)([_\- ]+)(.+)$", p[-1]))]
+    return _Cut.of(
+        [[*p[:-1], *words] for p, words in zip(parts, last, strict=True)] if len(last) == len(parts) else parts
+    )
 
 
-def _roles(rows: list[list[str]], marks: list[list[str]]) -> tuple[list[str | None], bool]:
-    """Say what every word is: text, or one of the groups."""
-    columns = [tuple(row[i] for row in rows) for i in range(len(rows[0]))]
+def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
+    """Tell what every word is: text, or one of the groups; and whether words said so."""
     varying = [i for i, c in enumerate(columns) if len(set(c)) > 1]
-    roles: list[str | None] = [None] * len(columns)
-    sure = True
-    for i in varying:
-        roles[i] = _told(columns, i)
-    for i in range(len(columns) - 2):  # 2024-05-31
-        if all(
-            all(re.fullmatch(p, v) for v in columns[i + k])
-            for k, p in enumerate((r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*"))
-        ):
-            for k in set(varying) & {i, i + 1, i + 2}:
-                roles[k] = EPISODE
+    roles: Roles = [_by_words(columns, i) if i in varying else None for i in range(len(columns))]
+    for i in range(len(columns) - 2):
+        if all(re.fullmatch(p, v) for k, p in enumerate(_DATE_PARTS) for v in columns[i + k]):
+            roles = [EPISODE if j in varying and i <= j <= i + 2 else role for j, role in enumerate(roles)]
     for i in varying:  # box1/box1_03
         if roles[i] is None and any(j < i and columns[i] == columns[j] for j in varying):
             roles[i] = "other"
-    if UNIT not in roles:  # motor00_01 and motor00_02 are two episodes
-        named = [
-            i
-            for i, c in enumerate(columns)
-            if len(set(c)) == 1 and re.search(r"\d", c[0]) and _told(columns, i) == UNIT
-        ]
-        for i in named[:1] if varying else ():
-            roles[i] = UNIT
+    if UNIT not in roles and varying:  # motor00_01 and motor00_02 are two episodes
+        same = [i for i, c in enumerate(columns) if i not in varying and re.search(r"\d", c[0])]
+        named = next((i for i in same if _by_words(columns, i) == UNIT), None)
+        roles = [UNIT if i == named else role for i, role in enumerate(roles)]
     left = [i for i in varying if roles[i] is None]
-    units = [i for i in varying if roles[i] is UNIT] or [i for i in left if len(set(columns[i])) < len(rows)]
-    for i in left:
-        if any(
-            j > i and _nested(columns, i, j) for j in units
-        ):  # good/act1, faulty/act3: two labels, and not two units
+    repeated = [i for i in left if len(set(columns[i])) < len(columns[i])]
+    units = [i for i in varying if roles[i] == UNIT] or repeated
+    for i in left:  # good/act1, faulty/act3: two labels, and not two units
+        if any(j > i and _nested(columns[i], columns[j]) for j in units):
             roles[i] = GROUP
     left = [i for i in left if roles[i] is None]
     if left:
-        sure = False
-        if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
-            repeated = [i for i in left if len(set(columns[i])) < len(rows) or varying == [i]]
-            if repeated:
-                roles[repeated[0]] = UNIT
-        for i in left:
-            before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
-            if roles[i] is None and before:
-                numbered = all(re.search(r"\d", v) for v in columns[i])  # batch2/motor7: the batch is part of the name
-                roles[i] = UNIT if numbered else CONDITION if CONDITION not in roles else EPISODE
-            elif roles[i] is None:
-                few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i])
-                roles[i] = CONDITION if few and CONDITION not in roles and i != varying[-1] else EPISODE
-    return _contiguous(roles, columns), sure
+        _by_place(columns, varying, left, roles)
+    return _contiguous(roles), not left
 
 
-def _told(columns: list[tuple[str, ...]], i: int) -> str | None:
+def _nested(outer: tuple[str, ...], inner: tuple[str, ...]) -> bool:
+    """Tell whether words without numbers label units: every unit, a numbered word, has one, and a label has several."""
+    values, labels = set(inner), set(outer)
+    numbers = [bool(re.search(r"\d", v)) for v in (*values, *labels)]
+    apart = all(numbers[: len(values)]) and not any(numbers[len(values) :])
+    return apart and len(labels) < len(values) == len(set(zip(outer, inner, strict=True)))
+
+
+def _by_words(columns: list[tuple[str, ...]], i: int) -> str | None:
     """Return what words say about the words at one place."""
     values = {v.lower() for v in columns[i]}
-    if OUTLIERS in values or "outlier" in values:
+    if values & {OUTLIERS, "outlier"}:
         return GROUP
-    plain = {re.sub(r"[\d]+$", "", v) for v in values}
     if len(values & _CONDITIONS) >= max(1, len(values) - 1) or all(_MEASURE.match(v) for v in values):
         return CONDITION
+    plain = {re.sub(r"\d+$", "", v) for v in values}
     before = columns[i - 1][0].lower() if i and len(set(columns[i - 1])) == 1 else ""
-    for role, words in _WORDS.items():
-        known = words.split()
-        if len(plain) == 1 and next(iter(plain)) in known and all(re.search(r"\d", v) for v in values):
-            return role
-        if re.sub(r"s$", "", before) in known:
-            return role
-    return EPISODE if all(_DATE.match(v) for v in columns[i]) else None
+    numbered = plain.pop() if len(plain) == 1 and all(re.search(r"\d", v) for v in values) else ""
+    roles = {_ROLE_OF.get(numbered), _ROLE_OF.get(re.sub(r"s$", "", before))}
+    role = next((role for role in _WORDS if role in roles), None)
+    return role or (EPISODE if all(_DATE.match(v) for v in columns[i]) else None)
 
 
-def _contiguous(roles: list[str | None], columns: list[tuple[str, ...]]) -> list[str | None]:
-    """Keep of every role one stretch of places: what is between belongs to it where it is text, else the later places become episodes."""
+def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequence[int], roles: Roles) -> None:
+    """Set the roles that no word tells: units before conditions before episodes."""
+    if UNIT not in roles:  # what differs in every file is no machine, unless nothing else differs
+        repeated = [i for i in left if len(set(columns[i])) < len(columns[i]) or varying == [i]]
+        for i in repeated[:1]:
+            roles[i] = UNIT
+    for i in left:
+        numbered = [bool(re.search(r"\d", v)) for v in columns[i]]
+        before = UNIT in roles[i + 1 :] and not any(roles[i + 1 : roles.index(UNIT, i + 1)])
+        if roles[i] is None and before and all(numbered):  # batch2/motor7: the batch is part of the name
+            roles[i] = UNIT
+        elif roles[i] is None:
+            few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i]) and i != varying[-1]
+            labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
+            free: str = (
+                UNIT if labels and not before else EPISODE
+            )  # KDN_1bar, O-ring257_3bar: these words count nothing
+            roles[i] = CONDITION if (before or few) and CONDITION not in roles else free
+
+
+def _contiguous(roles: Roles) -> Roles:
+    """Keep of every role one stretch of places, with text between; later places become episodes."""
     for role in (GROUP, UNIT, CONDITION, EPISODE):
         places = [i for i, r in enumerate(roles) if r == role]
         if len(places) < 2:
             continue
-        between = roles[places[0] : places[-1] + 1]
-        if all(r in (role, None) for r in between):
-            roles[places[0] : places[-1] + 1] = [role] * len(between)
+        first, last = places[0], places[-1]
+        if all(r in (role, None) for r in roles[first : last + 1]):
+            roles[first : last + 1] = [role] * (last + 1 - first)
         elif role is EPISODE:
             for i in places[:-1]:
-                if any(r not in (EPISODE, None) for r in roles[i : places[-1]]):
-                    roles[i] = "other"
+                roles[i] = role if all(r in (role, None) for r in roles[i:last]) else "other"
         else:
-            for i in places[1:]:
-                roles[i] = EPISODE
-            return _contiguous(roles, columns)
+            return _contiguous([EPISODE if i in places[1:] else r for i, r in enumerate(roles)])
     return roles
 
 
@@ -215,45 +213,35 @@ def quoted(text: str) -> str:
     return re.sub(r"\\([^\w\s.^$*+?{}\[\]|()\\])|\\ ", lambda m: m[1] or " ", re.escape(text))
 
 
-def _pattern(rows: list[list[str]], marks: list[list[str]], roles: list[str | None], ending: str) -> str:
-    """Write the expression."""
-    text, i, n = "^", 0, len(roles)
-    while i < n:
-        end = i
-        while roles[i] is not None and end + 1 < n and roles[end + 1] == roles[i]:
-            end += 1
-        values = {"".join(_joined(row, mark, i, end)) for row, mark in zip(rows, marks, strict=True)}
-        if roles[i] is None:
-            text += quoted(rows[0][i])
-        elif roles[i] == "other":
-            text += r"[^/]+?"
-        else:
-            text += f"(?P<{roles[i]}>{_class_of(values, end > i)})"
-        if end + 1 < n:
-            between = {mark[end] for mark in marks}
-            text += quoted(between.pop()) if len(between) == 1 else r"[/_\-. ]+"
-        i = end + 1
-    return text + ending + "$"
+def _pattern(cut: _Cut, roles: Roles, ending: str) -> str:
+    """Write the expression, with places of one role side by side in one group."""
+    text, start = "^", 0
+    while start < len(roles):
+        stop = start + 1
+        while roles[start] is not None and stop < len(roles) and roles[stop] == roles[start]:
+            stop += 1
+        text += _group(cut, roles[start], start, stop)
+        between = {mark[stop - 1] for mark in cut.marks} if stop < len(roles) else {""}
+        text += quoted(between.pop()) if len(between) == 1 else r"[/_\-. ]+"
+        start = stop
+    return f"{text}{ending}$"
 
 
-def _joined(row: list[str], mark: list[str], start: int, end: int) -> list[str]:
-    found = [row[start]]
-    for i in range(start, end):
-        found += [mark[i], row[i + 1]]
-    return found
-
-
-def _class_of(values: set[str], several: bool) -> str:
+def _group(cut: _Cut, role: str | None, start: int, stop: int) -> str:
+    """Return the expression of some places."""
+    if role is None:
+        return quoted(cut.rows[0][start])
+    if role == "other":
+        return r"[^/]+?"
+    marked = ([*zip(row, [*mark, ""], strict=True)] for row, mark in zip(cut.rows, cut.marks, strict=True))
+    values = {"".join(map("".join, pairs[start : stop - 1])) + pairs[stop - 1][0] for pairs in marked}
     if all(v.isdecimal() for v in values):
-        return r"\d+"
-    if several:
-        return ".+"
-    return r"[^/_]+" if not any("_" in v or "/" in v for v in values) else ".+?"
+        return rf"(?P<{role}>\d+)"
+    apart = ".+?" if any("_" in v or "/" in v for v in values) else "[^/_]+"
+    return f"(?P<{role}>{'.+' if stop - start > 1 else apart})"
 
 
 def _tells_apart(pattern: str, paths: Sequence[str]) -> bool:
-    found = [re.search(pattern, p) for p in paths]
-    if not all(found):
-        return False
-    keys = [tuple(m.groupdict().get(g) for g in (UNIT, CONDITION, EPISODE)) for m in found if m]
-    return len(set(keys)) == len(paths)
+    """Tell whether every path fits, and no two are the same episode."""
+    matches = [match.groupdict() for p in paths if (match := re.search(pattern, p))]
+    return len({tuple(m.get(g) for g in (UNIT, CONDITION, EPISODE)) for m in matches}) == len(paths) == len(matches)

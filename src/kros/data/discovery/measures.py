@@ -8,20 +8,8 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-SECONDS = {
-    "s": 1.0,
-    "sec": 1.0,
-    "seconds": 1.0,
-    "sek": 1.0,
-    "ms": 1e-3,
-    "msec": 1e-3,
-    "us": 1e-6,
-    "µs": 1e-6,
-    "μs": 1e-6,
-    "ns": 1e-9,
-    "min": 60.0,
-    "h": 3600.0,
-}
+_TIMES = {1.0: "s sec seconds sek", 1e-3: "ms msec", 1e-6: "us µs μs", 1e-9: "ns", 60.0: "min", 3600.0: "h"}
+SECONDS = {unit: factor for factor, units in _TIMES.items() for unit in units.split()}
 _KINDS = {
     "angle": "rad mrad deg ° grad rev turn turns u umdr",
     "position": "m mm cm um µm μm km in inc counts cnt",
@@ -34,29 +22,21 @@ _KINDS = {
     "pressure": "pa kpa mpa hpa bar mbar psi",
     "temperature": "°c degc k °f c",
     "other": "w kw kg g % - 1 l/min l/s pct percent none bool hex dez",
+    "time": " ".join(SECONDS),
 }
-KIND_OF = {unit: kind for kind, units in _KINDS.items() for unit in units.split()} | {unit: "time" for unit in SECONDS}
+KIND_OF = {unit: kind for kind, units in _KINDS.items() for unit in units.split()}
+_ANGLES = {"deg ° grad": math.pi / 180, "mrad": 1e-3, "rev turn turns umdr": 2 * math.pi}
+_SPEEDS = {"deg/s °/s": math.pi / 180, "rpm 1/min u/min min-1 min^-1 upm": math.pi / 30, "rev/s": 2 * math.pi}
 _TO_RADIANS = {
-    "deg": (math.pi / 180, "rad"),
-    "°": (math.pi / 180, "rad"),
-    "grad": (math.pi / 180, "rad"),
-    "mrad": (1e-3, "rad"),
-    "deg/s": (math.pi / 180, "rad/s"),
-    "°/s": (math.pi / 180, "rad/s"),
-    "rpm": (math.pi / 30, "rad/s"),
-    "1/min": (math.pi / 30, "rad/s"),
-    "u/min": (math.pi / 30, "rad/s"),
-    "min-1": (math.pi / 30, "rad/s"),
-    "min^-1": (math.pi / 30, "rad/s"),
-    "upm": (math.pi / 30, "rad/s"),
-    "rev/s": (2 * math.pi, "rad/s"),
-    "rev": (2 * math.pi, "rad"),
-    "turn": (2 * math.pi, "rad"),
-    "turns": (2 * math.pi, "rad"),
-    "umdr": (2 * math.pi, "rad"),
+    unit: (factor, base)
+    for base, factors in (("rad", _ANGLES), ("rad/s", _SPEEDS))
+    for units, factor in factors.items()
+    for unit in units.split()
 }
 _BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
 _AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
+_LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
+_SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
 
 
 @dataclass(frozen=True)
@@ -73,7 +53,11 @@ def known(unit: str) -> bool:
 
 
 def _plain(unit: str) -> str:
-    return unicodedata.normalize("NFC", unit).strip().strip("[](){}").strip().lower().replace(" ", "").replace("º", "°")
+    return _bare(unicodedata.normalize("NFC", unit)).lower().replace(" ", "").replace("º", "°")
+
+
+def _bare(text: str) -> str:
+    return text.strip().strip("[](){}").strip()
 
 
 def split_header(text: str) -> Header:
@@ -93,20 +77,21 @@ def split_header(text: str) -> Header:
 
 def is_unit_row(cells: Sequence[str]) -> bool:
     """Tell whether a row holds units of measure."""
-    written = [c for c in cells if c.strip()]
-    return bool(written) and 2 * sum(known(c) or bool(re.match(r"^\[.*\]$", c.strip())) for c in written) > len(written)
+    written = [c.strip() for c in cells if c.strip()]
+    units = sum(known(c) or (c.startswith("[") and c.endswith("]")) for c in written)
+    return bool(written) and 2 * units > len(written)
 
 
 def clean_unit(text: str) -> str:
     """Return a unit without brackets; nothing for a dash."""
-    bare = text.strip().strip("[](){}").strip()
+    bare = _bare(text)
     return "" if bare in ("-", "1", "none") else {"°": "deg", "°/s": "deg/s"}.get(bare, bare)
 
 
-def kind_of_unit(unit: str) -> str | None:
-    """Return the kind of quantity a unit of measure stands for."""
-    found = KIND_OF.get(_plain(unit))
-    return None if found == "other" else found
+def kind_of_unit(unit: str) -> str:
+    """Return the kind of quantity a unit of measure stands for; nothing where it says none."""
+    kind = KIND_OF.get(_plain(unit), "")
+    return "" if kind == "other" else kind
 
 
 def to_radians(unit: str) -> tuple[float, str] | None:
@@ -116,31 +101,17 @@ def to_radians(unit: str) -> tuple[float, str] | None:
 
 def unit_of_factor(factor: float, unit: str) -> str:
     """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
-    return next(
-        (
-            name
-            for name, (size, base) in _TO_RADIANS.items()
-            if base == unit and math.isclose(size, factor, rel_tol=1e-6)
-        ),
-        "",
-    )
+    sizes = ((name, size) for name, (size, base) in _TO_RADIANS.items() if base == unit)
+    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=1e-6)), "")
 
 
 def identifier(text: str, taken: Sequence[str] = ()) -> str:
     """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
     if text.isidentifier() and text.isascii() and text not in taken:
         return text
-    spelled = text
-    for letter, plain in zip(
-        "äöüßÄÖÜΔωφθατ",
-        ("ae", "oe", "ue", "ss", "Ae", "Oe", "Ue", "d", "omega", "phi", "theta", "alpha", "tau"),
-        strict=True,
-    ):
-        spelled = spelled.replace(letter, plain)
+    spelled = "".join(_SPELLED.get(letter, letter) for letter in text)
     ascii_text = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode().lower()
     name = re.sub(r"\W+", "_", ascii_text).strip("_") or "channel"
     name = name if name[0].isalpha() else f"c{name}"
-    found, n = name, 2
-    while found in taken:
-        found, n = f"{name}_{n}", n + 1
-    return found
+    numbered = (f"{name}_{n}" for n in range(2, len(taken) + 3))
+    return next(n for n in (name, *numbered) if n not in taken)

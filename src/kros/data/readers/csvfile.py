@@ -21,41 +21,32 @@ from ...core.errors import DataError
 from ...core.files import require_regular, shortened
 from ...core.memory import pass_on_shortage
 from ..arrow import fill
-from .timestamps import seconds_of
 
-ABSENT = (
-    "-",
-    "--",
-    "---",
-    "#DIV/0!",
-    "#NUM!",
-    "#REF!",
-    "#VALUE!",
-    "#WERT!",
-    "#ZAHL!",
-    "#BEZUG!",
-    "#NV",
-)  # cells of spreadsheets without a number
+# cells of spreadsheets without a number
+ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
 BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
+CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9}))?(?:Z|[+-]\d{2}:?\d{2})?"
+_DATE_PARTS = {"y": r"(?P<year>\d{4})", "m": r"(?P<month>\d{1,2})", "d": r"(?P<day>\d{1,2})"}
+DATES = {order: "[-./]".join(_DATE_PARTS[letter] for letter in order) for order in ("ymd", "dmy", "mdy")}
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a file is written: delimiter, whether a line names the columns, lines before it, decimal point, encoding, lines behind the header."""
+    """How a file is written: delimiter, whether a line names the columns, lines before it, decimal point, ..."""
 
     delimiter: str = ","
     header: bool = True
     skip_rows: int = 0
     decimal: str = "."
     encoding: str = "utf-8"
-    unit_rows: int = 0
+    unit_rows: int = 0  # lines between the header and the numbers
 
 
 COMMA = Dialect()
 
 
 class LimitedFile:
-    """An open file that refuses to give more than is ever read; text that was packed too tightly to be recordings is refused early."""
+    """An open file that gives no more than is ever read; text that was packed too tightly is refused."""
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         self._file, self._path = file, path
@@ -70,34 +61,30 @@ class LimitedFile:
         """Return the next line with its end, or refuse one that is longer than any header."""
         line = self._counted(self._file.readline(limits.MAX_LINE_BYTES + 1))
         if len(line) > limits.MAX_LINE_BYTES:
-            raise DataError(
-                f"Reading {self._path}: a line at the start is longer than {limits.MAX_LINE_BYTES} bytes, so this is no table of text; check "
-                "the file and its line ends."
-            )
+            problem = f"a line at the start is longer than {limits.MAX_LINE_BYTES} bytes, so this is no table of text"
+            raise DataError(f"Reading {self._path}: {problem}; check the file and its line ends.")
         if b"\r" in line.removesuffix(b"\r\n").removesuffix(b"\r"):
-            raise DataError(
-                f"Reading {self._path}: lines end with CR alone, as on old systems; convert the line ends to LF or CR LF."
-            )
+            problem = "lines end with CR alone, as on old systems"
+            raise DataError(f"Reading {self._path}: {problem}; convert the line ends to LF or CR LF.")
         if b"\0" in line:
-            raise DataError(
-                f"Reading {self._path}: holds NUL bytes, so it is binary or UTF-16; convert it to text in UTF-8."
-            )
+            problem = "holds NUL bytes, so it is binary or UTF-16"
+            raise DataError(f"Reading {self._path}: {problem}; convert it to text in UTF-8.")
         return line
 
     def close(self) -> None:
-        """Say that nothing more is read."""
+        """Mark the file as read."""
         self.closed = True
 
     def _counted(self, content: bytes) -> bytes:
         self._given += len(content)
+        more = f"Reading {self._path}: unpacks to more than"
         if self._given > limits.MAX_TEXT_BYTES:
-            raise DataError(
-                f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; split it, or raise MAX_TEXT_BYTES in kros.core.limits."
-            )
+            advice = "split it, or raise MAX_TEXT_BYTES in kros.core.limits"
+            raise DataError(f"{more} {limits.MAX_TEXT_BYTES} bytes; {advice}.")
         if self._given > max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size):
+            advice = "unpack it yourself if it is one, or raise MAX_RATIO in kros.core.limits"
             raise DataError(
-                f"Reading {self._path}: unpacks to more than {limits.MAX_RATIO} times its {self._size} bytes, which recordings never do; unpack it "
-                "yourself if it is one, or raise MAX_RATIO in kros.core.limits."
+                f"{more} {limits.MAX_RATIO} times its {self._size} bytes, which recordings never do; {advice}."
             )
         return content
 
@@ -139,36 +126,35 @@ def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
 
 def _fields(line: str, path: Path, dialect: Dialect) -> list[str]:
     try:
-        return [
-            part.strip() for part in next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True), [])
-        ]
+        row = next(csv.reader([line], delimiter=dialect.delimiter, skipinitialspace=True), [])
     except csv.Error as error:
         raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
+    return [part.strip() for part in row]
 
 
 def read_columns(
     path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA, timestamp: str | None = None
 ) -> npt.NDArray[np.float64]:
-    """Read some columns of a file, shape (len(wanted), n_rows)."""
+    """Read some columns of a file, the first as timestamps where their order is given, shape (len(wanted), n_rows)."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 
-    read = arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK)
-    parse = arrow.ParseOptions(delimiter=dialect.delimiter)
-    numbers = {name: pa.float64() for name in wanted}
-    if timestamp is not None:
-        numbers[wanted[0]] = pa.string()
-    convert = arrow.ConvertOptions(
-        column_types=numbers,
-        include_columns=list(numbers),
-        decimal_point=dialect.decimal,
-        null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
+    kinds = {name: pa.float64() for name in wanted} | ({} if timestamp is None else {wanted[0]: pa.string()})
+    options = (
+        arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK),
+        arrow.ParseOptions(delimiter=dialect.delimiter),
+        arrow.ConvertOptions(
+            column_types=kinds,
+            include_columns=list(kinds),
+            decimal_point=dialect.decimal,
+            null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
+        ),
     )
     with opened(path, dialect.encoding) as file:
         lines = dialect.skip_rows + dialect.header + (dialect.unit_rows if dialect.header else 0)
         _skip(file, lines, path)  # here, so that both readings count lines alike
         try:
-            table = arrow.read_csv(pa.PythonFile(file, mode="r"), read, parse, convert)
+            table = arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
         except DataError:
             raise
         except (pa.ArrowException, ValueError, MemoryError) as error:
@@ -188,23 +174,18 @@ def read_columns(
 def _skip(file: LimitedFile, lines: int, path: Path) -> None:
     for line in range(lines):
         if not file.readline():
-            raise DataError(
-                f"Reading {path}: {lines} lines stand before the numbers by the mapping, found {line} in all; correct skip_rows."
-            )
+            actual = f"{lines} lines stand before the numbers by the mapping, found {line} in all"
+            raise DataError(f"Reading {path}: {actual}; correct skip_rows.")
 
 
 def _text(line: bytes, path: Path, encoding: str) -> str:
     named = encoding if _has_ascii(encoding) else "utf-8"
+    named = "utf-8-sig" if codecs.lookup(named).name == "utf-8" else named
     try:
-        return (
-            line.decode("utf-8-sig" if codecs.lookup(named).name == "utf-8" else named)
-            .rstrip("\r\n")
-            .removeprefix("\ufeff")
-        )
+        return line.decode(named).rstrip("\r\n").removeprefix("\ufeff")
     except UnicodeDecodeError as error:
-        raise DataError(
-            f"Reading {path}: its first line is not {encoding.upper()} ({error}); name the encoding, such as cp1252."
-        ) from error
+        problem = f"its first line is not {encoding.upper()} ({error})"
+        raise DataError(f"Reading {path}: {problem}; name the encoding, such as cp1252.") from error
 
 
 def _explain(message: str, names: Sequence[str]) -> str:
@@ -212,3 +193,30 @@ def _explain(message: str, names: Sequence[str]) -> str:
     if "straddling" in message:
         return f"a line, or a text in quotes, is longer than {BLOCK} bytes"
     return shortened(re.sub(r"In CSV column #(\d+):", lambda match: f"in column {names[int(match[1])]!r}:", message))
+
+
+def timestamp_pattern(order: str) -> str:
+    """Return the expression of timestamps with a date in some order, ``ymd``, ``dmy`` or ``mdy``, or without a date."""
+    return rf"^\s*(?:{DATES[order]}[T ]\s*)?{CLOCK}\s*$"
+
+
+def seconds_of(column: Any, order: str) -> npt.NDArray[np.float64]:
+    """Return timestamps as seconds since the first one, NaN where a cell holds none, shape (n_rows,), s."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    parts = pc.extract_regex(column.combine_chunks(), pattern=timestamp_pattern(order))
+    bad = parts.is_null().to_numpy(zero_copy_only=False)
+
+    def number(name: str, default: str = "0") -> npt.NDArray[np.int64]:
+        cells = pc.fill_null(pc.struct_field(parts, name), default)
+        cells = pc.utf8_rpad(cells, 9, "0") if name == "fraction" else pc.if_else(pc.equal(cells, ""), default, cells)
+        return np.asarray(pc.cast(cells, pa.int64()).to_numpy(zero_copy_only=False), dtype=np.int64)
+
+    years = (number("year", "1970") - 1970).astype("datetime64[Y]")
+    months = years.astype("datetime64[M]") + (number("month", "1") - 1)
+    days = (months.astype("datetime64[D]") + (number("day", "1") - 1)).astype(np.int64)
+    whole = ((days * 24 + number("hour")) * 60 + number("minute")) * 60 + number("second")
+    good = np.flatnonzero(~bad)
+    since = 10**9 * (whole - (whole[good[0]] if good.size else 0)) + number("fraction")
+    return np.where(bad, np.nan, 1e-9 * since)

@@ -1,30 +1,32 @@
-"""The paper's raw recordings of motor drives with Harmonic Drive gearboxes.
+"""The paper's raw recordings of motor drives with Harmonic Drive gearboxes, both ways: CSV files with a fixed mapping.
 
     raw/batch_b/{population,outliers}/<YYYYmmddTHHMMSS>_<serial>_<load|noload>/*_<episode>.csv
 
-Columns, by position after one header line: time (s, also ms or us), position (deg), velocity (deg/s), torque (% of full scale), target position (deg),
-target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS` declares the preparation.
+Columns, by position after one header line: time (s, also ms or us), position (deg), velocity (deg/s), torque (% of
+full scale), target position (deg), target velocity (deg/s), all on the motor side of a gear of ratio 100. `STEPS`
+declares the preparation.
 """
 
 from __future__ import annotations
 
+import io
 import logging
 import math
-import os
 import re
-from collections.abc import Iterator
-from dataclasses import dataclass
+from datetime import datetime, timedelta
+from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core.errors import DataError
-from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
-from ..prepare import assemble, episode_order
-from ..recording import Recording, Recordings, estimate_period, usable
-from ..scaling import Scaling
+from ..arrow import from_numpy
+from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
-from .csvfile import first_fields, read_columns
+from ..writers.folders import in_threads, whole_folder
+from .csv_folder import csv_files, read_csv_folder
+from .csv_mapping import ChannelMapping, CsvMapping
 
 logger = logging.getLogger(__name__)
 
@@ -33,8 +35,6 @@ PERIOD_S = 1e-3
 REST_SAMPLES = 1000
 TARGET_LAG = 1
 GROUPS = ("population", OUTLIERS)
-METADATA = {"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO}
-COLUMNS = ("time", "position", "velocity", "current", "target_position", "target_velocity")
 CHANNELS = (
     Channel("position", Role.STATE, "deg", measured=True),
     Channel("velocity", Role.STATE, "deg/s"),
@@ -52,29 +52,26 @@ STEPS: tuple[Step, ...] = (
     Offset("position", "target_position", 500, 1000),
     Trim(start=REST_SAMPLES),
 )
-FOLDER = re.compile(r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)")
+FOLDER = r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)"
+EPISODE = r"[^/]*(?=\d{3}\.csv$)0{0,2}(?P<episode>\d{1,3})\.csv"  # the last three characters of the stem
+MAPPING = CsvMapping(
+    files=f"^(?P<group>{'|'.join(GROUPS)})/{FOLDER}/{EPISODE}$",
+    time=1,
+    channel=tuple(
+        ChannelMapping(name=c.name, role=c.role, unit=c.unit, measured=c.measured, column=number)
+        for number, c in enumerate(CHANNELS, start=2)
+    ),
+    prepare=STEPS,
+    metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
+)
 
-
-@dataclass(frozen=True, eq=False)
-class RawRecordings(Recordings):
-    """Reads one raw file at a time."""
-
-    time_scale: float = 1.0
-
-    def file(self, place: str) -> Path:
-        """Return the file of an episode."""
-        return Path(place)
-
-    def read(self, key: EpisodeKey, place: str) -> Recording:
-        """Return one episode as recorded."""
-        columns = read_columns(Path(place), COLUMNS, COLUMNS)
-        return Recording(
-            key, np.ascontiguousarray(columns[1:].T), np.where(usable(columns[0]), columns[0], np.nan) * self.time_scale
-        )
+HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
+DECIMALS = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, target position, target velocity
+FIRST_STAMP = datetime(2023, 1, 1)
 
 
 def find_root(source: Path) -> Path | None:
-    """Return the folder that holds ``population`` or ``outliers``, at `source` or in its ``batch_b`` (also below ``raw``)."""
+    """Return the folder with ``population`` or ``outliers``: `source`, or its ``batch_b`` (also below ``raw``)."""
     for candidate in (source, source / "batch_b", source / "raw" / "batch_b"):
         if any((candidate / group).is_dir() for group in GROUPS):
             return candidate
@@ -82,98 +79,109 @@ def find_root(source: Path) -> Path | None:
 
 
 def is_raw_layout(source: Path) -> bool:
-    """Tell whether some folder in ``population`` or ``outliers`` is named as a recording of the raw layout: other layouts use these words too."""
+    """Tell whether a folder in ``population`` or ``outliers``, words that others use too, is named as in the layout."""
     root = find_root(source)
-    folders = (
-        path for group in GROUPS if root is not None and (root / group).is_dir() for path in (root / group).iterdir()
-    )
-    return any(path.is_dir() and FOLDER.fullmatch(path.name) is not None for path in folders)
+    folders = [path for group in GROUPS for path in root.glob(f"{group}/*")] if root is not None else []
+    return any(path.is_dir() and re.fullmatch(FOLDER, path.name) for path in folders)
 
 
 def read_motor_drive_raw(source: Path | str) -> Population:
-    """Read the paper's raw layout."""
-    root = find_root(Path(source))
+    """Read the paper's raw layout, sampled at 1 kHz, so steps of time of 1 are ms and of 1000 are us."""
+    root, what = find_root(Path(source)), f"Reading {source} as motor-drive-raw"
     if root is None:
-        raise DataError(
-            f"Reading {source} as motor-drive-raw: found no folder 'population' or 'outliers', nor 'batch_b' with one of "
-            "them; check the path."
-        )
-    groups: dict[str, str] = {}
-    files: dict[EpisodeKey, str] = {}
-    for group, path, match in _folders(root):
-        unit = match["unit"]
-        if groups.setdefault(unit, group) != group:
-            raise DataError(
-                f"Unit {unit} is in both groups {groups[unit]!r} and {group!r} of {root}; move its folders to one of them."
-            )
-        for episode, file in _episodes(path):
-            key = EpisodeKey(unit, match["condition"], episode)
-            if key in files:
-                raise DataError(
-                    f"Duplicate episodes: {key} is in {files[key]} and in {file}; remove or renumber one of them."
-                )
-            files[key] = file
-    for file in files.values():
-        _check_header(Path(file))
-    units = [Unit(unit, group) for unit, group in groups.items()]
-    if not files:
-        raise DataError(
-            f"Reading {source} as motor-drive-raw: found {len(groups)} folders of units and no .csv in them; check the path."
-        )
-    recordings = RawRecordings(files, _time_scale(RawRecordings(files)(min(files, key=episode_order))))
-    scaling = {name: Scaling(number + 1) for number, name in enumerate(COLUMNS) if number}
-    return assemble(recordings, CHANNELS, units, metadata=METADATA, steps=STEPS, scaling=scaling)
-
-
-def _time_scale(first: Recording) -> float:
-    """Return the factor from the column of time to seconds: the layout is sampled at 1 kHz, so steps of 1 are ms and of 1000 are us."""
-    period = estimate_period(first)
-    for scale in (1.0, 1e-3, 1e-6):
-        if math.isclose(period * scale, PERIOD_S, rel_tol=0.01):
-            return scale
-    logger.warning(
-        "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples.",
-        period,
-        first.key,
+        missing = "found no folder 'population' or 'outliers', nor 'batch_b' with one of them"
+        raise DataError(f"{what}: {missing}; check the path.")
+    files = [name for _, name in csv_files(root) if name.endswith(".csv") and name.startswith(GROUPS)]
+    strange = next((name for name in files if not re.search(MAPPING.files, name)), None)
+    if strange is not None:
+        wanted = "<YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>/*_<episode, 3 digits>.csv"
+        raise DataError(f"{what}: file {root / strange} should be named {wanted}; rename it or move it away.")
+    population = read_csv_folder(root, MAPPING)
+    period = population.sample_period_s
+    scale = next((s for s in (1.0, 1e-3, 1e-6) if math.isclose(period * s, PERIOD_S, rel_tol=0.01)), None)
+    if scale is None:
+        text = "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples."
+        logger.warning(text, period, population.episodes[0])
+    return (
+        population if scale in (None, 1.0) else read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
     )
-    return 1.0
 
 
-def _folders(root: Path) -> Iterator[tuple[str, Path, re.Match[str]]]:
-    for group in GROUPS:
-        if not (root / group).is_dir():
-            continue
-        for path in sorted(p for p in (root / group).iterdir() if p.is_dir() and not p.name.startswith(".")):
-            match = FOLDER.fullmatch(path.name)
-            if match is None:
-                raise DataError(
-                    f"Folder {path} should be named <YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>; rename it or move it away."
-                )
-            yield group, path, match
+def write_raw(population: Population, out: Path | str) -> None:
+    """Write the paper's raw layout, ``<out>/batch_b/<group>/<stamp>_<serial>_<load|noload>/*_<episode>.csv``.
+
+    Parameters
+    ----------
+    population : Population
+        Drives *before* preparation, in the reader's channels and units (rad and rad/s at the gear output, fraction of
+        full scale): episodes still hold the 1000 samples at rest and the offset of the position. Targets are written
+        one row later than the measurements they belong to, so reading back gives one sample less (and 1000 less at
+        rest).
+    out : Path
+        Folder to make, whole or not at all.
+
+    Raises
+    ------
+    DataError
+        Other channels, or names that the layout cannot hold.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> from tempfile import TemporaryDirectory
+    >>> from kros.data import write_raw
+    >>> from kros.plants import HarmonicDrivePopulation
+    >>> drives = HarmonicDrivePopulation(n_units=2, n_episodes=1, seconds=2.0, conditions=("noload",))
+    >>> with TemporaryDirectory() as folder:
+    ...     write_raw(drives.simulate().raw, f"{folder}/raw")  # as recorded, before preparation
+    ...     print(len(list(Path(folder).rglob("*.csv"))))
+    2
+    """
+    names, expected = tuple(c.name for c in population.channels), tuple(c.name for c in CHANNELS)
+    if names != expected:
+        needs = f"needs the channels {expected}, found {names}"
+        raise DataError(f"Writing the raw layout of motor drives {needs}; write Parquet instead.")
+    groups = list(population.groups())
+    for key in population.episodes:
+        _check_names(key)
+    with whole_folder(Path(out)) as folder:
+        in_threads([partial(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)])
 
 
-def _episodes(folder: Path) -> Iterator[tuple[str, str]]:
-    """Yield (episode, file) of one folder; the last three characters of the stem number the episode."""
-    for name in sorted(os.listdir(folder)):
-        if not name.endswith(".csv") or name.startswith("."):
-            continue
-        number = name[:-4][-3:]
-        if not re.fullmatch(r"[0-9]{3}", number):
-            raise DataError(
-                f"File {folder / name}: the last three characters before .csv should number the episode, found {number!r}; rename it."
-            )
-        yield str(int(number)), str(folder / name)
+def _check_names(key: EpisodeKey) -> None:
+    """Refuse names that the layout cannot hold."""
+    named = re.fullmatch("[0-9]{6}", key.unit) and re.fullmatch("[0-9]{1,3}", key.episode)
+    if not named or key.condition not in ("load", "noload"):
+        needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
+        raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
 
 
-def _check_header(file: Path) -> None:
-    fields = first_fields(file)
-    if len(fields) != len(COLUMNS):
-        problem = "missing" if len(fields) < len(COLUMNS) else "extra"
-        raise DataError(
-            f"Reading {file}: {len(COLUMNS)} columns are needed ({', '.join(COLUMNS)}), found {len(fields)}: {fields}; "
-            f"{problem} columns, correct the file."
-        )
-    if all(re.fullmatch(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?", field) for field in fields):
-        raise DataError(
-            f"Reading {file}: one header line is needed, found numbers in the first line: {fields}; put the names of the columns first."
-        )
+def _write_folder(population: Population, keys: tuple[EpisodeKey, ...], folder: Path, index: int) -> None:
+    """Write the episodes of one unit and condition."""
+    unit, condition = keys[0].unit, keys[0].condition
+    group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
+    stamp = (FIRST_STAMP + timedelta(minutes=10 * index)).strftime("%Y%m%dT%H%M%S")
+    name = f"{stamp}_{unit}_{condition}"
+    target = folder / "batch_b" / group / name
+    target.mkdir(parents=True)
+    for key in keys:
+        content = raw_csv(population.read(key), population.sample_period_s)
+        (target / f"{name}_{int(key.episode):03d}.csv").write_bytes(content)
+
+
+def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
+    """Return one raw file."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    recorded = values.copy()
+    recorded[TARGET_LAG:, 3:] = values[:-TARGET_LAG, 3:]
+    recorded[:TARGET_LAG, 3:] = values[0, 3:]
+    recorded /= np.array([MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD, PERCENT, MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD])
+    columns = zip([np.arange(len(values)) * sample_period_s, *recorded.T], DECIMALS, strict=True)
+    rounded = [from_numpy(np.round(column, decimals) + 0.0) for column, decimals in columns]
+    table = pa.Table.from_arrays(rounded, names=[c.name for c in CHANNELS] + ["time"])
+    buffer = io.BytesIO(HEADER)
+    buffer.seek(len(HEADER))
+    csv.write_csv(table, buffer, csv.WriteOptions(include_header=False))
+    return buffer.getvalue()

@@ -53,7 +53,8 @@ def read(
     prepare : iterable of Step or mapping
         Further steps, as in ``[[data.prepare]]``, after those of the mapping.
     optional : collection of str
-        Channels that recordings may lack, such as states that only a test bench measures; steps that need them are left out with them.
+        Channels that recordings may lack, such as states that only a test bench measures; steps that need them are
+        left out with them.
 
     Returns
     -------
@@ -80,44 +81,36 @@ def read(
     if reader is not None and reader not in READERS:
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
     chosen = _fitting(reader, Path(source), mapping is not None)
-    if chosen == "csv":
-        if mapping is None:
-            raise ConfigError(
-                f"Reading {source} as csv needs a mapping of columns; give mapping=, --mapping FILE or the table [data.csv] (kros init writes one)."
-            )
+    if chosen == "csv" and mapping is None:
+        advice = "give mapping=, --mapping FILE or the table [data.csv] (kros init writes one)"
+        raise ConfigError(f"Reading {source} as csv needs a mapping of columns; {advice}.")
+    if chosen != "csv" and mapping is not None:
+        problem = "a CSV mapping is given, which only the reader 'csv' uses"
+        raise ConfigError(f'Reading {source} as {chosen}: {problem}; remove it or set data.reader = "csv".')
+    if mapping is not None:
         population = read_csv_folder(source, mapping, optional)
-    elif mapping is not None:
-        raise ConfigError(
-            f"Reading {source} as {chosen}: a CSV mapping is given, which only the reader 'csv' uses; remove it or set "
-            'data.reader = "csv".'
-        )
     else:
         population = read_parquet(source) if chosen == "parquet" else read_motor_drive_raw(source)
     absent = set(optional) - set(population.states) - set(population.inputs)
-    return prepared(population, [step for s in steps if (step := s.without(absent)) is not None] if absent else steps)
+    return prepared(population, [step for s in steps if (step := s.without(absent) if absent else s) is not None])
 
 
 def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
     """Return the reader to use, after checking that the folder fits it."""
+    reading = f"Reading {source}"
     if not source.exists():
-        raise DataError(f"Reading {source}: there is no such folder; check data.source (relative to the study file).")
+        raise DataError(f"{reading}: there is no such folder; check data.source (relative to the study file).")
     if not source.is_dir():
-        raise DataError(
-            f"Reading {source}: this is a file, and recordings are a folder; give the folder that holds it."
-        )
+        raise DataError(f"{reading}: this is a file, and recordings are a folder; give the folder that holds it.")
     if not any(source.iterdir()):
-        raise DataError(f"Reading {source}: the folder is empty; check data.source or record something.")
+        raise DataError(f"{reading}: the folder is empty; check data.source or record something.")
     if reader == "csv" or (reader is None and with_mapping):
         return "csv"  # a mapping may describe any layout
-    found = detect_reader(source)
-    if found is None:
-        raise DataError(
-            f"Reading {source}: no reader fits; it has neither population.json, nor 'population' and 'outliers', nor CSV "
-            "files; check data.source."
-        )
-    if reader not in (None, found):
-        raise DataError(
-            f"Reading {source} as {reader}: the folder {LOOKS[found]}, so it looks like {found}; set data.reader = "
-            f'"{found}", or check data.source.'
-        )
-    return found
+    fitting = detect_reader(source)
+    if fitting is None:
+        problem = "it has neither population.json, nor 'population' and 'outliers', nor CSV files"
+        raise DataError(f"{reading}: no reader fits; {problem}; check data.source.")
+    if reader not in (None, fitting):
+        looks = f"the folder {LOOKS[fitting]}, so it looks like {fitting}"
+        raise DataError(f'{reading} as {reader}: {looks}; set data.reader = "{fitting}", or check data.source.')
+    return fitting

@@ -21,40 +21,43 @@ from ...core.files import require_regular, shortened
 from ...core.memory import pass_on_shortage
 from ..arrow import fill
 from ..checks import check_period
-from ..population import Channel, EpisodeKey, Population, Role, TrueChannel, Unit, columns_in_order
+from ..population import Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 from ..scaling import Scaling
-from ..tables import build
 
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
+AGAIN = "convert the recordings again"
+Array = npt.NDArray[np.float64]
 Version = tuple[int, int, int]
+Place = tuple[str, int, int]
+_ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError)
 
 
 class Kept:
-    """Arrays by key, those that were asked for last, at most so many bytes in all; they cannot be written to."""
+    """Read-only arrays by key, the latest asked for, at most so many bytes in all."""
 
     def __init__(self, limit: int) -> None:
         self.limit, self.size = limit, 0
-        self.arrays: OrderedDict[Hashable, npt.NDArray[np.float64]] = OrderedDict()
+        self.arrays: OrderedDict[Hashable, Array] = OrderedDict()
         self._lock = Lock()
 
-    def take(self, key: Hashable, make: Callable[[], npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
+    def take(self, key: Hashable, make: Callable[[], Array]) -> Array:
         """Return the array of a key, made where it is not there."""
         with self._lock:
             if key in self.arrays:
                 self.arrays.move_to_end(key)
                 return self.arrays[key]
-        made = make()
-        made.flags.writeable = False
+        array = make()
+        array.flags.writeable = False
         with self._lock:
-            if made.nbytes <= self.limit and key not in self.arrays:
-                self.arrays[key] = made
-                self.size += made.nbytes
+            if array.nbytes <= self.limit and key not in self.arrays:
+                self.arrays[key] = array
+                self.size += array.nbytes
             while self.size > self.limit:
                 self.size -= self.arrays.popitem(last=False)[1].nbytes
-        return made
+        return array
 
 
 _KEPT = Kept(limit=2**28)  # the demo's recordings fit, those of a factory do not have to
@@ -67,53 +70,38 @@ class ParquetRecordings(Recordings):
     folder: str
     columns: tuple[str, ...]
 
-    def file(self, place: tuple[str, int, int]) -> Path:
+    def file(self, place: Place) -> Path:
         """Return the file of a unit and condition."""
         return Path(self.folder) / place[0]
 
-    def read(self, key: EpisodeKey, place: tuple[str, int, int]) -> Recording:
+    def read(self, key: EpisodeKey, place: Place) -> Recording:
         """Return one episode."""
-        name, group, samples = place
-        path = Path(self.folder) / name
+        path = self.file(place)
         require_regular(path, sys.maxsize)
-        file = path.stat()
-        version = (file.st_ino, file.st_size, file.st_mtime_ns)  # a file written anew is read anew
-        return Recording(
-            key,
-            _KEPT.take(
-                (str(path), version, group, samples, key, self.columns),
-                lambda: self._values(key, path, version, group, samples),
-            ),
+        status = path.stat()
+        version = (status.st_ino, status.st_size, status.st_mtime_ns)  # a file written anew is read anew
+        values = _KEPT.take(
+            (str(path), version, place, key, self.columns), lambda: self._values(key, path, version, place)
         )
+        return Recording(key, values)
 
-    def _values(
-        self, key: EpisodeKey, path: Path, version: Version, group: int, samples: int
-    ) -> npt.NDArray[np.float64]:
+    def _values(self, key: EpisodeKey, path: Path, version: Version, place: Place) -> Array:
         """Return the samples of an episode from its file."""
         try:
-            table = _read_group(path, version, group, samples, [*KEYS, *self.columns])
+            table = _read_group(path, version, place, [*KEYS, *self.columns])
             values = np.empty((table.num_rows, len(self.columns)))
             for column, channel in enumerate(self.columns):
                 fill(values[:, column], table.column(channel))
             table.select(KEYS).validate(full=True)
-            for label, expected in zip(KEYS, (key.unit, key.condition, key.episode), strict=True):
-                _check_label(table.column(label), label, expected, path)
+            for name in KEYS:
+                expected, actual = getattr(key, name), table.column(name).unique().to_pylist()
+                _require(actual == [expected], path, f"the index says {name} {expected!r}, the samples say {actual!r}")
+            return values
         except DataError:
             raise
-        except (
-            OSError,
-            ValueError,
-            LookupError,
-            TypeError,
-            ArithmeticError,
-            NotImplementedError,
-            MemoryError,
-        ) as error:  # and Arrow's own
+        except _ARROW_ERRORS as error:
             pass_on_shortage(error, path)
-            raise DataError(
-                f"Reading {key} from {path}: {shortened(str(error))}; convert the recordings again."
-            ) from error
-        return values
+            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
 
 
 @lru_cache(maxsize=64)
@@ -124,42 +112,28 @@ def _metadata(path: Path, version: Version) -> Any:
     return parquet.read_metadata(path)
 
 
-def _read_group(path: Path, version: Version, group: int, samples: int, columns: list[str]) -> Any:
+def _read_group(path: Path, version: Version, place: Place, columns: list[str]) -> Any:
     """Read one row group after its length and the types of its columns, pages against their checksums."""
     from pyarrow import parquet
 
-    about = _metadata(path, version)
-    with parquet.ParquetFile(
-        path, metadata=about, memory_map=True, pre_buffer=False, page_checksum_verification=True
-    ) as file:
-        found = file.metadata.row_group(group).num_rows
-        if found != samples:
-            raise DataError(
-                f"Reading {path}: {samples} samples are expected in row group {group}, found {found}; convert the recordings again."
-            )
+    _, group, samples = place
+    options: dict[str, Any] = {"memory_map": True, "pre_buffer": False, "page_checksum_verification": True}
+    with parquet.ParquetFile(path, metadata=_metadata(path, version), **options) as file:
+        actual = file.metadata.row_group(group).num_rows
+        _require(actual == samples, path, f"{samples} samples are expected in row group {group}, found {actual}")
         if samples > limits.MAX_SAMPLES:
-            raise DataError(
-                f"Reading {path}: an episode has {samples} samples; cut it, or raise MAX_SAMPLES in kros.core.limits."
-            )
-        schema = file.schema_arrow
+            advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
+            raise DataError(f"Reading {path}: an episode has {samples} samples; {advice}.")
         for name in columns:
-            kind = str(schema.field(name).type)
-            if (name in KEYS and "string" not in kind) or (name not in KEYS and kind != "double"):
-                wanted = "text" if name in KEYS else "numbers of type double"
-                raise DataError(
-                    f"Reading {path}: column {name!r} should hold {wanted}, found {kind}; convert the recordings again."
-                )
+            kind, wanted = str(file.schema_arrow.field(name).type), "text" if name in KEYS else "numbers of type double"
+            fits = "string" in kind if name in KEYS else kind == "double"
+            _require(fits, path, f"column {name!r} should hold {wanted}, found {kind}")
         return file.read_row_group(group, columns=columns, use_threads=False)
 
 
-def _check_label(column: Any, name: str, expected: str, path: Path) -> None:
-    """Refuse samples that say they belong to something else than the index says."""
-    found = column.unique().to_pylist()
-    if found != [expected]:
-        raise DataError(
-            f"Reading {path}: the index says {name} {expected!r}, the samples say {shortened(repr(found))}; files were renamed or exchanged, convert "
-            "the recordings again."
-        )
+def _require(condition: bool, path: Path, problem: str) -> None:
+    if not condition:
+        raise DataError(f"Reading {path}: {shortened(problem)}; files were changed, {AGAIN}.")
 
 
 def read_parquet(folder: Path | str) -> Population:
@@ -185,43 +159,44 @@ def read_parquet(folder: Path | str) -> Population:
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
     >>> import kros
-    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, sample_period_s=0.01, **names)
     >>> with TemporaryDirectory() as folder:
     ...     kros.data.write_parquet(population, f"{folder}/recordings")
     ...     print(kros.data.read_parquet(f"{folder}/recordings"))
     Population(1 unit, 1 condition, 1 episode every 0.01 s; states x (measured); inputs u)
     """
-    content, _ = load_artifact(Path(folder), INDEX)
+    folder = Path(folder)
+    content, _ = load_artifact(folder, INDEX)
+    what = f"Reading {folder / 'population.json'}"
     try:
-        channels = tuple(
-            Channel(c["name"], Role(c["role"]), _text(c["unit"]), c["measured"] is True) for c in content["channels"]
-        )
-        channels += tuple(
-            TrueChannel(t["name"], Role.TRUTH, _text(t["unit"]), of=_text(t["of"])) for t in content.get("truths", ())
-        )
-        channels = columns_in_order(channels)
+        columns = [_channel(c) for c in (*content["channels"], *content.get("truths", ()))]
         units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
         places = _places(content["groups"])
-        period = check_period(content["sample_period_s"], f"Reading {Path(folder) / 'population.json'}")
+        period = check_period(content["sample_period_s"], what)
         metadata = dict(content["metadata"])
-        scaling = {name: build(Scaling, own, f"scaling.{name}") for name, own in content.get("scaling", {}).items()}
+        scaling = {name: Scaling(**scale) for name, scale in content.get("scaling", {}).items()}
     except DataError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(
-            f"Reading {Path(folder) / 'population.json'}: not as kros writes it ({error!r}); convert the recordings again."
-        ) from error
-    missing = sorted({name for name, _, _ in places.values() if not (Path(folder) / name).is_file()})
+        raise DataError(f"{what}: not as kros writes it ({error!r}); {AGAIN}.") from error
+    missing = sorted({name for name, _, _ in places.values() if not (folder / name).is_file()})
     if missing:
-        raise DataError(
-            f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; convert the recordings again."
-        )
+        raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; {AGAIN}.")
+    channels = columns_in_order(columns)
     recordings = ParquetRecordings(places, str(folder), tuple(c.name for c in channels))
     return assemble(recordings, channels, units, period, metadata, scaling=scaling)
 
 
-def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, tuple[str, int, int]]:
-    places: dict[EpisodeKey, tuple[str, int, int]] = {}
+def _channel(row: Mapping[str, Any]) -> Channel:
+    """Return a channel of the index."""
+    of = _text(row.get("of", ""))
+    return Channel(_text(row["name"]), Role(row["role"]), _text(row["unit"]), row.get("measured") is True, of)
+
+
+def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, Place]:
+    """Return where every episode is."""
+    places: dict[EpisodeKey, Place] = {}
     for g in groups:
         unit, condition, name = _text(g["unit"]), _text(g["condition"]), _text(g["file"])
         if name in ("", ".", "..") or Path(name).name != name:

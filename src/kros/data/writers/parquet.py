@@ -1,16 +1,18 @@
 """Write a population in kros's native format.
 
     <out>/population.json                    channels, period, units, episodes with their lengths
-    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels and truths
+    <out>/<unit>@<condition>.parquet         one row group an episode: unit, condition, episode, k, then the channels
+    and truths
 
-Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`), then the index.
+Names of files are percent-encoded, so any id works. A study writes groups from several processes (`write_group`),
+then the index.
 """
 
 from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from hashlib import sha256
@@ -24,8 +26,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import DataError
 from ..arrow import from_numpy, repeated
-from ..checks import Look, check_structure, usable_episodes
-from ..copies import refuse_copies
+from ..checks import Look, check_structure, refuse_copies, usable_episodes
 from ..population import EpisodeKey, Population
 from ..readers.parquet import INDEX, KEYS
 from .folders import in_threads, whole_folder
@@ -34,7 +35,7 @@ logger = logging.getLogger(__name__)
 
 _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
-# Signals of sensors as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s more per 91 MB; zstd: 55 % for 0.08 s.
+# Signals as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s per 91 MB; zstd: 55 %, 0.08 s.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
 
 
@@ -44,9 +45,9 @@ class GroupRecord:
 
     unit: str
     condition: str
-    file: str
-    episodes: tuple[str, ...]  # in the order of the row groups
-    samples: tuple[int, ...]  # length of each episode
+    file: str = ""
+    episodes: tuple[str, ...] = ()  # in the order of the row groups
+    samples: tuple[int, ...] = ()  # length of each episode
     digests: tuple[str, ...] = ()  # of all samples of each episode
 
     @property
@@ -81,13 +82,9 @@ def write_group(
     try:
         written = list(_write_episodes(population, keys, temporary, on_nan, look))
         if not written:
-            logger.warning(
-                "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN.",
-                unit,
-                condition,
-                len(keys),
-            )
-            return GroupRecord(unit, condition, "", (), ())
+            text = "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN."
+            logger.warning(text, unit, condition, len(keys))
+            return GroupRecord(unit, condition)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -98,13 +95,14 @@ def write_group(
 def write_index(
     population: Population, records: Iterable[GroupRecord], folder: Path | str, converted: bool = True
 ) -> None:
-    """Write `population.json` for groups that were written, with it the folder is a population; where they are `converted`, they are new recordings."""
+    """Write `population.json` for groups that were written; where they are `converted`, they are new recordings."""
     groups = [g for g in records if g.episodes]
     written = {g.unit for g in groups}
     check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
     refuse_copies(pair for g in groups for pair in g.recognised)
     scaling = {
-        name: replace(own, converted=own.factor) if converted else own for name, own in population.scaling.items()
+        name: replace(scale, converted=scale.factor) if converted else scale
+        for name, scale in population.scaling.items()
     }
     content = {
         "sample_period_s": population.sample_period_s,
@@ -140,7 +138,8 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
     >>> from tempfile import TemporaryDirectory
     >>> import numpy as np
     >>> import kros
-    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, sample_period_s=0.01, **names)
     >>> with TemporaryDirectory() as folder:
     ...     kros.data.write_parquet(population, f"{folder}/recordings")
     ...     print(sorted(path.name for path in Path(folder, "recordings").iterdir()))
@@ -153,38 +152,40 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
 
 
 def _write_episodes(
-    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None = None
-) -> Iterable[tuple[str, int, str]]:
+    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None
+) -> Iterator[tuple[str, int, str]]:
+    """Write usable episodes one behind the other; yield episode, number of samples and digest."""
     from pyarrow import parquet
 
     names = [c.name for c in population.columns]
     schema = _schema(names)
-    encoding = {"k": COUNTER, **dict.fromkeys(names, SIGNALS)}
     options: dict[str, Any] = {
+        "column_encoding": {"k": COUNTER, **dict.fromkeys(names, SIGNALS)},
         "compression": COMPRESSION,
         "use_dictionary": list(KEYS),
         "write_statistics": False,
         "write_page_checksum": True,
     }
-    with parquet.ParquetWriter(path, schema, column_encoding=encoding, **options) as writer:
+    with parquet.ParquetWriter(path, schema, **options) as writer:
         for key, values, digest in usable_episodes(population, keys, on_nan, look):
             writer.write_table(_table(key, values, schema), row_group_size=len(values))
             yield key.episode, len(values), digest
 
 
 def _schema(names: Sequence[str]) -> Any:
+    """Return unit, condition, episode, k, then the channels."""
     import pyarrow as pa
 
     clash = sorted({*KEYS, "k"} & set(names))
     if clash:
-        raise DataError(
-            f"Writing Parquet: channels {clash} have the name of a key column ({', '.join(KEYS)}, k); rename them."
-        )
+        problem = f"channels {clash} have the name of a key column ({', '.join(KEYS)}, k)"
+        raise DataError(f"Writing Parquet: {problem}; rename them.")
     text = pa.dictionary(pa.int32(), pa.string())
     return pa.schema([*((name, text) for name in KEYS), ("k", pa.int64()), *((name, pa.float64()) for name in names)])
 
 
 def _table(key: EpisodeKey, values: npt.NDArray[np.float64], schema: Any) -> Any:
+    """Return an episode as an Arrow table."""
     import pyarrow as pa
 
     keys = [repeated(text, len(values)) for text in (key.unit, key.condition, key.episode)]

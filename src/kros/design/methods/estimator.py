@@ -31,11 +31,13 @@ def design_estimator(task: DesignTask) -> DesignResult:
         nominal,
         task.estimator,
     )
-    lower, upper = sides(task.limits, found.observer.lifting.states)
     bounds = found.observer.runtime
+    lower, upper = sides(task.limits, found.observer.lifting.states)
+    if bounds.lower is not None and bounds.upper is not None:
+        lower, upper = np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper)
     observer = replace(
         found.observer,
-        runtime=replace(bounds, lower=np.maximum(lower, bounds.lower), upper=np.minimum(upper, bounds.upper)),
+        runtime=replace(bounds, lower=lower, upper=upper),
         seen=training.seen,
         sensor=task.sensor,
     )

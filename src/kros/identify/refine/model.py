@@ -14,7 +14,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DimensionError
 from ...core.loading import check_shapes, loader
 from ...data.population import Population
-from ...data.scaled import scale_population
+from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor

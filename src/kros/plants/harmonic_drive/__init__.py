@@ -1,5 +1,4 @@
 """Simulated motor drives with a Harmonic Drive gearbox, tuned to look like those of section IV.
 
-`parameters` draws the drives, `reference` their trajectories, `dynamics` and `simulation` run them under `control`,
-`linear` knows how the gearbox disturbance shows at constant speed, `population` puts it together.
+`parameters` draws the drives, `reference` their trajectories, `dynamics` runs them, `population` adds their `truth`.
 """

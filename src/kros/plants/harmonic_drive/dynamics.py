@@ -4,25 +4,25 @@
     J_l dw_l/dt = k s + c (w - w_l) - m g l sin(q - s)               flange, and load where there is one
     ds/dt = w - w_l,   dq/dt = w,   tau di/dt = u - i
 
-The linear part is integrated exactly over a substep (matrix exponential); friction `F`, disturbance `i_d` and gravity are held,
-evaluated at the predicted middle of the substep.
+The linear part is integrated exactly over a substep (matrix exponential); friction `F`, disturbance `i_d` and gravity
+are held, evaluated at the predicted middle of the substep.
 
 Symbols
 -------
-q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its command
-p, v : position and velocity that the drive measures
-z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
+q, w : motor angle and velocity / gear ratio;   s : gear twist;   w_l : flange velocity;   i, u : current and its
+command p, v : position and velocity that the drive measures z : [s, w, w_l, i, u, f_m, f_l], shape (7, n);   M : map
+from z to the next [s, w, w_l, i] and the step of q, shape (5, 7, n)
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from .control import SAMPLE_PERIOD_S
-from .parameters import GEAR_RATIO, SMOOTHING_VELOCITY, DriveParameters
+from .parameters import COUNT_RAD, GEAR_RATIO, SAMPLE_PERIOD_S, VELOCITY_POLE, DriveParameters, Gains
 
 Array = npt.NDArray[Any]
 
@@ -31,11 +31,9 @@ SUBSTEP_S = SAMPLE_PERIOD_S / SUBSTEPS
 TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
 MEASURED = 2  # rows of p and v, in front of q and z
 RECORDED = MEASURED + 1 + COMMAND  # rows from p to i
-_HALF_STEP, _RATIO = (
-    np.array(0.5 * SUBSTEP_S),
-    np.array(float(GEAR_RATIO)),
-)  # NumPy turns floats into these, at every call
-_SMOOTHING = np.array([[1.0], [SMOOTHING_VELOCITY**2]])  # of what fades with the velocity, and of its sign
+BLOCK_SAMPLES = 32  # recorded time-major, then turned into one row per trajectory
+CHUNK_TRAJECTORIES = 800  # keeps the working set of a step in cache
+_SIGNALS = (0, 1, MEASURED + 1 + CURRENT)  # recorded rows of position, velocity and current
 
 
 def transition(p: DriveParameters, loaded: Array) -> Array:
@@ -57,12 +55,11 @@ def transition(p: DriveParameters, loaded: Array) -> Array:
 
 
 class Physics:
-    """State of a batch of trajectories and the code that moves it on by one sample, without allocating."""
+    """State of a batch of trajectories and the code that moves it on by one sample."""
 
     def __init__(self, p: DriveParameters, loaded: Array, q0: Array) -> None:
         n = len(p)
-        self.p = p
-        self.moment = loaded * p.load_moment
+        self.p, self.moment = p, loaded * p.load_moment
         self.M = np.ascontiguousarray(np.moveaxis(transition(p, loaded), 0, -1))
         self.ripple = np.ascontiguousarray((p.ripple * np.exp(1j * p.phase_rad)).T)
         self.rows = np.zeros((MEASURED + 1 + 7, n))  # side by side, so that recording a sample is one copy
@@ -71,64 +68,26 @@ class Physics:
         for _ in range(20):
             self.z[TWIST] = self.moment * np.sin(self.q - self.z[TWIST]) / p.stiffness
         self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + p.gearbox_current(self.q)
-        self._highest, self._lower = self.ripple[-1], tuple(self.ripple[-2::-1])
-        self._minus_constant, self._minus_moment = -p.torque_constant, -self.moment
-        self._scales = np.stack([1.0 / p.stribeck_velocity, np.ones(n)])
-        self._new = np.empty((5, n))
-        self._a, self._b, self._squares = np.empty(n), np.empty(n), np.empty((2, n))
-        self._angle, self._power = np.empty(n, complex), np.empty(n, complex)
 
     def advance(self) -> None:
         """Move on by one sampling period with the command in `z[COMMAND]` held."""
-        q, z, a = self.q, self.z, self._a
-        w, moved, new, step = z[W], z[:4], self._new[:4], self._new[4]
+        q, z = self.q, self.z
         for _ in range(SUBSTEPS):
-            np.multiply(w, _HALF_STEP, a)
-            np.add(q, a, a)  # q in the middle of the substep
-            self._motor_torque(a)
-            self._gravity(a)
-            np.einsum("ijn,jn->in", self.M, z, out=self._new)
-            moved[:] = new
-            np.add(q, step, q)
-
-    def _motor_torque(self, q: Array) -> None:
-        """z[FM] = -K_t i_d(q) - F(w)."""
-        f = self.z[FM]
-        np.multiply(self._disturbance(q), self._minus_constant, f)
-        np.subtract(f, self._friction(), f)
+            middle = q + z[W] * (0.5 * SUBSTEP_S)
+            z[FM] = self._disturbance(middle) * -self.p.torque_constant - self.p.dry_friction(z[W])
+            z[FL] = np.sin(middle - z[TWIST]) * -self.moment
+            moved = np.einsum("ijn,jn->in", self.M, z)
+            z[:4] = moved[:4]
+            q += moved[4]
 
     def _disturbance(self, q: Array) -> Array:
         """(34): i_d is the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
-        e, acc, add, multiply = self._angle, self._power, np.add, np.multiply
-        multiply(q, _RATIO, self._b)
-        np.cos(self._b, e.real)
-        np.sin(self._b, e.imag)
-        multiply(self._highest, e, acc)
-        for coefficient in self._lower:
-            add(acc, coefficient, acc)
-            multiply(acc, e, acc)
-        return acc.imag
-
-    def _friction(self) -> Array:
-        """F(w), as `DriveParameters.dry_friction` but in place."""
-        w, squares = self.z[W], self._squares
-        fade, width = squares
-        np.multiply(self._scales, w, squares)
-        np.multiply(squares, squares, squares)
-        np.add(squares, _SMOOTHING, squares)
-        np.divide(self.p.breakaway_torque, fade, fade)
-        np.add(fade, self.p.coulomb_torque, fade)
-        np.multiply(fade, w, fade)
-        np.sqrt(width, width)
-        np.divide(fade, width, fade)
-        return fade
-
-    def _gravity(self, q: Array) -> None:
-        """z[FL] = -m g l sin(q - s)."""
-        f = self.z[FL]
-        np.subtract(q, self.z[TWIST], f)
-        np.sin(f, f)
-        np.multiply(f, self._minus_moment, f)
+        angle = q * GEAR_RATIO
+        e = np.cos(angle) + 1j * np.sin(angle)
+        total = self.ripple[-1] * e
+        for coefficient in self.ripple[-2::-1]:
+            total = (total + coefficient) * e
+        return total.imag
 
 
 def load_torque(p: DriveParameters, recorded: Array) -> Array:
@@ -137,3 +96,81 @@ def load_torque(p: DriveParameters, recorded: Array) -> Array:
     gravity = p.load_moment * np.sin(q - z[TWIST])
     acceleration = (p.stiffness * z[TWIST] + p.damping * (z[W] - z[WL]) - gravity) / (p.flange_inertia + p.load_inertia)
     return p.load_inertia * acceleration + gravity
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedSignals:
+    """What a simulation leaves behind, one row per trajectory."""
+
+    states: Array  # shape (n, 3, n_samples): quantised position, its filtered difference, current without noise
+    velocity: Array  # shape (n, 1, n_samples), rad/s; true velocity of the motor
+    load_torque: Array  # shape (n_loaded, n_samples), float32, fraction of full-scale current; taken from the flange
+
+
+def simulate(
+    p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains
+) -> SimulatedSignals:
+    """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
+    n, n_samples = len(p), targets[0].shape[1]
+    states, velocity = np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples))
+    out = SimulatedSignals(states, velocity, np.empty((np.count_nonzero(loaded), n_samples), np.float32))
+    first_loaded = np.concatenate([[0], np.cumsum(loaded > 0)])
+    for start in range(0, n, CHUNK_TRAJECTORIES):
+        stop = min(start + CHUNK_TRAJECTORIES, n)
+        part = slice(start, stop)
+        torque = out.load_torque[first_loaded[start] : first_loaded[stop]]
+        chunk = SimulatedSignals(states[part], velocity[part], torque)
+        tracked = [(target, reference[part]) for target in targets]
+        _simulate_chunk(p.take(part), loaded[part], tracked, gains, chunk)
+    return out
+
+
+def _simulate_chunk(
+    p: DriveParameters, loaded: Array, tracked: list[tuple[Array, Array]], gains: Gains, out: SimulatedSignals
+) -> None:
+    """Simulate some trajectories into `out`; `tracked` holds targets and the one of every trajectory."""
+    n, n_samples = len(p), out.states.shape[-1]
+    position, rows = tracked[0]
+    physics = Physics(p, loaded, position[rows, 0])
+    drive = _Controller(physics, gains)
+    is_loaded = np.flatnonzero(loaded)
+    with_load = p.take(is_loaded)
+    recorded = np.empty((BLOCK_SAMPLES, RECORDED, n))
+    for first in range(0, n_samples, BLOCK_SAMPLES):
+        stop = min(first + BLOCK_SAMPLES, n_samples)
+        rp, rv = (np.ascontiguousarray(target[:, first:stop].T)[:, of] for target, of in tracked)
+        for k in range(stop - first):
+            drive.sample(rp[k], rv[k])
+            recorded[k] = physics.rows[:RECORDED]
+            physics.advance()
+        block = recorded[: stop - first]
+        for row, signal in enumerate(_SIGNALS):
+            out.states[:, row, first:stop] = block[:, signal].T
+        out.velocity[:, 0, first:stop] = block[:, MEASURED + 1 + W].T
+        if len(is_loaded):
+            torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
+            out.load_torque[:, first:stop] = (torque / with_load.torque_constant).T
+
+
+class _Controller:
+    """Encoder, velocity estimate and cascaded control of a batch; writes measurement and command into the physics."""
+
+    def __init__(self, physics: Physics, gains: Gains) -> None:
+        self.physics, self.gains = physics, gains
+        self.p, self.v = physics.p_v
+        self.p[:] = np.rint(physics.q / COUNT_RAD) * COUNT_RAD
+        self._integral = physics.z[COMMAND].copy()
+
+    def sample(self, rp: Array, rv: Array) -> None:
+        """Measure, and set the command for the coming sampling period."""
+        gains, u = self.gains, self.physics.z[COMMAND]
+        position = np.rint(self.physics.q * (1.0 / COUNT_RAD)) * COUNT_RAD
+        slope = (position - self.p) * ((1.0 - VELOCITY_POLE) / SAMPLE_PERIOD_S)
+        self.v *= VELOCITY_POLE
+        self.v += slope
+        self.p[:] = position
+        error = (rp - self.p) * gains.position + rv - self.v
+        raw = error * gains.velocity + self._integral
+        u[:] = np.minimum(np.maximum(raw, -1.0), 1.0)
+        self._integral += error * (gains.integral * SAMPLE_PERIOD_S)
+        self._integral += (u - raw) * gains.antiwindup

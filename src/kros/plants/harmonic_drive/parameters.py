@@ -1,13 +1,17 @@
-"""What a drive is made of, and how the drives of a batch differ.
+"""What a drive is made of, its software, and how the drives of a batch differ.
 
-All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases are uniform.
-Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
+target position --> (+) --> Kp --> (+) --> PI --> limit --> current
+                    -|    target velocity +|  -|
+              position                     velocity = filtered difference of position
+
+All mechanical quantities are referred to the gearbox output. Draws are log-normal around the nominal value; phases
+are uniform. Each unit has its own random stream, so that unit `k` is the same whatever the number of units.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -16,6 +20,11 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 GEAR_RATIO = 100
+SAMPLE_PERIOD_S = 1e-3
+ENCODER_COUNTS = 2**15  # per revolution of the motor
+COUNT_RAD = 2 * np.pi / (ENCODER_COUNTS * GEAR_RATIO)  # at the gearbox output
+VELOCITY_POLE = float(np.exp(-2 * np.pi * 150.0 * SAMPLE_PERIOD_S))  # first-order filter at 150 Hz
+CURRENT_NOISE = 2e-3  # standard deviation, fraction of full scale
 HARMONICS = 8
 SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
 UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
@@ -50,6 +59,29 @@ OUTLIER_LOG_FACTORS = {
 }
 
 
+class Loop(str, Enum):
+    """How stiff the velocity loop is."""
+
+    STIFF = "stiff"
+    SOFT = "soft"
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Controller gains."""
+
+    position: float  # 1/s
+    velocity: float  # fraction of full scale per rad/s
+    integral: float  # fraction of full scale per rad
+    antiwindup: float = 0.05  # share of the excess over the current limit that is taken off the integrator each sample
+
+
+GAINS = {
+    Loop.STIFF: Gains(position=25.0, velocity=3.75, integral=110.0),
+    Loop.SOFT: Gains(position=15.0, velocity=1.5, integral=25.0),
+}
+
+
 @dataclass(frozen=True, eq=False)
 class DriveParameters:
     """Physical parameters of a batch of drives; every field has the unit axis first."""
@@ -77,10 +109,10 @@ class DriveParameters:
         return DriveParameters(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
     def dry_friction(self, velocity: Array) -> Array:
-        """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign function, shape (n_units,), N m."""
-        fade = 1.0 + (velocity / self.stribeck_velocity) ** 2
-        sign = velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
-        return sign * (self.coulomb_torque + self.breakaway_torque / fade)
+        """Coulomb and Stribeck friction of each unit at its own velocity, with a smooth sign, shape (n_units,), N m."""
+        fade = (1.0 / self.stribeck_velocity * velocity) ** 2 + 1.0
+        torque = self.breakaway_torque / fade + self.coulomb_torque
+        return torque * velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
 
     def gearbox_current(self, position: Array) -> Array:
         """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""
@@ -89,38 +121,22 @@ class DriveParameters:
         return np.sum(self.ripple * np.sin(angle + self.phase_rad), axis=-1)
 
 
-def draw_parameters(seed: int, n_units: int, spread: float) -> DriveParameters:
-    """Draw the drives of a batch."""
-    return _stack([_draw(seed, (UNIT_STREAM, k), spread) for k in range(n_units)])
-
-
-def draw_outlier(seed: int, spread: float, severity: float) -> DriveParameters:
-    """Draw one drive with loose fasteners: softer, more friction, larger gearbox oscillation."""
-    values = _draw(seed, (OUTLIER_STREAM, 0), spread)
-    for name, log_factor in OUTLIER_LOG_FACTORS.items():
-        values[name] = values[name] * np.exp(severity * log_factor)
-    return _stack([values])
-
-
-def concatenate(first: DriveParameters, second: DriveParameters) -> DriveParameters:
-    """Append a batch to another."""
-    return DriveParameters(
-        **{f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)]) for f in fields(first)}
-    )
+def draw_parameters(seed: int, n_units: int, spread: float, severity: float | None = None) -> DriveParameters:
+    """Draw the drives of a batch, in front of them one with loose fasteners where there is a severity."""
+    units = [_draw(seed, (UNIT_STREAM, k), spread) for k in range(n_units)]
+    if severity is not None:
+        bad = _draw(seed, (OUTLIER_STREAM, 0), spread)
+        factors = {name: np.exp(severity * factor) for name, factor in OUTLIER_LOG_FACTORS.items()}
+        units.insert(0, {name: value * factors.get(name, 1.0) for name, value in bad.items()})
+    names = [f.name for f in fields(DriveParameters)]
+    return DriveParameters(**{name: np.array([unit[name] for unit in units], dtype=float) for name in names})
 
 
 def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
+    """Draw the parameters of one drive."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
-    values: dict[str, Any] = {
-        name: nominal * np.exp(spread * deviation * rng.standard_normal())
-        for name, (nominal, deviation) in NOMINAL.items()
-    }
+    shares = {name: np.exp(spread * deviation * rng.standard_normal()) for name, (_, deviation) in NOMINAL.items()}
+    values: dict[str, Any] = {name: nominal * shares[name] for name, (nominal, _) in NOMINAL.items()}
     values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(HARMONICS))
     values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, HARMONICS)
     return values
-
-
-def _stack(units: Sequence[dict[str, Any]]) -> DriveParameters:
-    return DriveParameters(
-        **{f.name: np.array([unit[f.name] for unit in units], dtype=float) for f in fields(DriveParameters)}
-    )

@@ -1,6 +1,7 @@
 """Smoothed trapezoidal velocity profiles through pseudorandom checkpoints.
 
-The resulting velocity resembles a smoothed pseudorandom binary sequence (section IV-A): full speed forward or backward almost all the time.
+The resulting velocity resembles a smoothed pseudorandom binary sequence (section IV-A): full speed forward or
+backward almost all the time.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, peri
 
 
 def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) -> tuple[Array, Array]:
-    """Move from checkpoint to checkpoint, leaving each at a given sample; position and velocity, shape (n_samples,), rad and rad/s."""
+    """Move from checkpoint to checkpoint, leaving each at a sample; position and velocity, (n_samples,), rad, rad/s."""
     padding = _RAMPS
     lengths = np.abs(np.diff(checkpoints)) / (MAX_SPEED * period_s)
     knots = np.stack([starts, starts + lengths], axis=1).ravel()
@@ -71,7 +72,8 @@ def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float)
         if good.any():
             return drawn[np.argmax(good)]
     raise ConfigError(
-        f"Drawing {n_moves} checkpoints for an episode of {seconds:g} s: none fit at {MAX_SPEED:.3g} rad/s; ask for seconds >= 2."
+        f"Drawing {n_moves} checkpoints for an episode of {seconds:g} s: none fit at {MAX_SPEED:.3g} rad/s; "
+        "ask for seconds >= 2."
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -37,9 +38,9 @@ from .verdict import with_verdict
 
 
 def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> list[dict[str, Any]]:
-    """Identify the units of some recordings as the study did, score each against the study's population, and give a verdict.
+    """Identify the units of some recordings as the study did, score each against its population, and give a verdict.
 
-    A name that a unit of the study has is refused where the recordings are others, unless `same_unit` states that it is the same machine.
+    A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.
     """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (
         config,
@@ -52,15 +53,10 @@ def scored(
     config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False
 ) -> list[dict[str, Any]]:
     """Score the units of some recordings against a run that is open."""
-    kept = [name.split("/") for name in sorted(store.files())]
-    folders = [
-        store.path(*parts[:2])
-        for parts in kept
-        if len(parts) == 3 and (parts[0], parts[2]) == ("outliers", "outlier_model.json")
-    ]
-    observer = (
-        Observer.load(store.path("observers", "deployed.json")) if store.holds("observers", "deployed.json") else None
-    )
+    pattern = re.compile("outliers/([^/]+)/outlier_model.json")
+    folders = [store.path("outliers", m[1]) for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
+    deployed = ("observers", "deployed.json")
+    observer = Observer.load(store.path(*deployed)) if store.holds(*deployed) else None
     population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     watched: list[dict[str, Any]] = []
@@ -73,9 +69,8 @@ def scored(
             return in_order(watched)
         check_channels(population, observer)
     if not folders:
-        raise ConfigError(
-            f"Run {store.folder}: has no outlier scores to compare with; run the study until quantify, with at least three units."
-        )
+        advice = "run the study until quantify, with at least three units"
+        raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
     rows: list[dict[str, Any]] = []
     with open_executor(workers) as executor:
         for folder in folders:
@@ -83,18 +78,13 @@ def scored(
             if models.condition in population.conditions:
                 rows += score_condition(store, population, models, OutlierModel.load(folder), executor, same_unit)
     if not rows:
-        raise DataError(
-            f"Checking {data}: the recordings have the conditions {', '.join(population.conditions)}, and the run has models of "
-            f"{', '.join(ModelSet.load(store.path('models', folder.name)).condition for folder in folders)} alone; name the condition, as in the study."
-        )
-    levels = {
-        (row["unit"], row["condition"]): {
-            key: row[key] for key in ("level_db", "level_rate", "level_units", "bands_db")
-        }
-        for row in watched
-    }
-    rows = [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
-    return in_order(rows)
+        modelled = ", ".join(ModelSet.load(store.path("models", folder.name)).condition for folder in folders)
+        recorded = f"the recordings have the conditions {', '.join(population.conditions)}"
+        both = f"{recorded}, and the run has models of {modelled} alone"
+        raise DataError(f"Checking {data}: {both}; name the condition, as in the study.")
+    names = ("level_db", "level_rate", "level_units", "bands_db")
+    levels = {(row["unit"], row["condition"]): {key: row[key] for key in names} for row in watched}
+    return in_order([row | levels.get((row["unit"], row["condition"]), {}) for row in rows])
 
 
 def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -124,10 +114,9 @@ def score_condition(
         evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
         known = recorded.same_recordings(factor)
         if unit in recorded.units and unit not in known and not same_unit:
-            raise DataError(
-                f"Checking unit {unit} ({models.condition}): the study has a unit of this name, with other recordings. Give --same-unit if it is the same "
-                "machine, which is then compared with the other units alone; else rename it."
-            )
+            known_name = "the study has a unit of this name, with other recordings"
+            same = "Give --same-unit if it is the same machine, which is then compared with the other units alone"
+            raise DataError(f"Checking unit {unit} ({models.condition}): {known_name}. {same}; else rename it.")
         known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
         score = recorded.qualified(

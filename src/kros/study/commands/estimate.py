@@ -1,4 +1,4 @@
-"""The deployed observer on recordings, its estimates written as Parquet or CSV; measured channels and inputs are enough.
+"""Estimates of the deployed observer on recordings, as Parquet or CSV; measured channels and inputs are enough.
 
 Estimates are in the units of the recordings that the study read, as those of an exported observer.
 """
@@ -31,7 +31,7 @@ KEYS = ("unit", "condition", "episode", "k")
 
 @dataclass(frozen=True)
 class Estimated:
-    """What was written: the number of episodes, where every unit's parameters came from, and how many of its samples were not good, by bit of the status."""
+    """What was written: episodes, sources of every unit's parameters, and its samples by bit of the status."""
 
     episodes: int
     parameters: dict[str, str]
@@ -39,18 +39,18 @@ class Estimated:
 
     def lines(self) -> list[str]:
         """Return it for people at a terminal, a line a unit where there is anything to say."""
-        units, said = dict.fromkeys([*self.parameters, *(u for u, own in self.samples.items() if own)]), []
+        units, lines = dict.fromkeys([*self.parameters, *(u for u, counts in self.samples.items() if counts)]), []
         for unit in units:
             parts = [f"parameters {self.parameters[unit]}"] if unit in self.parameters else []
             parts += [f"{count} samples {bit}" for bit, count in self.samples.get(unit, {}).items()]
-            said.append(f"unit {unit}: {'; '.join(parts)}")
-        return said
+            lines.append(f"unit {unit}: {'; '.join(parts)}")
+        return lines
 
 
 def estimate_recordings(
     run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None
 ) -> Estimated:
-    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample; where a parameter is followed, it stands behind them."""
+    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample, then the parameter that is followed."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
@@ -68,7 +68,7 @@ def estimate_recordings(
 
 
 def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
-    """Return what is to be known of the estimates: the observer, columns with their units of measure, parameters of every unit and their sources."""
+    """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
     observer = recordings.observer
     name = recordings.name
     columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded} | (

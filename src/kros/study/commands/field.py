@@ -1,4 +1,4 @@
-"""The deployed observer on recordings from the field: what arrives, parameters of every unit and where they come from, estimates."""
+"""The deployed observer on recordings from the field: what arrives, parameters of every unit, estimates."""
 
 from __future__ import annotations
 
@@ -66,10 +66,8 @@ class FieldRecordings:
 
     def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
         """Read episodes, some at a time."""
-        keys, values = (
-            keys or self.population.episodes,
-            {u: {**self.observer.parameters, **own} for u, own in self.values.items()},
-        )
+        keys = keys or self.population.episodes
+        values = {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
         for start in range(0, len(keys), _BATCH):
             yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
 
@@ -81,8 +79,8 @@ class FieldRecordings:
             [i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True)
         )
         if others:
-            own = found.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], own)
+            parameters = found.parameters(observer, others)
+            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], parameters)
             estimates[:, others] = x[..., :n]
         if self.name is None:
             return estimates, None, status
@@ -96,13 +94,13 @@ class FieldRecordings:
         return estimates, followed, status
 
     def count_status(self, found: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
-        """Add to the number of samples of every unit that are missing, invalid or beyond their limits, or at which the observer starts again."""
+        """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
         status = sample_status(self.observer, found.y, found.u) if status is None else status
         for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
-            own = counts.setdefault(unit, {})
+            of_unit = counts.setdefault(unit, {})
             for bit in SampleStatus:
                 if number := int(np.count_nonzero(status[:length, i] & bit)):
-                    own[str(bit.name)] = own.get(str(bit.name), 0) + number
+                    of_unit[str(bit.name)] = of_unit.get(str(bit.name), 0) + number
 
 
 def _settled(
@@ -118,16 +116,13 @@ def _settled(
             continue
         if set(missing) - {name} or not _trackable(observer, name):
             reason = units.reasons.get(unit, "it was not calibrated.")
-            raise IdentificationError(
-                f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} It cannot be followed by a phase-locked loop either, which needs one unknown "
-                f"parameter and an observer without delays; give it, --parameter {unit}.{name}=VALUE."
-            )
+            loop = "a phase-locked loop either, which needs one unknown parameter and an observer without delays"
+            follow = f"It cannot be followed by {loop}; give it, --parameter {unit}.{name}=VALUE."
+            raise IdentificationError(f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} {follow}")
         source = f"value that is {sources.get(unit)}"
         if name in missing and name == phase:
-            values[unit][name], source = (
-                _start(observer, population, unit, values[unit], name),
-                "value of the smallest innovation",
-            )
+            values[unit][name] = _start(observer, population, unit, values[unit], name)
+            source = "value of the smallest innovation"
         elif name in missing:
             source = "value of the nominal unit"
         sources[unit] = f"tracked from the {source}"

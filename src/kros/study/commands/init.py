@@ -6,7 +6,7 @@ import logging
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -26,23 +26,12 @@ from ...identify.periodic import PeriodicTerm, periodic_term
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import StudyConfig, validate_config
 from ..stages.read import FEWEST, open_source
-from .study_text import study_text
+from .study_text import LiftingProposal, study_text
 
 log = logging.getLogger(__name__)
 MOST_FINDINGS = 12
-NO_LOAD = (
-    "unloaded",
-    "noload",
-    "leerlauf",
-    "ohnelast",
-    "unbelastet",
-    "leer",
-    "idle",
-    "empty",
-    "vide",
-    "avide",
-    "sanscharge",
-)
+_UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
+NO_LOAD = _UNLOADED_WORDS.split()
 
 
 @dataclass(frozen=True)
@@ -54,15 +43,6 @@ class Initialised:
     findings: tuple[str, ...]
 
 
-@dataclass(frozen=True)
-class LiftingProposal:
-    """Tables ``[lifting]`` and ``[calibrate]``, and what they rest on."""
-
-    lifting: dict[str, Any] = field(default_factory=dict)
-    calibrate: dict[str, Any] = field(default_factory=dict)
-    why: str = "no periodic term of an angle stands out in what a linear model leaves"
-
-
 def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progress: Progress) -> Initialised:
     """Write a study for a folder of recordings."""
     if out.exists():
@@ -70,35 +50,30 @@ def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progres
     if not source.is_dir():
         raise DataError(f"Looking at {source}: there is no such folder; name the folder that holds the recordings.")
     work = Work(progress=progress)
-    data: dict[str, Any] = {"source": _source(source, out), "reader": "csv"}
-    reader, found = detect_reader(source), None
+    reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            raise ConfigError(
-                f"Looking at {source}: it {LOOKS[reader]}, which says what channels are; leave out --measured, --input, --files and --period."
-            )
-        data["reader"] = reader
+            says = f"it {LOOKS[reader]}, which says what channels are"
+            raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
+        data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
     else:
-        found = discover(source, wanted, ask, work)
-        data |= {"on_nan": "drop_episode"} if found.drop_nan else {}
-        data |= {"csv": found.mapping} | ({"prepare": list(found.prepare)} if found.prepare else {})
-    config = validate_config({"data": dict(data)}, out.parent.absolute(), str(out))
-    unloaded = _unloaded(open_source(config))
-    if unloaded is not None:
-        data["identify_on"] = unloaded
-        config = validate_config({"data": dict(data)}, out.parent.absolute(), str(out))
+        discovery = discover(source, wanted, ask, work)
+        data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}
+        data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
+        data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
+    folder = out.parent.absolute()
+    unloaded = _unloaded(open_source(validate_config({"data": dict(data)}, folder, str(out))))
+    data |= {} if unloaded is None else {"identify_on": unloaded}
+    config = validate_config({"data": dict(data)}, folder, str(out))
     population, facts, refused = _surveyed(config, work)
-    proposal = propose_lifting(population, facts) if facts is not None else LiftingProposal(why="not looked for")
-    findings = (
-        *(found.findings if found else ()),
-        *(facts.alerts if facts else ()),
-        *((f"kros run would refuse this: {refused}",) if refused else ()),
-    )
-    text = study_text(source, data, found, proposal.lifting, proposal.calibrate, proposal.why, findings)
-    validate_config(parse_toml(text), out.parent.absolute(), str(out))
+    proposal = LiftingProposal(why="not looked for") if facts is None else propose_lifting(population, facts)
+    findings = [*(discovery.findings if discovery else ()), *(facts.alerts if facts else ())]
+    findings += [f"kros run would refuse this: {refused}"] if refused else []
+    text = study_text(source, data, discovery, proposal, findings)
+    validate_config(parse_toml(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    return Initialised(out, tuple(_lines(population, found, proposal, findings, out)), findings)
+    return Initialised(out, tuple(_lines(population, discovery, proposal, findings, out)), tuple(findings))
 
 
 def _source(source: Path, out: Path) -> str:
@@ -109,7 +84,7 @@ def _source(source: Path, out: Path) -> str:
 
 
 def _unloaded(population: Population) -> str | None:
-    """Return the condition without load, where it is called otherwise than the default expects; else the one that most units have."""
+    """Return the condition without load where its name is not the default, else the one that most units have."""
     conditions = population.conditions
     if len(conditions) < 2 or UNLOADED in conditions:
         return None
@@ -122,45 +97,36 @@ def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFac
     population = open_source(config)
     try:
         check_population(population, allow_single=True)
-        kept, facts = survey(population, identify_on=config.data.identify_on, on_nan=config.data.on_nan, work=work)
-        return kept, facts, ""
+        data = config.data
+        return *survey(population, work, identify_on=data.identify_on, on_nan=data.on_nan), ""
     except DataError as error:
         return population, None, str(error)
 
 
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
-    """Return lifted functions where recordings ask for them: the periodic term of an angle, with the phase of every unit where it can be calibrated."""
+    """Return lifted functions where recordings ask for them: the periodic term of an angle, with a phase per unit."""
     if population.metadata.get("plant") == HARMONIC_DRIVE:
         return LiftingProposal(why="these recordings say which plant they are of, and its own lifting is taken")
-    angles = [
-        c.name for c in population.channels if c.role is Role.STATE and c.measured and _may_be_angle(c.name, c.unit)
-    ]
+    measured = [c for c in population.channels if c.role is Role.STATE and c.measured]
+    angles = [c.name for c in measured if c.unit == "rad" or (not c.unit and kind_of(c.name) in ("angle", "position"))]
     keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]
     term = periodic_term(population, angles, keys) if angles and keys else None
     if term is None:
         return LiftingProposal()
+    share = f"{100 * term.share:.2g} % of"
     if term.ratio == 1:
-        why = f"sin({term.angle}), as of gravity, explains {100 * term.share:.2g} % of what a linear model of one step leaves"
-        return LiftingProposal(
-            {"functions": [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]}, {}, why
-        )
-    why = (
-        f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({term.above:.0f} times what is left at ratios "
-        f"around; {100 * term.share:.2g} % of the residual)"
-    )
+        why = f"sin({term.angle}), as of gravity, explains {share} what a linear model of one step leaves"
+        functions = [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]
+        return LiftingProposal({"functions": functions}, {}, why)
+    above = f"{term.above:.0f} times what is left at ratios around; {share} the residual"
+    why = f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({above})"
     spec = _phase_spec(population, term)
     if spec is not None and _calibrates(population, facts, spec):
-        table = {"angle": spec.angle, "ratio": spec.ratio, "reference": spec.reference, "measured": spec.measured}
-        return LiftingProposal(
-            {"functions": [f"sin({term.ratio:g}*{term.angle} + phase)"]},
-            table,
-            f"{why}; every unit has a phase of its own",
-        )
+        names = ("angle", "ratio", "reference", "measured")
+        function = f"sin({term.ratio:g}*{term.angle} + phase)"
+        table = {name: getattr(spec, name) for name in names}
+        return LiftingProposal({"functions": [function]}, table, f"{why}; every unit has a phase of its own")
     return LiftingProposal({"functions": [f"{f}({term.ratio:g}*{term.angle})" for f in ("sin", "cos")]}, {}, why)
-
-
-def _may_be_angle(name: str, unit: str) -> bool:
-    return unit == "rad" or (unit == "" and kind_of(name) in ("angle", "position"))
 
 
 def _phase_spec(population: Population, term: PeriodicTerm) -> PhaseSpec | None:
@@ -181,28 +147,23 @@ def _calibrates(population: Population, facts: RecordingFacts, spec: PhaseSpec) 
 
 
 def _lines(
-    population: Population, found: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path
+    population: Population, discovery: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path
 ) -> list[str]:
     """Return what people read at the terminal."""
-    units, counts = population.unit_ids, {(u, c): len(keys) for u, c, keys in population.groups()}
-    fewest, most = min(counts.values()), max(counts.values())
-    each = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-    lines = [
-        f"{len(units)} unit{'s' * (len(units) != 1)} ({some(units, 6)}), conditions {', '.join(population.conditions)}, {len(population.episodes)} episodes "
-        f"({each} for each unit and condition), every {population.sample_period_s:g} s"
-    ]
-    if found is not None:
-        lines += [f"  {found.reading}", *column_lines(found.columns)]
-    lines += [
-        f"lifting: {'; '.join(proposal.lifting['functions'])}: {proposal.why}"
-        if proposal.lifting
-        else f"lifting: {proposal.why}"
-    ]
+    units, counts = population.unit_ids, [len(keys) for _, _, keys in population.groups()]
+    each = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
+    number = f"{len(units)} unit{'s' * (len(units) != 1)} ({some(units, 6)})"
+    episodes = f"{len(population.episodes)} episodes ({each} for each unit and condition)"
+    period = f"every {population.sample_period_s:g} s"
+    lines = [f"{number}, conditions {', '.join(population.conditions)}, {episodes}, {period}"]
+    if discovery is not None:
+        lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
+    functions = "; ".join(proposal.lifting.get("functions", ()))
+    lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
     lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
     if len(findings) > MOST_FINDINGS:
-        lines.append(
-            f"looks wrong: {len(findings) - MOST_FINDINGS} further points, which are written at the start of the study"
-        )
+        more = f"{len(findings) - MOST_FINDINGS} further points, which are written at the start of the study"
+        lines.append(f"looks wrong: {more}")
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

@@ -1,4 +1,4 @@
-"""The monitor of the deployed observer on recordings: what `kros check` can say where only measured channels and inputs were recorded."""
+"""The monitor of the deployed observer on recordings, for `kros check` where hidden channels were not recorded."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
                 innovations += judged_innovations(recordings, monitor, found)
         highest, bands = highest_levels(monitor, innovations, condition)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and highest is not None and highest > 0
-        row: dict[str, Any] = {
-            "unit": unit,
-            "condition": condition,
+        row: dict[str, Any] = {"unit": unit, "condition": condition, "outlier": outlier}
+        row |= {
             "score": None,
             "threshold": None,
-            "outlier": outlier,
+            "status": Status.OUTLIER if outlier else Status.CANNOT_TELL,
+            "detectable": None,
+            "episodes": len(keys),
         }
-        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "detectable": None, "episodes": len(keys)}
         row |= {"recorded_s": samples * population.sample_period_s, "left_out": []}
         row |= {"missing": [name for name in observer.recorded if name not in population.states], "level_db": highest}
         rate, units = (None, None) if monitor is None else (monitor.false_alarm_rate, monitor.units)
@@ -52,14 +52,9 @@ def monitored(recordings: FieldRecordings) -> list[dict[str, Any]]:
 
 def by_band(observer: Observer, monitor: Monitor, levels: Array) -> dict[str, dict[str, float]]:
     """Return levels, shape (q, bands), by the name of the measured channel and the centre frequency in Hz."""
-    names, centres = (
-        [observer.lifting.states[i] for i in observer.measured],
-        monitor.centres_hz(observer.sample_period_s),
-    )
-    return {
-        name: {f"{hz:.3g}": float(v) for hz, v in zip(centres, row, strict=True)}
-        for name, row in zip(names, levels, strict=True)
-    }
+    names = [observer.lifting.states[i] for i in observer.measured]
+    centres = [f"{hz:.3g}" for hz in monitor.centres_hz(observer.sample_period_s)]
+    return {name: dict(zip(centres, row.tolist(), strict=True)) for name, row in zip(names, levels, strict=True)}
 
 
 def judged_innovations(recordings: FieldRecordings, monitor: Monitor, found: Arriving) -> list[tuple[Array, Flags]]:
@@ -72,12 +67,12 @@ def judged_innovations(recordings: FieldRecordings, monitor: Monitor, found: Arr
 def highest_levels(
     monitor: Monitor | None, innovations: list[tuple[Array, Flags]], condition: str
 ) -> tuple[float | None, Array | None]:
-    """Return the highest level over the bound, dB, and that of every band, as the episodes come one after the other; None where nothing is judged."""
+    """Return the highest level over the bound, dB, and that of every band; None where nothing is judged."""
     if monitor is None or not any(judged.any() for _, judged in innovations):
         return None, None
     squares = np.concatenate(monitor.in_turn(innovations))
-    own = condition if condition in monitor.bounds else None
-    return float(monitor.level(squares, own).max()), monitor.band_levels(squares.max(axis=0))
+    known = condition if condition in monitor.bounds else None
+    return float(monitor.level(squares, known).max()), monitor.band_levels(squares.max(axis=0))
 
 
 def level_text(row: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Recordings that are held against a finished run: opened as the run's own were, with each unit's lifting parameters."""
+"""Recordings beside a finished run: opened as those of the run were, with the lifting parameters of every unit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ log = logging.getLogger(__name__)
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
-    """Open a folder with the run's own reader, or what a TOML with ``[data]`` names; channels that are `optional` may be absent."""
+    """Open a folder with the run's reader, or what a TOML with ``[data]`` names; `optional` channels may be absent."""
     data = Path(data)
     section = config.data
     if data.is_file():
@@ -50,30 +50,28 @@ def hidden_states(observer: Observer) -> tuple[str, ...]:
 
 
 def check_channels(population: Population, observer: Observer, *, field_recordings: bool = False) -> None:
-    """Refuse recordings whose channels, units of measure or sampling period are not those of the run; in the field hidden states may be absent."""
+    """Refuse other channels, units of measure or sampling periods than those of the run; hidden ones may be absent."""
     expected, found = (observer.recorded, observer.inputs), (population.states, population.inputs)
     needed = (*(observer.lifting.states[i] for i in observer.measured), *observer.inputs)
     missing = [name for name in needed if name not in (*population.states, *population.inputs)]
     if missing and field_recordings:
+        there = ", ".join((*population.states, *population.inputs))
+        absent = f"{', '.join(missing)} is missing from the recordings, which have {there}"
         raise DataError(
-            f"Channels: the observer needs {', '.join(needed)}; {', '.join(missing)} is missing from the recordings, which have "
-            f"{', '.join((*population.states, *population.inputs))}; record it, or correct the mapping."
+            f"Channels: the observer needs {', '.join(needed)}; {absent}; record it, or correct the mapping."
         )
     if expected != found and not field_recordings:
-        raise DataError(
-            f"Channels: the run has states and inputs {expected}, the recordings {found}; read them the same way."
-        )
-    own = observer.about.get("units_of_measure", {})
+        both = f"the run has states and inputs {expected}, the recordings {found}"
+        raise DataError(f"Channels: {both}; read them the same way.")
+    units = observer.about.get("units_of_measure", {})
     for channel in population.channels:
-        if channel.unit and own.get(channel.name, channel.unit) not in ("", channel.unit):
-            raise DataError(
-                f"Channels: {channel.name} is in {own[channel.name]!r} in the run and in {channel.unit!r} in the recordings; declare a scale step, or leave "
-                "the unit out where it is only written differently."
-            )
+        if channel.unit and units.get(channel.name, channel.unit) not in ("", channel.unit):
+            both = f"is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
+            advice = "declare a scale step, or leave the unit out where it is only written differently"
+            raise DataError(f"Channels: {channel.name} {both}; {advice}.")
     if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
-        raise DataError(
-            f"Sampling period: the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s; declare a resample step."
-        )
+        both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
+        raise DataError(f"Sampling period: {both}; declare a resample step.")
 
 
 def identify_on(store: Store) -> str:
@@ -111,9 +109,11 @@ def unit_values(
         if parameter in values:
             found.sources[unit] = "given"
             continue
-        own = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
         try:
-            segments = segments_of((population, own.get(prefer) or next(iter(own.values())), calibration.spec))
+            segments = segments_of(
+                (population, by_condition.get(prefer) or next(iter(by_condition.values())), calibration.spec)
+            )
             values[parameter], found.sources[unit] = calibration.calibrate(segments, unit).phase_rad, "calibrated"
             if calibration.spec.measured not in population.states:
                 found.sources[unit] = f"calibrated on the derivative of {calibration.spec.angle}"
@@ -147,10 +147,9 @@ def parse_given(texts: Collection[str], units: Collection[str], known: Collectio
         except ValueError:
             value = np.nan
         if unit not in units or name not in known or not np.isfinite(value):
-            raise ConfigError(
-                f"--parameter {text}: should be UNIT.NAME=VALUE with a unit of the recordings ({', '.join(sorted(units)[:5])}), a parameter of the observer "
-                f"({', '.join(known) or 'it has none'}) and a number."
-            )
+            of = f"a unit of the recordings ({', '.join(sorted(units)[:5])})"
+            name_of = f"a parameter of the observer ({', '.join(known) or 'it has none'})"
+            raise ConfigError(f"--parameter {text}: should be UNIT.NAME=VALUE with {of}, {name_of} and a number.")
         given.setdefault(unit, {})[name] = value
     return given
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from ...data.discovery.discover import Discovery
 from ...data.discovery.roles import ColumnPart, TableColumn
 
 COMMENTS = {
-    "files": "what a file is: a regular expression on its path, whose groups unit, condition, episode and group are read",
+    "files": "what a file is: a regular expression on its path with the groups unit, condition, episode and group",
     "exclude": "left out; the reasons are above",
     "time": "column of time",
     "time_scale": "from the column of time to seconds",
@@ -27,80 +28,76 @@ COMMENTS = {
 }
 
 
+@dataclass(frozen=True)
+class LiftingProposal:
+    """Tables ``[lifting]`` and ``[calibrate]``, and what they rest on."""
+
+    lifting: dict[str, Any] = field(default_factory=dict)
+    calibrate: dict[str, Any] = field(default_factory=dict)
+    why: str = "no periodic term of an angle stands out in what a linear model leaves"
+
+
 def study_text(
     source: Path,
     data: Mapping[str, Any],
-    found: Discovery | None,
-    lifting: Mapping[str, Any],
-    calibrate: Mapping[str, Any],
-    why: str,
+    discovery: Discovery | None,
+    proposal: LiftingProposal,
     findings: Sequence[str],
 ) -> str:
     """Return a study as TOML."""
-    lines = [
-        *_comment(
-            f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; every line may be corrected."
-        )
-    ]
+    written = f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; edit any line."
+    lines = _comment(written)
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
-    lines += ["", "[data]", *(f"{key} = {_value(data[key])}" for key in ("source", "reader", "on_nan") if key in data)]
-    condition = _value(data["identify_on"]) if "identify_on" in data else None
-    identify_on = '# identify_on = "..."' if condition is None else f"identify_on = {condition}"
-    lines += [f"{identify_on}  # condition that models and observers are made from, where there are several"]
+    lines += ["", "[data]", *_keys({key: data[key] for key in ("source", "reader", "on_nan") if key in data})]
+    identify_on = _keys({"identify_on": data.get("identify_on", "...")})[0]
+    prefix = "" if "identify_on" in data else "# "
+    lines += [f"{prefix}{identify_on}  # condition that models and observers are made from, where there are several"]
     lines += ['# exclude = ["..."]  # units that take no part']
-    if found is not None:
-        lines += _mapping(found)
+    lines += _mapping(discovery) if discovery is not None else []
     for step in data.get("prepare", ()):
-        lines += ["", "[[data.prepare]]", *(f"{key} = {_value(value)}" for key, value in step.items())]
-    lines += ["", *_comment(f"Lifted functions: {why}.")]
-    if lifting:
-        lines += ["[lifting]", *(f"{key} = {_value(value)}" for key, value in lifting.items())]
-    else:
-        lines += [
-            "# [lifting]",
-            '# functions = ["sin(angle)"]  # nonlinear terms that you know of; without any, models are linear',
-        ]
-    if calibrate:
-        lines += [
-            "",
-            *_comment("Where the phase of every unit is found: in the error of a speed that is held constant."),
-        ]
-        lines += ["[calibrate]", *(f"{key} = {_value(value)}" for key, value in calibrate.items())]
+        lines += ["", "[[data.prepare]]", *_keys(step)]
+    lines += ["", *_comment(f"Lifted functions: {proposal.why}.")]
+    example = '# functions = ["sin(angle)"]  # nonlinear terms that you know of; without any, models are linear'
+    lines += ["[lifting]", *_keys(proposal.lifting)] if proposal.lifting else ["# [lifting]", example]
+    if proposal.calibrate:
+        where = "Where the phase of every unit is found: in the error of a speed that is held constant."
+        lines += ["", *_comment(where), "[calibrate]", *_keys(proposal.calibrate)]
     return "\n".join(lines) + "\n"
 
 
-def _mapping(found: Discovery) -> Iterator[str]:
+def _keys(table: Mapping[str, Any]) -> list[str]:
+    return [f"{key} = {_value(value)}" for key, value in table.items()]
+
+
+def _mapping(discovery: Discovery) -> Iterator[str]:
+    """Yield the lines of ``[data.csv]``, columns that were left out as comments."""
     yield from ("", "[data.csv]")
-    for key, value in found.mapping.items():
+    for key, value in discovery.mapping.items():
         if key != "channel":
-            note = found.notes.get(key, COMMENTS.get(key, ""))
-            if key == "files":
-                yield from _comment(found.reading)
-            yield f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"
-    by_name = {c.name: c for c in found.columns}
-    for channel in found.mapping["channel"]:
+            yield from _comment(discovery.reading) if key == "files" else ()
+            yield _line(key, value, discovery.notes.get(key, COMMENTS.get(key, "")))
+    by_name = {c.name: c for c in discovery.columns}
+    for channel in discovery.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
-    spare = [c for c in found.columns if c.part is ColumnPart.LEFT_OUT and c.why != "no numbers"]
+    spare = [c for c in discovery.columns if c.part is ColumnPart.LEFT_OUT and c.why != "no numbers"]
     if spare:
-        yield from (
-            "",
-            "# Columns that were left out; a channel of the role state is estimated, one of the role input is known at run time.",
-        )
+        roles = "a channel of the role state is estimated, one of the role input is known at run time"
+        yield from ("", f"# Columns that were left out; {roles}.")
     for column in spare:
-        table = {
-            "name": column.name,
-            "column": column.reference,
-            "role": "state",
-            **({"unit": column.unit} if column.unit else {}),
-        }
+        table = {"name": column.name, "column": column.reference, "role": "state"}
+        table |= {"unit": column.unit} if column.unit else {}
         yield from ("", *(f"# {line}" for line in ("[[data.csv.channel]]", *_channel(table, column))))
 
 
 def _channel(table: Mapping[str, Any], column: TableColumn) -> Iterator[str]:
     for key, value in table.items():
         note = {"role": column.why, "measured": "available at run time", "scale": "to " + column.unit}.get(key, "")
-        yield f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"
+        yield _line(key, value, note)
+
+
+def _line(key: str, value: Any, note: str) -> str:
+    return f"{key} = {_value(value)}{f'  # {_one_line(note)}' if note else ''}"
 
 
 def _value(value: Any) -> str:
@@ -119,10 +116,6 @@ def _one_line(text: str) -> str:
 
 
 def _comment(text: str) -> list[str]:
-    return textwrap.wrap(
-        _one_line(text),
-        118,
-        initial_indent="# ",
-        subsequent_indent="#   " if text.startswith("- ") else "# ",
-        break_on_hyphens=False,
-    )
+    later = "#   " if text.startswith("- ") else "# "
+    indents: dict[str, Any] = {"initial_indent": "# ", "subsequent_indent": later}
+    return textwrap.wrap(_one_line(text), 118, break_on_hyphens=False, **indents)

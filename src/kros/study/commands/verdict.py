@@ -1,4 +1,4 @@
-"""One word about every unit that `kros check` scored: PASS, FAIL or UNDECIDED, with the reason, at a terminal and as JUnit XML."""
+"""The verdict on every unit that `kros check` scored, PASS, FAIL or UNDECIDED, as text and JUnit XML."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ _ORDER = list(Verdict)
 
 def with_verdict(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row of scores with its verdict and the reason in words."""
-    verdict = Verdict.FAIL if row["outlier"] else Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
+    verdict = Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
+    verdict = Verdict.FAIL if row["outlier"] else verdict
     return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
 
 
@@ -66,7 +67,8 @@ def junit_text(rows: Sequence[dict[str, Any]]) -> str:
         inside = "" if tag is None else f"<{tag} type={_quoted(worst(own))} message={_quoted(text)}/>"
         cases.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
     counts = {tag: sum(worst(own) is verdict for own in units.values()) for tag, verdict in _COUNTED.items()}
-    head = f'<testsuite name="kros check" tests="{len(units)}" failures="{counts["failures"]}" errors="{counts["errors"]}">'
+    numbers = f'tests="{len(units)}" failures="{counts["failures"]}" errors="{counts["errors"]}"'
+    head = f'<testsuite name="kros check" {numbers}>'
     return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *cases, "</testsuite>", ""])
 
 
@@ -88,23 +90,17 @@ def _reasons(row: dict[str, Any]) -> list[str]:
     elif row["status"] == Status.CANNOT_TELL and "missing" not in row and row["units"] < FEWEST_UNITS:
         reasons.append(f"needs at least {FEWEST_UNITS} units to compare with, has {row['units']}")
     elif row["status"] == Status.OTHER_MOTIONS:
-        reasons.append(
-            "beyond the others, but by no more than one unit differs from motion to motion; repeat the motions of the study"
-        )
+        less = "beyond the others, but by no more than one unit differs from motion to motion"
+        reasons.append(f"{less}; repeat the motions of the study")
     elif row.get("detectable") is not None and not row["outlier"]:
         only = "only " if row["status"] == Status.CANNOT_TELL else ""
-        reasons.append(
-            f"{only}a change of gain above {row['detectable']:.2g} % would be detected, at {row['detectable_hz']:.3g} Hz"
-        )
+        change = f"{only}a change of gain above {row['detectable']:.2g} % would be detected"
+        reasons.append(f"{change}, at {row['detectable_hz']:.3g} Hz")
     if "missing" in row:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     if row.get("level_db") is not None:
-        units = (
-            f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
-            if row["level_units"] < FEWEST_UNITS
-            else ""
-        )
-        reasons.append(f"innovation {level_text(row)}{units}")
+        few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
+        reasons.append(f"innovation {level_text(row)}{few if row['level_units'] < FEWEST_UNITS else ''}")
     elif "missing" in row:
         reasons.append("the deployed observer has no monitor, or no sample can be judged")
     if row["left_out"]:

@@ -8,7 +8,7 @@ from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import prepare
 from ...data.steps import parse_steps
-from ...data.survey import check_usable, survey
+from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.limits import limits_of
@@ -77,23 +77,13 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
 def run(context: Context) -> None:
     """Read everything once."""
     config = context.config
-    in_place = config.data.reader == PARQUET and not config.data.prepare
-    folder = None if in_place else context.store.draft("recordings")
+    in_place, store = config.data.reader == PARQUET and not config.data.prepare, context.store
+    copy = None if in_place else Copy(store.draft("recordings"), store.path("recordings"))
     population, data = open_source(config, context.given), config.data
-    reserve, earlier = draw(config, population), context.store.path("recordings")
-    _, facts = survey(
-        population,
-        config.split.test,
-        data.identify_on,
-        data.on_nan,
-        folder,
-        context.work,
-        reserve,
-        earlier,
-        fewest=FEWEST_SAMPLES
-        + 1
-        + resolve_lifting(config.lifting, config.calibrate, population, config.split.test).history,
-    )
+    lifting = resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
+    options = {"test": config.split.test, "identify_on": data.identify_on, "on_nan": data.on_nan}
+    fewest, reserve = FEWEST_SAMPLES + 1 + lifting.history, draw(config, population)
+    _, facts = survey(population, context.work, copy, reserve=reserve, fewest=fewest, **options)
     if in_place and facts.dropped:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}

@@ -1,0 +1,434 @@
+"""Preparation as declared steps: small frozen objects, applied to each episode in the order given.
+
+Each step says what it does to the channels and the sampling period, so that a population can be described before
+anything is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a
+table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
+
+Examples
+--------
+>>> import kros
+>>> kros.data.steps.parse_steps([{"step": "shift", "channels": ["torque"], "lag": 1}])
+(Shift(channels=('torque',), lag=1),)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from ..core import limits
+from ..core.errors import ConfigError, DataError
+from ..core.files import did_you_mean, shortened
+from ..core.removed import refusing
+from .checks import check_finite
+from .population import Channel, Role
+from .recording import Recording, check_increasing, estimate_period, title
+from .scaling import Scalings, scaling_of
+
+__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
+__getattr__ = refusing(__name__)
+
+Float = npt.NDArray[np.float64]
+Channels = tuple[Channel, ...]
+
+
+@dataclass(frozen=True)
+class Step:
+    """Base of all steps; `step` is its word in TOML, `makes_even` says that recordings of uneven time may enter.
+
+    Examples
+    --------
+    >>> from dataclasses import replace
+    >>> import kros
+    >>> class Magnitude(kros.data.steps.Step):
+    ...     def apply(self, recording, channels, period_s):
+    ...         return replace(recording, values=abs(recording.values))
+    >>> data = kros.from_arrays({"a": [[[-1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> kros.data.prepare(data, [Magnitude(), kros.data.steps.Trim(start=1)]).columns[0].name
+    'x'
+    """
+
+    step: ClassVar[str] = ""
+    makes_even: ClassVar[bool] = False
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    @property
+    def named(self) -> tuple[str, ...]:
+        """Channels that this step needs."""
+        names = getattr(self, "channels", None) or (getattr(self, "channel", None), getattr(self, "reference", None))
+        return tuple(name for name in names if name is not None)
+
+    def check(self, period_s: float) -> None:
+        """Refuse settings that cannot be."""
+
+    def channels_after(self, channels: Channels) -> Channels:
+        """Return the channels as this step leaves them; refuse channels that it does not fit."""
+        self.columns(self.named, channels)
+        return channels
+
+    def period_after(self, period_s: float) -> float:
+        """Return the sampling period as this step leaves it, s."""
+        self.check(period_s)
+        return period_s
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, with what this step does to them."""
+        return scaling
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the prepared recording; `channels` and `period_s` describe the one given."""
+        raise NotImplementedError
+
+    def without(self, names: Collection[str]) -> Step | None:
+        """Return the step for the channels that are left without some, or None where it has nothing to do."""
+        left = tuple(name for name in self.named if name not in names)
+        if hasattr(self, "channels") and left:
+            return replace(self, channels=left)  # type: ignore[call-arg]
+        return self if left == self.named and not hasattr(self, "channels") else None
+
+    def columns(self, names: Sequence[str], channels: Channels) -> list[int]:
+        """Return the columns of named channels, or say which name is unknown."""
+        known = [c.name for c in channels]
+        unknown = next((name for name in names if name not in known), None)
+        if unknown is not None:
+            hint = did_you_mean(unknown, known) or ";"
+            raise ConfigError(f"Step {self.step!r} asks for channel {unknown!r}{hint} there are {known}; correct it.")
+        return [known.index(name) for name in names]
+
+    def _require(self, condition: bool, needs: str) -> None:
+        if not condition:
+            raise ConfigError(f"Step {self.step!r} needs {needs}; correct it.")
+
+
+@dataclass(frozen=True)
+class Scale(Step):
+    """Multiply channels by a factor; `unit` names the new unit of measure.
+
+    Examples
+    --------
+    >>> import kros
+    >>> data = kros.from_arrays({"a": [[[180.0], [90.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> turned = kros.data.prepare(data, [kros.data.steps.Scale(("x",), 3.14159 / 180, unit="rad")])
+    >>> turned.channels[0].unit
+    'rad'
+    """
+
+    channels: tuple[str, ...]
+    factor: float
+    unit: str | None = None
+    step: ClassVar[str] = "scale"
+
+    def check(self, period_s: float) -> None:
+        """Refuse a factor that leaves nothing."""
+        self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
+
+    def channels_after(self, channels: Channels) -> Channels:
+        """Return the channels with their new unit of measure."""
+        self.columns(self.channels, channels)
+        scaled = self.channels if self.unit is not None else ()
+        return tuple(replace(c, unit=self.unit or "") if c.name in scaled else c for c in channels)
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, multiplied."""
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(s, factor=s.factor * self.factor) for name, s in before.items()}}
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the recording with some columns multiplied."""
+        values = recording.values.copy()
+        with np.errstate(over="ignore"):  # infinity is refused by the checks, with its place
+            values[:, self.columns(self.channels, channels)] *= self.factor
+        return replace(recording, values=values)
+
+
+@dataclass(frozen=True)
+class Shift(Step):
+    """Move channels that lag the others by `lag` samples back into place; a negative `lag` is a lead.
+
+    The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
+
+    Examples
+    --------
+    >>> import kros
+    >>> names = {"states": ["x", "late"], "measured": ["x"], "sample_period_s": 0.01}
+    >>> data = kros.from_arrays({"a": [[[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]]}, **names)
+    >>> kros.data.prepare(data, [kros.data.steps.Shift(("late",), lag=1)]).read(data.keys()[0]).tolist()
+    [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
+    """
+
+    channels: tuple[str, ...]
+    lag: int
+    step: ClassVar[str] = "shift"
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, moved."""
+        before = {name: scaling_of(scaling, name) for name in self.channels}
+        return {**scaling, **{name: replace(s, lag_samples=s.lag_samples + self.lag) for name, s in before.items()}}
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the aligned recording, `abs(lag)` samples shorter."""
+        n, length = len(recording.values), len(recording.values) - abs(self.lag)
+        if length <= 0:
+            raise DataError(
+                f"{title(recording.key)}: shifting by {self.lag} samples leaves nothing of {n}; leave it out."
+            )
+        fixed, moved = max(0, -self.lag), max(0, self.lag)
+        columns, rest = self.columns(self.channels, channels), recording.cut(fixed, fixed + length)
+        values = rest.values.copy()
+        values[:, columns] = recording.values[moved : moved + length, columns]
+        return replace(rest, values=values)
+
+
+@dataclass(frozen=True)
+class Offset(Step):
+    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)``.
+
+    Examples
+    --------
+    >>> import kros
+    >>> names = {"states": ["x"], "inputs": ["target"], "measured": ["x"], "sample_period_s": 0.01}
+    >>> data = kros.from_arrays({"a": [[[0.5, 0.0], [1.5, 1.0], [2.5, 2.0]]]}, **names)
+    >>> shifted = kros.data.prepare(data, [kros.data.steps.Offset("x", "target", 0, 2)])
+    >>> shifted.read(shifted.keys()[0])[:, 0].tolist()
+    [0.0, 1.0, 2.0]
+    """
+
+    channel: str
+    reference: str
+    start: int
+    stop: int
+    step: ClassVar[str] = "offset"
+
+    def check(self, period_s: float) -> None:
+        """Refuse an empty window."""
+        self._require(0 <= self.start < self.stop, f"0 <= start < stop, found start = {self.start}, stop = {self.stop}")
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from, with the offset in words."""
+        window = f"samples {self.start} to {self.stop - 1} of every episode"
+        offset = f"mean of {self.reference} - {self.channel} over {window}"
+        return {**scaling, self.channel: replace(scaling_of(scaling, self.channel), offset=offset)}
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the recording with the offset removed."""
+        column, reference = self.columns((self.channel, self.reference), channels)
+        if len(recording.values) < self.stop:
+            needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
+            actual = f"the episode has {len(recording.values)}"
+            raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
+        window = recording.values[self.start : self.stop]
+        check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
+        values = recording.values.copy()
+        values[:, column] += np.mean(window[:, reference] - window[:, column])
+        return replace(recording, values=values)
+
+
+@dataclass(frozen=True)
+class Trim(Step):
+    """Keep samples ``[start, stop)``, without the last `tail`.
+
+    Examples
+    --------
+    >>> import kros
+    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> kros.data.prepare(data, [kros.data.steps.Trim(start=1, tail=1)]).source.steps
+    (Trim(start=1, stop=None, tail=1),)
+    """
+
+    start: int = 0
+    stop: int | None = None
+    tail: int = 0
+    step: ClassVar[str] = "trim"
+
+    def check(self, period_s: float) -> None:
+        """Refuse bounds in the wrong order."""
+        ordered = self.stop is None or self.start < self.stop
+        self._require(self.start >= 0 and self.tail >= 0 and ordered, f"0 <= start < stop and tail >= 0, found {self}")
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the shorter recording."""
+        n = len(recording.values)
+        stop = min(n if self.stop is None else self.stop, n - self.tail)
+        if stop <= self.start:
+            bounds = f"start = {self.start}, stop = {self.stop}, tail = {self.tail}"
+            advice = "leave the episode out or trim less"
+            raise DataError(f"{title(recording.key)}: trimming to {bounds} leaves nothing of {n} samples; {advice}.")
+        return recording.cut(self.start, stop)
+
+
+@dataclass(frozen=True)
+class Resample(Step):
+    """Bring uneven time, or another rate, to a fixed period.
+
+    At the same or a higher rate this is linear interpolation. When the rate falls, samples are interpolated to a grid
+    that is an integer number of times finer, filtered without delay below the new Nyquist frequency, and thinned. All
+    channels are treated alike, so linear relations between them survive.
+
+    Parameters
+    ----------
+    period_s : float, s
+    max_gap_s : float, optional, s
+        Longest gap in time that a straight line bridges, a longer one is an error; default: ten median steps.
+    passband : float
+        Cut-off of the filter as a share of the new Nyquist frequency.
+
+    Examples
+    --------
+    >>> import kros
+    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
+    >>> finer = kros.data.prepare(data, [kros.data.steps.Resample(0.005)])
+    >>> finer.read(finer.keys()[0]).ravel().tolist()
+    [0.0, 0.5, 1.0, 1.5, 2.0]
+    """
+
+    period_s: float
+    max_gap_s: float | None = None
+    passband: float = 0.8
+    step: ClassVar[str] = "resample"
+    makes_even: ClassVar[bool] = True
+
+    def period_after(self, period_s: float) -> float:
+        """Return the new sampling period, s."""
+        self._require(0 < self.period_s < math.inf, f"period_s > 0, found {self.period_s}")
+        self._require(self.max_gap_s is None or self.max_gap_s > 0, f"max_gap_s > 0, found {self.max_gap_s}")
+        self._require(0 < self.passband < 1, f"0 < passband < 1, found {self.passband}")
+        return self.period_s
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the recording on the new grid, which starts at its first sample."""
+        time, what = recording.time_s, f"{title(recording.key)}: resampling"
+        time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
+        timed = replace(recording, time_s=time)
+        check_increasing(timed)
+        median, gap = estimate_period(timed), int(np.diff(time).argmax())
+        longest, limit = time[gap + 1] - time[gap], 10 * median if self.max_gap_s is None else self.max_gap_s
+        if longest > limit:
+            bridge = f"bridge a gap of {longest:g} s after sample {gap} (allowed: {limit:g} s)"
+            raise DataError(f"{what} would {bridge}; cut the episode there, or raise max_gap_s.")
+        count = (time[-1] - time[0]) / min(self.period_s, median)
+        if count > limits.MAX_SAMPLES:
+            make = f"would make {count:g} samples of {len(time)}"
+            raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
+        return replace(recording, values=self.resampled(time, recording.values, median), time_s=None)
+
+    def resampled(self, time_s: Float, values: Float, median_s: float) -> Float:
+        """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
+        finer = math.ceil(self.period_s / median_s - 1e-3)
+        step = self.period_s / finer
+        grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + 1e-6) + 1)
+        fine = np.column_stack([np.interp(grid, time_s, column) for column in values.T])
+        return fine if finer == 1 else np.ascontiguousarray(lowpass(fine, self.passband * 0.5 / finer)[::finer])
+
+
+@dataclass(frozen=True)
+class Differentiate(Step):
+    """Add the derivative of a channel, low-passed at `cutoff_hz`, as a new state.
+
+    The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a
+    running observer could have measured.
+
+    Examples
+    --------
+    >>> import kros
+    >>> parabola = {"a": [[[(0.01 * k) ** 2] for k in range(200)]]}
+    >>> data = kros.from_arrays(parabola, states=["angle"], measured=["angle"], sample_period_s=0.01)
+    >>> with_rate = kros.data.prepare(data, [kros.data.steps.Differentiate("angle", "rate", cutoff_hz=5.0)])
+    >>> with_rate.states, float(with_rate.read(with_rate.keys()[0])[100, 1].round(6))
+    (('angle', 'rate'), 2.0)
+    """
+
+    channel: str
+    name: str
+    cutoff_hz: float
+    unit: str = ""
+    step: ClassVar[str] = "differentiate"
+
+    def check(self, period_s: float) -> None:
+        """Refuse a cut-off that is not below the Nyquist frequency."""
+        bound = f"a cutoff_hz above zero and below the Nyquist frequency of {0.5 / period_s:g} Hz"
+        self._require(0 < self.cutoff_hz < 0.5 / period_s, f"{bound}, found {self.cutoff_hz}")
+
+    def channels_after(self, channels: Channels) -> Channels:
+        """Return the channels with the new state after the other states."""
+        self.columns(self.named, channels)
+        if self.name in [c.name for c in channels]:
+            raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
+        at = _n_states(channels)
+        return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
+
+    def scaling_after(self, scaling: Scalings) -> Scalings:
+        """Return where channels come from: the derivative has the factor of its channel, and no column."""
+        return {**scaling, self.name: replace(scaling_of(scaling, self.channel), column=None, offset="")}
+
+    def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
+        """Return the recording with one more column."""
+        smooth = lowpass(recording.values[:, self.columns(self.named, channels)], self.cutoff_hz * period_s)[:, 0]
+        values = np.insert(recording.values, _n_states(channels), np.gradient(smooth, period_s), axis=1)
+        return replace(recording, values=values)
+
+
+def _n_states(channels: Channels) -> int:
+    return sum(c.role is Role.STATE for c in channels)
+
+
+def lowpass(values: Float, cutoff: float) -> Float:
+    """Filter columns without delay by a windowed sinc; ends are extended by odd reflection."""
+    half = min(math.ceil(4 / cutoff), len(values) - 1) if cutoff > 0 else 0
+    if cutoff >= 0.5 or half < 1:
+        return values
+    from scipy.signal import convolve, firwin
+
+    taps = firwin(2 * half + 1, 2 * cutoff, window="hamming")[:, None]
+    padded = np.concatenate([2 * values[0] - values[half:0:-1], values, 2 * values[-1] - values[-2 : -half - 2 : -1]])
+    return np.asarray(convolve(padded, taps, mode="valid"))
+
+
+STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Trim, Resample, Differentiate)}
+
+
+def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
+    """Return steps from TOML tables (steps pass through).
+
+    Parameters
+    ----------
+    tables : iterable of mapping or Step
+        For example ``[{"step": "trim", "start": 1000}]``.
+    where : str
+        What the messages call the list.
+
+    Raises
+    ------
+    ConfigError
+        An unknown step or key, a missing key, or a value of the wrong type.
+
+    Examples
+    --------
+    >>> from kros.data.steps import parse_steps
+    >>> parse_steps([{"step": "trim", "start": 1000}])
+    (Trim(start=1000, stop=None, tail=0),)
+    """
+    return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
+
+
+def _parse_step(table: Mapping[str, Any], where: str) -> Step:
+    """Return the step of one table."""
+    name = table.get("step") if isinstance(table, Mapping) else None
+    if not isinstance(name, str) or name not in STEPS:
+        raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
+    try:
+        return TypeAdapter(STEPS[name]).validate_python({key: v for key, v in table.items() if key != "step"})
+    except ValidationError as error:
+        problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
+        key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
+        text = f"{key}: {problem['msg'].lower()}, found {actual}"
+        if problem["type"] == "unexpected_keyword_argument":
+            text = f"unknown key {key!r}{did_you_mean(key, known) or ';'} known keys are {', '.join(known)}"
+        if problem["type"] == "missing":
+            text = f"key {key!r} is missing, found {list(table)}; add it"
+        raise ConfigError(f"{where} (step {name!r}): {text}.") from error

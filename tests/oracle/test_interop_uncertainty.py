@@ -9,7 +9,7 @@ control = pytest.importorskip("control")
 
 from kros.core.errors import ConfigError, DataError, DimensionError  # noqa: E402
 from kros.interop import quantify_models  # noqa: E402
-from kros.uncertainty.bilinear import BilinearAxis  # noqa: E402
+from kros.uncertainty.weights.bilinear import BilinearAxis  # noqa: E402
 
 FREQS = np.geomspace(1e-3, 10.0, 80)
 

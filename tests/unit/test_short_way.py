@@ -13,7 +13,7 @@ from kros.data import Population
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
 from kros.plants import PLANTS
-from kros.uncertainty import UncertainModels, quantify_systems
+from kros.uncertainty import UncertainModels, quantify
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 
@@ -165,4 +165,4 @@ def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> 
     systems = uncertain.models.models().systems()
     options = {"freqs_hz": np.geomspace(0.5, 100, 40), "max_order": 1}
     found = kros.quantify(systems, "additive", **options)
-    assert found.peak_db == quantify_systems(systems, "additive", **options).peak_db
+    assert found.peak_db == quantify(systems, "additive", **options).peak_db

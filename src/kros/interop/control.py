@@ -234,37 +234,37 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     }
 
 
-def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
-    """Return the nominal and the weights of an uncertain model as `control.StateSpace`.
+def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
+    """Return the nominal and the weights of an uncertain model as `control.StateSpace`, a nominal response as `control.FRD`.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
     >>> from kros.interop import uncertainty_to_control
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
     >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> uncertainty_to_control(quantify_systems(units, "additive")).nominal.dt
+    >>> uncertainty_to_control(quantify(units, "additive")).nominal.dt
     0.01
     """
-    nominal, scaled = (
-        to_control(model.nominal_system, name="nominal"),
-        to_control(model.scaled_nominal(), name="scaled_nominal"),
-    )
-    certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
-    if model.sample_period_s == 0:
-        certificate = (
-            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, checked between the points of the "
-            "grid; from there on residuals count as constant"
+    if isinstance(model, UncertainModel):
+        nominal, scaled = (
+            to_control(model.nominal_system, name="nominal"),
+            to_control(model.scaled_nominal(), name="scaled_nominal"),
         )
-    return with_weights(nominal, scaled, model, certificate)
-
-
-def with_weights(
-    nominal: Any, scaled: Any, model: UncertainModel | ResponseUncertainty, certificate: str
-) -> UncertaintyForControl:
-    """Put the weights of an uncertain model beside its nominal."""
+        certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
+        if model.sample_period_s == 0:
+            certificate = (
+                f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, "
+                "checked between the points of the grid; from there on residuals count as constant"
+            )
+    else:
+        G, certificate = model.nominal_response, model.certificate
+        nominal, scaled = (
+            control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, model.sample_period_s or 0)
+            for g in (G, G / model.output_scale[:, None] * model.input_scale)
+        )
     extra = model.remainder
     return UncertaintyForControl(
         nominal=nominal,

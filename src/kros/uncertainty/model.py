@@ -111,10 +111,10 @@ class ResponseUncertainty(Uncertainty):
     Examples
     --------
     >>> import numpy as np
-    >>> from kros.uncertainty import quantify_responses
+    >>> from kros.uncertainty import quantify
     >>> freqs_hz = np.geomspace(0.1, 40, 30)
     >>> lags = np.array([0.9, 1.0, 1.2])[:, None] / (1 + 1j * freqs_hz / 5)
-    >>> found = quantify_responses(lags[:, :, None, None], freqs_hz, "additive", sample_period_s=0.01)
+    >>> found = quantify(lags[:, :, None, None], freqs_hz, "additive", sample_period_s=0.01)
     >>> found.nominal_id, found.cover_max <= 1
     ('1', True)
     """
@@ -138,10 +138,10 @@ class UncertainModel(Uncertainty):
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
     >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> found = quantify_systems(units, "output_multiplicative")
+    >>> found = quantify(units, "output_multiplicative")
     >>> found.nominal_id, found.form.value, round(found.peak_db[found.form], 1)
     ('1', 'output_multiplicative', -14.0)
     """

@@ -20,9 +20,9 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import DimensionError
 from ..core.loading import check_shapes, loader
-from .fits.magnitude import fit_magnitude
 from .forms import Form, residual
 from .weights.cover import Cover, cover_ratio
+from .weights.magnitude import fit_magnitude
 from .weights.weight import EntrywiseWeight, Weight, unstructured_excess
 
 Array = npt.NDArray[Any]

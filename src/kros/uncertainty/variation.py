@@ -29,7 +29,7 @@ from ..core.loading import check_shapes, loader
 from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual
-from .validation import check_scale
+from .inputs import check_scale
 
 Array = npt.NDArray[Any]
 

@@ -32,7 +32,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
-from ..validation import check_scale
+from ..inputs import check_scale
 from .distances import Distances, balance, distances, joined, scaled_levels
 from .score import FEWEST_UNITS, OutlierScore, Status
 from .scoring import Nominals, scores_of

@@ -1,4 +1,4 @@
-r"""Optimal cover of a set of residuals, frequency by frequency: diagonal (or scalar) magnitudes left and right.
+r"""Optimal cover of a set of residuals, frequency by frequency: diagonal magnitudes left and right.
 
 A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R = exp(x_r)` and
 `s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
@@ -42,7 +42,6 @@ _TINY = 1e-300
 class Structure(str, Enum):
     """Which entries of the weights are free."""
 
-    SCALAR = "scalar"
     DIAGONAL = "diagonal"
     ENTRYWISE = "entrywise"
 
@@ -76,11 +75,6 @@ class Cover:
         """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m'); independent of the gauge."""
         return self.left[:, :, None] * self.right[:, None, :]
 
-    def regauged(self, reference: int) -> Cover:
-        """Return the same cover with right entry `reference` equal to one."""
-        scale = self.right[:, [reference]]
-        return Cover(self.left * scale, self.right / scale)
-
     def cost_db(self) -> Array:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
@@ -91,19 +85,11 @@ def as_structure(structure: Structure | str) -> Structure:
     return member(Structure, structure, "Weight structure")
 
 
-def optimal_cover(
-    E: Array,
-    structure: Structure | str = Structure.DIAGONAL,
-    pull: float = _PULL,
-    squarings: tuple[int, ...] = _SQUARINGS,
-) -> Cover:
-    """Return the cover of residuals (unit, frequency, p', m') with the smallest mean log magnitudes; a larger pull makes it smoother."""
+def optimal_cover(E: Array, pull: float = _PULL) -> Cover:
+    """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes; a larger pull makes it smoother."""
     first = entries_first(E)
-    p, m = first.shape[:2]
-    size = sigma_max_first(first).max(axis=0)
-    if as_structure(structure) is Structure.SCALAR:
-        return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
-    x = _descend(first, size, p, pull, squarings)
+    p = first.shape[0]
+    x = _descend(first, sigma_max_first(first).max(axis=0), p, pull)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
@@ -121,21 +107,18 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, pull: float, squarings: tuple[int, ...]) -> Array:
+def _descend(first: Array, size: Array, p: int, pull: float) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    chosen = alive[
-        np.unique(
-            np.linspace(0, len(alive) - 1, max(60, _ENTRIES // (first.shape[0] * first.shape[1]))).round().astype(int)
-        )
-    ]
+    count = max(60, _ENTRIES // (first.shape[0] * first.shape[1]))
+    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, count).round().astype(int))]
     E = first[..., chosen] / size[chosen]
     E = E[:, :, _largest(sigma_max_first(E))]
     x = np.zeros((n, len(chosen)))
-    for power in squarings:
+    for power in _SQUARINGS:
         for _ in range(_NEWTON):
             x, moved = _newton(_Smooth(E, p, power, pull), x)
             if moved < 1e-3:

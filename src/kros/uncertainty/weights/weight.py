@@ -20,9 +20,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.lti import StateSpace, gain
+from ...core.lti import StateSpace, dense_response, gain
 from ...core.small_matrices import sigma_max
-from ..fits.diagonal_response import diagonal_response
 from .certificate import Method
 from .cover import Cover, Structure
 
@@ -60,10 +59,10 @@ class Weight:
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
     >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> weight = quantify_systems(units, "output_multiplicative").weight
+    >>> weight = quantify(units, "output_multiplicative").weight
     >>> weight.structure.value, weight.cover_max <= 1
     ('diagonal', True)
     """
@@ -81,7 +80,8 @@ class Weight:
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
-        return Cover(np.abs(diagonal_response(self.left, freqs_hz)), np.abs(diagonal_response(self.right, freqs_hz)))
+        left, right = (dense_response(side, freqs_hz) for side in (self.left, self.right))
+        return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
 
     def matrix(self) -> StateSpace:
         """Return the p' by m' system `W_L 1 W_R`, with 1 a matrix of ones, that bounds every entry of the residuals: `|E_ij| <= |W_ij|`."""

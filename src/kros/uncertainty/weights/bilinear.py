@@ -9,14 +9,15 @@ of nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
-from ..core.lti import StateSpace
+from ...core.errors import ConfigError
+from ...core.lti import StateSpace
+from .residuals import Residuals
 
 Array = npt.NDArray[Any]
 
@@ -48,6 +49,24 @@ class BilinearAxis:
         """Return the frequencies on the continuous axis, at most `last_hz`."""
         angle = np.pi * self.period_s * np.asarray(freqs_hz, float)
         return np.asarray(np.minimum(np.tan(np.minimum(angle, np.pi / 2)) / (np.pi * self.period_s), self.last_hz))
+
+    def mapped(self, residuals: Residuals) -> Residuals:
+        """Return residuals at mapped frequencies, constant from `last_hz` on; their systems are those of the modes alone."""
+
+        def units(freqs_hz: Array, rows: Array) -> Array:
+            return residuals.units(self.continuous_hz(freqs_hz), rows)
+
+        systems = None
+        if residuals.systems is not None:
+            systems = self.discrete(residuals.systems[0]), self.discrete(residuals.systems[1])
+        nominal = residuals.nominal
+        return replace(
+            residuals,
+            nominal=lambda freqs_hz: nominal(self.continuous_hz(freqs_hz)),
+            units=units,
+            systems=systems,
+            proven=False,
+        )
 
     def continuous(self, system: StateSpace) -> StateSpace:
         """Return the continuous system with the same response at mapped frequencies."""

@@ -14,10 +14,10 @@ from ..core.lti import StateSpace
 Array = npt.NDArray[Any]
 
 
-def read_models(
+def read_systems(
     models: Any, unit_ids: Sequence[str] | None, output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None
 ) -> tuple[StateSpace, tuple[str, ...], tuple[Array, Array]]:
-    """Models as a checked batch, ids and scales."""
+    """Return models as a checked batch, with ids and scales."""
     if hasattr(models, "systems") and hasattr(models, "unit_ids"):
         output_scale = models.output_scale if output_scale is None else output_scale
         input_scale = models.input_scale if input_scale is None else input_scale
@@ -25,7 +25,7 @@ def read_models(
         models = models.systems(unit_ids)
     system = stack_systems(models)
     ids = check_ids(unit_ids, system.batch_shape[0])
-    _check(system, tuple(f"unit {name}" for name in ids))
+    _check_stable(system, tuple(f"unit {name}" for name in ids))
     return (
         system,
         ids,
@@ -52,7 +52,8 @@ def stack_systems(models: Any) -> StateSpace:
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
             raise DimensionError(
-                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of systems."
+                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of "
+                "systems, an array of responses, or the result of kros.identify."
             )
         systems = [StateSpace.of(system) for system in models]
         found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
@@ -108,10 +109,10 @@ def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> Non
             f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
             f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
         )
-    _check(candidate[None], (name,))
+    _check_stable(candidate[None], (name,))
 
 
-def _check(system: StateSpace, names: tuple[str, ...]) -> None:
+def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     count = (len(names),)
     finite = np.ones(count, bool)
@@ -148,3 +149,45 @@ def _padded(system: StateSpace, n_states: int) -> StateSpace:
         A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
     return StateSpace(A, B, C, system.D, system.dt)
+
+
+def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
+    """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
+    if response.shape != shape:
+        raise DimensionError(
+            f"Quantify: the response of {name!r} should have the shape {shape}, found {response.shape}."
+        )
+    finite = np.isfinite(response).all(axis=(1, 2))
+    if not finite.all():
+        at = freqs[int(np.argmin(finite))]
+        raise DataError(
+            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out."
+        )
+
+
+def read_response_data(
+    data: Sequence[Any], freqs_hz: npt.ArrayLike | None, options: dict[str, Any]
+) -> tuple[Array, Array]:
+    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`; dt joins the options."""
+    first, nominal = data[0], options.get("nominal")
+    beside = [("the nominal", nominal)] if nominal is not None and hasattr(nominal, "frdata") else []
+    for name, other in [*((f"response {k}", one) for k, one in enumerate(data)), *beside]:
+        if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
+            raise DimensionError(
+                f"Quantify: {name} has other frequencies than the first response; interpolate or measure on one grid."
+            )
+        if other.dt != first.dt or other.frdata.shape != first.frdata.shape:
+            raise DimensionError(
+                f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
+                f"{first.frdata.shape} and {first.dt}; bring them to one."
+            )
+    if first.dt is True or freqs_hz is not None:
+        raise ConfigError(
+            f"Quantify: response data bring their own frequencies and sampling period in seconds, found freqs_hz = "
+            f"{freqs_hz!r} and dt = {first.dt}."
+        )
+    options["sample_period_s"] = float(first.dt or 0.0)
+    if beside:
+        options["nominal"] = np.moveaxis(np.asarray(beside[0][1].frdata), -1, 0)
+    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in data])
+    return responses, np.asarray(first.omega, float) / (2 * np.pi)

@@ -1,4 +1,4 @@
-"""How well a load is estimated: slow errors against the same estimator's floor without load; of estimate and truth low-passed without delay."""
+"""How well a load is estimated: slow errors against the same estimator's floor without load."""
 
 from __future__ import annotations
 
@@ -35,12 +35,13 @@ class LoadAccuracy:
 def load_accuracy(
     estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
 ) -> LoadAccuracy:
-    """Judge estimates of the load, shape (n_samples, batch), against known ones; episodes whose load is zero throughout give the floor."""
+    """Judge estimates of the load, shape (n_samples, batch), against known ones."""
     truth = np.asarray(load, dtype=float)
     loaded = np.any(truth != 0, axis=0)
     if loaded.all() or not loaded.any():
         raise DataError(
-            f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} with load."
+            f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} "
+            f"with load."
         )
     slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
     error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow

@@ -1,11 +1,13 @@
 r"""How a known load shows in what an observer sees, collected from recordings of a few units.
 
-The load is one more hidden state, the last: zero in recordings without load, known in the others. Both kinds count alike, however many
-there are. What is regressed is the part that can be seen (`without_level`), of the load and, since under load the level is missing there too, of the current:
+The load is one more hidden state, the last: zero in recordings without load, known in the others. Both kinds count
+alike, however many there are. What is regressed is the part that can be seen (`without_level`), of the load and, since
+under load the level is missing there too, of the current:
 
 .. math:: \tau_s, \qquad i - (\tau - \tau_s).
 
-The past of what is seen then needs one lag with the same forgetting: the integral of the tracking error, which the drive's controller holds.
+The past of what is seen then needs one lag with the same forgetting: the integral of the tracking error, which the
+drive's controller holds.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ class LoadCalibration:
     past : PastMoments
         Of the recorded states and the load, its "units" the two kinds of recordings.
     batch : EpisodeBatch
-        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its "units" are the kinds.
+        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its
+        "units" are the kinds.
     level_s : float
         Time after which a constant load is forgotten.
     used, left_out : tuple of int
@@ -92,7 +95,8 @@ def calibrate_load(
     corner_hz : float, optional
         What is faster in the known load, vibrations of the gear for instance, does not count as load.
     limit : float, optional
-        Episodes in which the current comes so far are left out: a controller at its limit no longer does what its errors say.
+        Episodes in which the current comes so far are left out: a controller at its limit no longer does what its
+        errors say.
 
     Raises
     ------
@@ -128,8 +132,10 @@ def calibrate_load(
     loaded = np.any(load[:, used] != 0, axis=0)
     if not loaded.any() or loaded.all():
         raise DataError(
-            f"Load calibration: needs recordings with and without load, found {int(loaded.sum())} and {int((~loaded).sum())} that count; "
-            f"{int(at_limit.sum())} of {len(at_limit)} come to the current's limit; take a smaller load or slower moves."
+            f"Load calibration: needs recordings with and without load, found {int(loaded.sum())} and "
+            f"{int((~loaded).sum())} that count; "
+            f"{int(at_limit.sum())} of {len(at_limit)} come to the current's limit; take a smaller load or "
+            f"slower moves."
         )
     torque = load[:, used] if corner_hz is None else low_passed(load[:, used], corner_hz, dt)
     seen = without_level(torque, level_s, dt)

@@ -1,8 +1,9 @@
-r"""The paper's estimate (section IV-E.2): the error of the current that an observer of the unloaded machine makes under load.
+r"""The paper's estimate (section IV-E.2): the current's error of an observer of the unloaded machine under load.
 
-Where the current is recorded, ``tau = K (i - i_hat)``: the current in excess of what the unloaded machine would need for this motion. K is the
-torque constant; one known load gives it by least squares on signals low-passed without delay, together with a constant that takes up a bias.
-An observer that knows the current under load better than its unloaded model does hides the load: use one that follows the unloaded model.
+Where the current is recorded, ``tau = K (i - i_hat)``: the current in excess of what the unloaded machine would need
+for this motion. K is the torque constant; one known load gives it by least squares on signals low-passed without delay,
+together with a constant that takes up a bias. An observer that knows the current under load better than its unloaded
+model does hides the load: use one that follows the unloaded model.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ def calibrate_torque(
     dx, dt = x - x.mean(), t - t.mean()
     if not dt @ dt > 0 or not dx @ dt > 0:
         raise DataError(
-            f"Torque constant: the known load should change and the current's error follow it; found deviations {t.std():.3g} and {x.std():.3g} "
+            f"Torque constant: the known load should change and the current's error follow it; found deviations "
+            f"{t.std():.3g} and {x.std():.3g} "
             f"and covariance {dx @ dt / len(t):.3g}; check signs, and that the observer is one of the unloaded machine."
         )
     constant = float(dx @ dt / (dx @ dx))

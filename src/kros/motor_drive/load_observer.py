@@ -1,4 +1,4 @@
-"""The observer that learned from a known load how loads show: total current and load torque are separate states of it."""
+"""The observer that learned from a known load how loads show."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def load_observer(
     samples: int = 6000,
     iterations: int = 10,
 ) -> Observer:
-    """Return an observer with the recorded states, ``load``, and ``memory_1, ...``, which needs neither current nor load at run time.
+    """Return an observer with the recorded states, ``load`` and ``memory_1, ...``, without current or load as inputs.
 
     Parameters
     ----------
@@ -43,7 +43,8 @@ def load_observer(
     Returns
     -------
     Observer
-        It runs, is saved and certified (`relift_certificate`) as all are. `load`, and under load the current, lack their level (`AngleLoad`).
+        It runs, is saved and certified (`relift_certificate`) as all are. `load`, and under load the current, lack
+        their level (`AngleLoad`).
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`.
+"""Uncertainty of a population: six forms, nominal, weights that cover all units, outliers, variation and noise.
 
 Examples
 --------

@@ -1,7 +1,8 @@
-"""From systems or responses of units to an uncertain set: choose the nominal, bound its residuals and what the form leaves out.
+"""From systems or responses of units to an uncertain set: nominal, residuals, and what the form leaves out.
 
-Continuous systems are bounded on the unit circle that the bilinear map makes of the imaginary axis (`weights.bilinear`),
-responses between their frequencies as if they were straight lines in the complex plane, without a claim there.
+Continuous systems are bounded on the unit circle that the bilinear map makes of the imaginary axis
+(`weights.bilinear`), responses between their frequencies as if they were straight lines in the complex plane, without a
+claim there.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
 
 
 def _unresolved(bound: Array) -> npt.NDArray[np.intp]:
-    """Return the inner maxima of a bound that fall by more than 3 dB to a neighbour: peaks that the grid does not resolve."""
+    """Return the inner maxima of a bound that fall by more than 3 dB to a neighbour."""
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
     top = (middle >= bound[:-2]) & (middle >= bound[2:])
     return np.flatnonzero(top & (middle > np.maximum(_RESOLVED * low, 1e-8 * bound.max()))) + 1
@@ -176,7 +177,7 @@ def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, op
 
 
 def _bound_discrete(residuals: Residuals, freqs_hz: Array, dt: float, options: Options) -> dict[str, Any]:
-    """Return largest residual, cover, weight and misfit, and cover and weight of the remainder where the form leaves one."""
+    """Return bound, cover, weight, misfit, and cover and weight of the remainder where the form leaves one."""
     target = Target(dt, options.max_order, options.tolerance_db, options.fit)
     fit = fit_entries if options.structure is Structure.ENTRYWISE else fit_weight
     weight, cover = fit(residuals, freqs_hz, target)
@@ -204,7 +205,8 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     unknown = int(np.isnan(ratio).sum())
     if unknown:
         _LOG.warning(
-            "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the misfit is "
+            "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the "
+            "misfit is "
             "unknown there.",
             form.value,
             unknown,
@@ -215,7 +217,8 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
         return False
     _LOG.log(
         logging.WARNING if largest > _WARNED else logging.INFO,
-        "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an additive "
+        "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an "
+        "additive "
         "term. The additive form needs none.",
         form.value,
         largest,
@@ -226,7 +229,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
 def _fields(
     ids: tuple[str, ...], index: int, freqs_hz: Array, scales: tuple[Array, Array], choices: Any, bound: dict[str, Any]
 ) -> dict[str, Any]:
-    """Return the fields of `Uncertainty` for the nominal `index` among the units, -1 for a model that is none of them."""
+    """Return the fields of `Uncertainty` for the nominal `index` among the units."""
     name, form = ids[index] if index >= 0 else POOLED, bound["form"]
     return {
         "unit_ids": ids,

@@ -1,15 +1,15 @@
 r"""The six uncertainty forms of section II-A.4: residual from two plants, perturbed plant from a residual.
 
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =================================
 form                    perturbed plant                        residual                   exact when
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =================================
 additive                Gp = G + E                             Gp - G                     always
 input_multiplicative    Gp = G (1 + E)                         G^+ (Gp - G)               range(Gp - G) in range(G)
 output_multiplicative   Gp = (1 + E) G                         (Gp - G) G^+               rows(Gp - G) in rows(G)
-inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows(Gp) in rows(G)
+inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows too
 inverse_input_...       Gp = G (1 - E)^-1                      Gp^+ (Gp - G)              range(G) in range(Gp)
 inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+              rows(G) in rows(Gp)
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =================================
 
 The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, what it
 leaves out is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published
@@ -143,7 +143,7 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
 
 
 def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
-    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for; NaN where an inverse form's matrix is singular.
+    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for.
 
     Examples
     --------
@@ -222,7 +222,8 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     Returns
     -------
     ndarray, shape (unit, frequency)
-        NaN where the matrix that the form inverts has a condition number above 1e12; zero where the plant itself is zero.
+        NaN where the matrix that the form inverts has a condition number above 1e12; zero where the plant itself is
+        zero.
 
     Examples
     --------
@@ -245,7 +246,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
 def completion(
     form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return residuals, zero where an inverse form is near singular, and the remainder: `Gp = rebuild(form, G, E) + R` everywhere."""
+    """Return residuals, zero where an inverse form is near singular, and the remainder."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
     if form.inverse:
@@ -268,7 +269,8 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
     G, Gp = np.asarray(nominal), np.asarray(perturbed)
     if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
         raise DimensionError(
-            f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}; bring them to the same channels."
+            f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}; bring "
+            f"them to the same channels."
         )
     axes = max(G.ndim, Gp.ndim)
     return G.reshape((1,) * (axes - G.ndim) + G.shape), Gp.reshape((1,) * (axes - Gp.ndim) + Gp.shape)

@@ -1,4 +1,4 @@
-"""What a quantification is given: models or responses of units, a nominal, scales and options, read and checked, every refusal by name."""
+"""What a quantification is given: models, responses, a nominal and scales, read and checked."""
 
 from __future__ import annotations
 
@@ -34,15 +34,17 @@ def read_systems(
 
 
 def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """Return the names of units, ``0, 1, ...`` by default, or say what is wrong with them or that there are too few units."""
+    """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
     ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
     if len(ids) != count or len(set(ids)) != count:
         raise DimensionError(
-            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
+            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} "
+            f"({', '.join(ids[:5])} ...)."
         )
     if count < 2:
         raise DataError(
-            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); record more units."
+            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); "
+            f"record more units."
         )
     return ids
 
@@ -69,7 +71,8 @@ def stack_systems(models: Any) -> StateSpace:
         models = StateSpace(A, B, C, D, systems[0].dt)
     if len(models.batch_shape) != 1:
         raise DimensionError(
-            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; stack the units."
+            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; "
+            f"stack the units."
         )
     return models
 
@@ -99,14 +102,15 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
 
 
 def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> None:
-    """Raise a `DimensionError` or `DataError` when a candidate for the nominal is not one stable system like the units."""
+    """Raise a `DimensionError` or `DataError` when a candidate is not one stable system like the units."""
     if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (
         system.n_outputs,
         system.n_inputs,
         system.dt,
     ):
         raise DimensionError(
-            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
+            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} "
+            f"inputs at {system.dt} s, found "
             f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
         )
     _check_stable(candidate[None], (name,))
@@ -120,7 +124,8 @@ def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
         finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
     if not finite.all():
         raise DataError(
-            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again."
+            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or "
+            f"identify it again."
         )
     stable = np.broadcast_to(system.is_stable(), count)
     if not stable.all():
@@ -138,7 +143,7 @@ def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
 
 
 def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output: at rest after one sample, or decaying as fast as the system's slowest mode."""
+    """Add states without input and output, at rest after a sample or as slow as the slowest."""
     more = n_states - system.n_states
     if not more:
         return system
@@ -168,7 +173,7 @@ def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Ar
 def read_response_data(
     data: Sequence[Any], freqs_hz: npt.ArrayLike | None, options: dict[str, Any]
 ) -> tuple[Array, Array]:
-    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`; dt joins the options."""
+    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first, nominal = data[0], options.get("nominal")
     beside = [("the nominal", nominal)] if nominal is not None and hasattr(nominal, "frdata") else []
     for name, other in [*((f"response {k}", one) for k, one in enumerate(data)), *beside]:

@@ -1,8 +1,9 @@
 r"""What a quantification gives: a nominal, and a bound on how the units of the population differ from it.
 
-Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u = diag(input_scale)` every response is
-`S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In physical units an output-side residual is `S_y E S_y^-1`, an
-input-side one `S_u E S_u^-1`, an additive one `S_y E S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signals.
+Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u =
+diag(input_scale)` every response is `S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In
+physical units an output-side residual is `S_y E S_y^-1`, an input-side one `S_u E S_u^-1`, an additive one `S_y E
+S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signals.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """A bound on how the units of a population differ from a nominal one, whether their models are known or their responses alone.
+    """A bound on how the units of a population differ from a nominal one.
 
     Parameters
     ----------
@@ -41,14 +42,16 @@ class Uncertainty:
     output_scale : ndarray, shape (p,)
     input_scale : ndarray, shape (m,)
     bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal used).
+        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal
+        used).
     nominals : dict of Form to str
         Unit behind each of these bounds.
     cover : Cover
         Optimal cover of the residuals, frequency by frequency.
     weight : Weight
     misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
+        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above
+        1e12).
     remainder : Weight or None
         Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
     remainder_cover : Cover or None
@@ -94,7 +97,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResponseUncertainty(Uncertainty):
-    """Weights that bound how measured frequency responses differ from a nominal one, at the frequencies given and nowhere else.
+    """Weights that bound how measured responses differ from a nominal one, at the frequencies given and nowhere else.
 
     Parameters
     ----------
@@ -105,8 +108,8 @@ class ResponseUncertainty(Uncertainty):
     certificate : str
         Where the bound holds.
     unresolved_hz : ndarray, shape (n,), Hz
-        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not resolve, and
-        that may be higher beside it. All other fields are those of `Uncertainty`.
+        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the
+        grid does not resolve, and that may be higher beside it. All other fields are those of `Uncertainty`.
 
     Examples
     --------
@@ -220,7 +223,7 @@ class UncertainModel(Uncertainty):
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
-    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them, so that all matrices have entries of common sizes."""
+    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them."""
     rows = 1.0 / output_scale[:, None]
     if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):
         A, B = system.A * output_scale * rows, system.B * rows * input_scale

@@ -1,7 +1,8 @@
 """The verb: from models of every unit to how the units differ.
 
 models --scored against one another--> outliers, which may be dropped
-models of the others --smallest peak residual--> nominal --residuals, covered by weights--> one uncertain set a kind of model
+models of the others --smallest peak residual--> nominal --residuals, covered by weights--> one uncertain set a kind of
+model
 """
 
 from __future__ import annotations
@@ -81,7 +82,8 @@ class UncertainModels:
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
-        return f"<UncertainModels: {', '.join(self.sets)} around unit {self.nominal}, {flagged} of {len(self.scores)} outlier scores flagged>"
+        kinds, scores = ", ".join(self.sets), f"{flagged} of {len(self.scores)} outlier scores flagged"
+        return f"<UncertainModels: {kinds} around unit {self.nominal}, {scores}>"
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""
@@ -160,7 +162,8 @@ def quantify(
 
     Parameters
     ----------
-    models : IdentifiedModels, ModelSet, StateSpace, sequence or mapping of systems, array_like or sequence of response data
+    models : IdentifiedModels, ModelSet, StateSpace, sequence or mapping of systems, array_like or sequence of response
+    data
         Of `kros.identify`; or a batch, list or mapping by name of stable systems with `A, B, C, D, dt`, discrete or
         continuous (``dt = 0``), with as many states as they like; or frequency responses, complex, of shape (unit,
         frequency, p, m), or objects with `frdata, omega, dt` as python-control has them.
@@ -211,7 +214,7 @@ def quantify(
     """
     if isinstance(models, IdentifiedModels):
         given = {} if freqs_hz is None else {"freqs_hz": freqs_hz}
-        settings = UncertaintySettings.of({"form": Form(form).value} | given | options, "Quantify")
+        settings = UncertaintySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
         return _quantify_population(models, settings, work)
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
@@ -252,7 +255,7 @@ def _quantify_population(models: IdentifiedModels, settings: UncertaintySettings
 
 
 def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySettings) -> str:
-    """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
+    """Return the nominal unit, by default the best of the first kind of models, shared by all as in the paper."""
     if settings.nominal is None or (settings.nominal == _BEST and _BEST not in units):
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
         return units[choose_nominal(responses, settings.form).index]

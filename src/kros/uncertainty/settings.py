@@ -1,4 +1,4 @@
-"""Settings of quantification: form, nominal and outlier scores (of a study, too), and how weights are fitted and checked."""
+"""Settings of quantification: form, nominal, order and outliers; and how weights are fitted and checked."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 r"""Exact search for the best nominal among many candidates (`identify.refine.minimax`).
 
-Plants are tall here: wide ones are transposed, with the dual form; as `E_ia(G^T, Gp^T) = -E_ia(Gp, G)^T`, the inverse additive form then has nominal
-and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigma(D G^+) = sigma(D L)`.
+Plants are tall here: wide ones are transposed, with the dual form; as `E_ia(G^T, Gp^T) = -E_ia(Gp, G)^T`, the inverse
+additive form then has nominal and perturbed plant exchanged. With `G^+ = L Q^H`, L small and triangular, `sigma(D G^+)
+= sigma(D L)`.
 """
 
 from __future__ import annotations
@@ -87,7 +88,7 @@ class Geometry:
 
 
 def search(geometry: Geometry, units: Plants) -> tuple[int, Array, Array, Array]:
-    """Return the unit whose bound has the lowest peak: its row, its bound, peaks (or lower bounds) of all, and which are exact."""
+    """Return the unit of the lowest peak, its bound, peaks or lower bounds of all, and which are exact."""
     count, n_freqs = units.G.shape[2:]
 
     def against(rows: Array, witness: Array) -> Array:

@@ -69,7 +69,7 @@ def certify(
     right: StateSpace,
     systems: ResidualSystems | None = None,
 ) -> Certificate:
-    """Return the largest ratio (unit, n) from DC to Nyquist, known on a dense grid, Hz, by level sets where systems are known."""
+    """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
     pencils = [] if systems is None or peak <= 0 else systems.ratios(left, right)
     if not pencils or not _trusted(pencils, freqs_hz, known, left.dt):

@@ -1,18 +1,19 @@
 r"""Optimal cover of a set of residuals, frequency by frequency: diagonal magnitudes left and right.
 
-A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R = exp(x_r)` and
-`s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
+A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R =
+exp(x_r)` and `s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
 
     mean(log W_L) + mean(log W_R) = mean(x_l) + mean(x_r) + log s(x_l, x_r)
 
-is convex in x (three-lines theorem) and the same for all ways to share a common factor between left and right. The maximum over units and
-singular values is smoothed by a Schatten norm of order 2 q,
+is convex in x (three-lines theorem) and the same for all ways to share a common factor between left and right. The
+maximum over units and singular values is smoothed by a Schatten norm of order 2 q,
 
     log s  ~  1 / (2 q) log sum_k tr (M_k M_k^H)^q,     M_k = exp(-x_l) E_k exp(-x_r)
 
-whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at once with q rising to
-65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the optimum finite where residuals are triangular,
-and picks the smooth one where it is not unique; a stronger pull gives covers that are easier to fit (`weights`).
+whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at
+once with q rising to 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the
+optimum finite where residuals are triangular, and picks the smooth one where it is not unique; a stronger pull gives
+covers that are easier to fit (`weights`).
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ class Cover:
         return Cover(self.left[rows], self.right[rows])
 
     def entries(self) -> Array:
-        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m'); independent of the gauge."""
+        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m')."""
         return self.left[:, :, None] * self.right[:, None, :]
 
     def cost_db(self) -> Array:
@@ -86,7 +87,7 @@ def as_structure(structure: Structure | str) -> Structure:
 
 
 def optimal_cover(E: Array, pull: float = _PULL) -> Cover:
-    """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes; a larger pull makes it smoother."""
+    """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
     first = entries_first(E)
     p = first.shape[0]
     x = _descend(first, sigma_max_first(first).max(axis=0), p, pull)
@@ -96,7 +97,7 @@ def optimal_cover(E: Array, pull: float = _PULL) -> Cover:
 
 
 def cover_ratio(E: Array, left: Array, right: Array) -> Array:
-    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes (frequency, p') and (frequency, m')."""
+    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes of the frequencies."""
     first = entries_first(E)
     l_inv, r_inv = (1 / np.maximum(v, _TINY) for v in (left.T, right.T))
     return sigma_max_first(first * l_inv[:, None, None, :] * r_inv[None, :, None, :])

@@ -1,10 +1,10 @@
-r"""Weights from residuals: a fit on few frequencies and units, a check on many, a proof on all, and the lift at the end.
+r"""Weights from residuals: a fit on few frequencies and units, a check on many, a proof on all.
 
 Magnitudes of one entry are fitted by linear programs (`magnitude`), those of diagonal weights jointly (`joint`); the
-paper's entrywise weights are one magnitude for every entry. A fit is checked on a grid ten times denser, with DC, Nyquist
-and the modes of units and weights; frequencies and units that it misses join it. What counts is the proof for the
-systems as returned (`certificate`): units and frequencies beyond them join once more, and at last the left weight is
-scaled until it touches.
+paper's entrywise weights are one magnitude for every entry. A fit is checked on a grid ten times denser, with DC,
+Nyquist and the modes of units and weights; frequencies and units that it misses join it. What counts is the proof for
+the systems as returned (`certificate`): units and frequencies beyond them join once more, and at last the left weight
+is scaled until it touches.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[W
 
 
 def fit_entries(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[EntrywiseWeight, Cover]:
-    """Return one magnitude for every entry, as the paper has it; the cover is ones, and the largest entries row by row."""
+    """Return one magnitude for every entry, as the paper has it."""
     E = residuals.at(freqs_hz)
     p, m = E.shape[2:]
     dt = target.sample_period_s
@@ -210,7 +210,7 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Proof:
-    """The certificate with the largest bound over blocks of units, the largest ratio on their grids, and units beyond one."""
+    """The certificate with the largest bound over blocks of units, the largest ratio on their grids."""
 
     certificate: Certificate
     on_grid: float
@@ -266,7 +266,7 @@ def _lifted(weight: Weight, proof: _Proof) -> Weight:
 
 
 def _marked(freqs_hz: Array, size: Array, count: int) -> Array:
-    """Return the indices of both ends, the highest peaks, and points as dense as a size bends, half of them evenly spaced."""
+    """Return the indices of both ends, the highest peaks, and points as dense as a size bends."""
     inner = np.flatnonzero((size > 0) & (freqs_hz > 0))
     ends = [0, len(freqs_hz) - 1]
     if len(inner) < count:

@@ -81,7 +81,7 @@ class JointFit:
 
 
 def fit_jointly(problem: JointProblem, max_order: int, tolerance_db: float, settings: FitSettings) -> JointFit:
-    """Return diagonal magnitudes, left ones first, within the tolerance at lower orders, or the best up to the largest order."""
+    """Return diagonal magnitudes, left ones first, within the tolerance at lower orders."""
     search = _Search(problem, settings)
     fitted = search.descended(_start(problem, max_order, settings), tolerance_db)
     fitted = search.exchanged(fitted, tolerance_db)
@@ -130,7 +130,7 @@ class _Search:
         return state.fitted()
 
     def exchanged(self, fitted: JointFit, tolerance_db: float) -> JointFit:
-        """Add poles and zeros where the fit gains most, take the weakest out, as long as that brings the excess down."""
+        """Add poles and zeros where the fit gains most, take the weakest out."""
         for _ in range(self.settings.exchanges):
             if fitted.excess_db <= tolerance_db:
                 break
@@ -153,7 +153,7 @@ class _Search:
         return fitted
 
     def _grown(self, start: Sections) -> Sections:
-        """Return the same magnitudes with a pair of poles and zeros more in every entry, where moving them apart gains most."""
+        """Return the same magnitudes with a pair of poles and zeros more in every entry."""
         entries, count = np.flatnonzero(start.orders > 0), self.settings.corners
         corners, width = np.linspace(*self.problem.ends, count), np.log(2.0)
         probe = Sections.spread([corners[[i]] for i in range(count)], [2] * count, width)

@@ -83,7 +83,8 @@ def fit_magnitude(
         Non-negative. Values below 1e-8 of the largest count as that; all zero gives the zero system.
     sample_period_s : float, s
     order : int, optional
-        Best fit of at most this order; by default the smallest order within the tolerance, or the best up to `max_order`.
+        Best fit of at most this order; by default the smallest order within the tolerance, or the best up to
+        `max_order`.
     max_order : int
     tolerance_db : float, dB
         Distance at which a lower order is good enough.
@@ -191,7 +192,7 @@ def _factored(rational: RationalMagnitude, freqs: Array, values: Array, dt: floa
 
 
 def _best_bound(tau: Array, targets: Array, order: int, lower: _Bound | None) -> _Bound | None:
-    """Return the best n / d of one order above the targets, positive on the whole axis; `lower` is the best of lower orders."""
+    """Return the best n / d of one order above the targets, positive on the whole axis."""
     if order == 0:
         rational = RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0))
         return _Bound(rational, float(targets.max() / targets.min()))

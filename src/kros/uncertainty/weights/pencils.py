@@ -1,8 +1,8 @@
-r"""Descriptor systems of what is bounded: residuals of all forms, what the forms leave out, and their ratios to weights.
+r"""Descriptor systems of residuals, of what forms leave out, and of their ratios to weights.
 
 `s F x = A x + B u, y = C x + D u` with `s = (z - 1) / (z + 1)`. Sums, products and inverses of descriptors are
-descriptors, and so is a pseudo-inverse, with P~ the adjoint system: for a tall P, `x = P^+ d` is `P~ (d - P x) = 0`, and
-for a wide one `x = P~ y`, `P x = d`. The formulas of `forms` are written with them.
+descriptors, and so is a pseudo-inverse, with P~ the adjoint system: for a tall P, `x = P^+ d` is `P~ (d - P x) = 0`,
+and for a wide one `x = P~ y`, `P x = d`. The formulas of `forms` are written with them.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ class Descriptor:
 
 
 def _eigenvalues(left: Array, right: Array) -> Array:
-    """Return the finite eigenvalues of a pencil whose rows and columns are brought to sizes near one, by powers of two."""
+    """Return the finite eigenvalues of a pencil whose rows and columns are brought to sizes near one."""
     from scipy.linalg import eigvals
 
     if not len(left):
@@ -164,7 +164,7 @@ class ResidualSystems:
             yield system if self.entry is None else system.entry(*self.entry)
 
     def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
-        """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large, or the form leaves nothing but rounding."""
+        """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""
         if self.remainder and leaves_nothing(self.form, self.nominal.n_outputs, self.nominal.n_inputs):
             return []
         before, after = (Descriptor.of(invert(w)) for w in (right, left))
@@ -172,7 +172,7 @@ class ResidualSystems:
         return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= _LARGEST else []
 
     def modes_hz(self, grid_hz: Array) -> Array:
-        """Return frequencies in and around every mode of residuals and plants that a grid from DC to Nyquist passes over."""
+        """Return frequencies in and around every mode of residuals and plants."""
         dt = self.nominal.dt
         plants = [
             Descriptor.of(self.nominal),

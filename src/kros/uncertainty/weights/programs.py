@@ -2,8 +2,10 @@ r"""The linear programs behind `magnitude`: iterations towards the best rational
 
 Two iterations, both in the coefficients a and b of n and d, with `e` the denominator of the step before:
 
-    start (Sanathanan-Koerner):  minimise t  s.t.  |n_i / f_i - d_i| <= t e_i,                            mean(d / e) = 1
-    improve (Dinkelbach):        minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i,   mean(d / e) = 1
+    start (Sanathanan-Koerner):  minimise t  s.t.  |n_i / f_i - d_i| <= t e_i
+    improve (Dinkelbach):        minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i
+
+and mean(d / e) = 1.
 
 The first needs no guess of the ratio gamma and is exact at once for data of that order; the second converges
 superlinearly to the global optimum from any bound. Rows are relative to the denominator, columns to their largest
@@ -95,7 +97,7 @@ class Grid:
         return denominator, best, gamma
 
     def _lifted(self, solution: tuple[Array, Array] | None) -> tuple[RationalMagnitude | None, float]:
-        """Return the bound with its numerator lifted onto the targets and its ratio; none where n or d is not positive."""
+        """Return the bound, lifted onto the targets, and its ratio; None where n or d is not positive."""
         if solution is None:
             return None, np.inf
         a, b = solution
@@ -106,7 +108,7 @@ class Grid:
         return RationalMagnitude(a / ratio.min(), b, self.knots), float(ratio.max() / ratio.min())
 
     def _solved(self, scale: Array, gamma: float | None = None) -> tuple[Array, Array] | None:
-        """Minimise t over (a, b, t) under the rows of the first iteration, or of the second from a ratio, and the edges."""
+        """Minimise t over (a, b, t) under the rows of the first iteration, or of the second from a ratio."""
         d = self.phi / scale[:, None]
         n = d / self.targets[:, None]
         edge, size = self.edge / scale[self.nearest, None], self.phi.shape[1]
@@ -130,7 +132,7 @@ class Grid:
 
 
 def minimised(A: Array, g: Array, active: Array | None = None) -> tuple[Array, Array] | None:
-    """Return x and its active rows: minimise the last of x under `A x <= 0`, `g x = 1`; None where that has no solution."""
+    """Return x and its active rows: minimise the last of x under `A x <= 0`, `g x = 1`."""
     n = len(g)
     bounds = np.delete(-np.eye(n), int(np.abs(g[:-1]).argmax()), axis=0)
     begin = np.vstack([bounds, g]), np.append(np.full(n - 1, _FAR), 1.0), np.full(n - 1, -1)
@@ -157,7 +159,7 @@ def _near(A: Array, g: Array, active: Array) -> tuple[Array, Array, Array]:
 
 
 def _stepped(A: Array, M: Array, right: Array, names: Array) -> tuple[Array, Array] | None:
-    """Step from the vertex `M x = right`, whose multipliers are positive, until no row is exceeded; -1 names no row of A."""
+    """Step from the vertex `M x = right`, whose multipliers are positive, until no row is exceeded."""
     for _ in range(50 * len(M)):
         inverse = np.linalg.inv(M)
         x = inverse @ right

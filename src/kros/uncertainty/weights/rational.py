@@ -80,7 +80,7 @@ def basis(tau: Array, knots: Array) -> Array:
 
 
 def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
-    """Return the roots in tau of `sum a_k phi_k`, whose first and last coefficients are not zero, or raise a `KrosError`."""
+    """Return the roots in tau of `sum a_k phi_k`, whose first and last coefficients are not zero."""
     import mpmath
 
     order = len(knots)

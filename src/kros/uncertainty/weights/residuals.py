@@ -79,7 +79,7 @@ class Residuals:
         return replace(self.realised, entry=None, remainder=False).modes_hz(grid_hz)
 
     def deciding(self, freqs_hz: Array, block: int) -> Array:
-        """Return the units that are the largest at some frequency, by singular value or by an entry: they decide a cover."""
+        """Return the units that are the largest at some frequency, by singular value or by an entry."""
         best: tuple[Array, Array] | None = None
         for rows in self.blocks(block):
             E = self.of(rows).at(freqs_hz)

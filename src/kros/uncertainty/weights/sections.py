@@ -1,9 +1,10 @@
-r"""Magnitudes as products of sections of first and second order: every parameter stands for a stable, minimum-phase system.
+r"""Magnitudes as products of sections of first and second order, stable and minimum phase.
 
 With `w = (z - 1) / (z + 1)` and `tau = -w^2` on the unit circle, a pair of zeros or poles is `w^2 + b w + c` with
 b, c > 0, real or complex, and a single one is `w + a`:
 
-    |w^2 + b w + c|^2 / c^2 = (1 + u)^2 (1 + (e^y - 4) v),   u = tau / c,  v = u / (1 + u)^2,  x = log c,  y = log(b^2 / c)
+    |w^2 + b w + c|^2 / c^2 = (1 + u)^2 (1 + (e^y - 4) v),   u = tau / c,  v = u / (1 + u)^2,
+                                                               x = log c,  y = log(b^2 / c)
     |w + a|^2 / a^2         = 1 + u,                         u = tau / a^2,  x = log a^2
 
 Sums of logarithms keep their precision over any number of decades. The systems are cascades of sections in
@@ -42,7 +43,7 @@ class Sections:
 
     @classmethod
     def spread(cls, corners: Sequence[Array], orders: Sequence[int], width: float) -> Sections:
-        """Return magnitudes of one: a pole and a zero section on each other at every corner, the last of an odd order single."""
+        """Return magnitudes of one: a pole on a zero section at every corner, the last single for odd orders."""
         rows = [
             (entry, sign, 2 * (i + 1) <= order, x)
             for entry, (values, order) in enumerate(zip(corners, orders, strict=True))
@@ -168,7 +169,7 @@ class Sections:
         return system
 
     def _roots(self, entry: int, sign: float) -> list[list[complex]]:
-        """Return the roots in w of every section, pairs first; the smaller real one of a pair follows from the product."""
+        """Return the roots in w of every section, pairs first."""
         rows = np.flatnonzero((self.entry == entry) & (self.sign == sign))
         roots: list[list[complex]] = []
         for k in rows[np.lexsort((self.corner[rows], ~self.pair[rows]))]:
@@ -200,7 +201,7 @@ class Dipole:
 
 
 def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:
-    """Return sections (pair, x, y) of roots: complex pairs, real ones with their neighbours, the middle one of an odd number."""
+    """Return sections (pair, x, y) of roots: complex pairs, real ones with their neighbours."""
     real = sorted(-r.real for r in roots if abs(r.imag) <= _REAL * abs(r))
     upper = [r for r in roots if r.imag > _REAL * abs(r)]
     rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in upper]

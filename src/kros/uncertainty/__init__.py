@@ -16,7 +16,7 @@ from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
 from .forms import Form, bounds, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal.choice import NominalChoice, choose_nominal
+from .nominal import NominalChoice, choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify

@@ -22,7 +22,7 @@ from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
 from .inputs import check_candidate, check_ids, check_response, check_scale, find_nominal, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
-from .nominal.choice import choose_nominals
+from .nominal import choose_nominals
 from .settings import FitSettings
 from .weights.bilinear import BilinearAxis, beyond, continuous_grid
 from .weights.cover import Structure, as_structure

@@ -117,7 +117,7 @@ class ResponseUncertainty(Uncertainty):
     >>> from kros.uncertainty import quantify
     >>> freqs_hz = np.geomspace(0.1, 40, 30)
     >>> lags = np.array([0.9, 1.0, 1.2])[:, None] / (1 + 1j * freqs_hz / 5)
-    >>> found = quantify(lags[:, :, None, None], freqs_hz, "additive", sample_period_s=0.01)
+    >>> found = quantify(lags[:, :, None, None], "additive", freqs_hz, sample_period_s=0.01)
     >>> found.nominal_id, found.cover_max <= 1
     ('1', True)
     """

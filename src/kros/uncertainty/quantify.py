@@ -28,7 +28,7 @@ from .bounded import Options, bound_responses, bound_systems
 from .forms import Form, as_form, residual
 from .inputs import read_response_data
 from .model import ResponseUncertainty, UncertainModel
-from .nominal.choice import choose_nominal
+from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import UncertaintySettings

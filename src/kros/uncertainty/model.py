@@ -42,16 +42,14 @@ class Uncertainty:
     output_scale : ndarray, shape (p,)
     input_scale : ndarray, shape (m,)
     bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal
-        used).
+        Largest residual over the other units for the best nominal of each form, and for the nominal of `form`.
     nominals : dict of Form to str
         Unit behind each of these bounds.
     cover : Cover
         Optimal cover of the residuals, frequency by frequency.
     weight : Weight
     misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above
-        1e12).
+        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular.
     remainder : Weight or None
         Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
     remainder_cover : Cover or None
@@ -162,20 +160,10 @@ class UncertainModel(Uncertainty):
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
-        arrays: dict[str, Array] = {
-            "freqs_hz": self.freqs_hz,
-            "output_scale": self.output_scale,
-            "input_scale": self.input_scale,
-            "misfit": self.misfit,
-            **{f"bound_{form.value}": bound for form, bound in self.bounds.items()},
-            **_pack_system("nominal", self.nominal_system),
-            **_pack_weight("weight", self.weight, self.cover),
-        }
-        content: dict[str, Any] = {
-            "form": self.form,
-            "unit_ids": self.unit_ids,
-            "nominal": self.nominal,
-            "nominal_id": self.nominal_id,
+        arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
+        arrays |= _pack_system("nominal", self.nominal_system) | _pack_weight("weight", self.weight, self.cover)
+        content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
             "peak_db": {form.value: peak for form, peak in self.peak_db.items()},
@@ -196,30 +184,28 @@ class UncertainModel(Uncertainty):
         content, arrays = load_artifact(Path(folder), "uncertain_model")
         axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {}, Path(folder))
-        dt = content["sample_period_s"]
+        dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
         weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
-        remainder, remainder_cover = (
-            _unpack_weight("remainder", content["remainder"], arrays, dt)
-            if content["remainder"] is not None
-            else (None, None)
-        )
+        remainder: tuple[Weight | None, Cover | None] = (None, None)
+        if content["remainder"] is not None:
+            remainder = _unpack_weight("remainder", content["remainder"], arrays, dt)
+        facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
+        facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
         return cls(
-            form=Form(content["form"]),
-            unit_ids=tuple(content["unit_ids"]),
-            nominal=content["nominal"],
-            nominal_id=content["nominal_id"],
             nominal_system=_unpack_system("nominal", arrays, dt),
-            freqs_hz=arrays["freqs_hz"],
-            output_scale=arrays["output_scale"],
-            input_scale=arrays["input_scale"],
-            bounds={Form(name): arrays[f"bound_{name}"] for name in content["nominals"]},
-            nominals={Form(name): unit for name, unit in content["nominals"].items()},
+            bounds={form: arrays[f"bound_{form.value}"] for form in nominals},
+            nominals=nominals,
             cover=cover,
             weight=weight,
-            misfit=arrays["misfit"],
-            remainder=remainder,
-            remainder_cover=remainder_cover,
+            remainder=remainder[0],
+            remainder_cover=remainder[1],
+            **facts,
         )
+
+
+_ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
+_FACTS = ("form", "unit_ids", "nominal", "nominal_id")
+_OF_WEIGHT = ("structure", "cover_max", "overbound_db_max", "within_tolerance", "method", "remaining_margin")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
@@ -232,16 +218,9 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
 
 
 def _facts(weight: Weight) -> dict[str, Any]:
-    own = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
-    same = (
-        "structure",
-        "cover_max",
-        "overbound_db_max",
-        "within_tolerance",
-        "method",
-        "remaining_margin",
-    )
-    return own | {"orders": [weight.left_orders, weight.right_orders]} | {name: getattr(weight, name) for name in same}
+    excess = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
+    orders = {"orders": [weight.left_orders, weight.right_orders]}
+    return excess | orders | {name: getattr(weight, name) for name in _OF_WEIGHT}
 
 
 def _number(value: float | None) -> float:
@@ -263,17 +242,14 @@ def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
-    fields: dict[str, Any] = {
+    fields: dict[str, Any] = {key: facts[key] for key in _OF_WEIGHT} | {
         "left": _unpack_system(f"{name}_left", arrays, dt),
         "right": _unpack_system(f"{name}_right", arrays, dt),
         "left_orders": tuple(facts["orders"][0]),
         "right_orders": tuple(facts["orders"][1]),
         "structure": as_structure(facts["structure"]),
-        "cover_max": facts["cover_max"],
-        "overbound_db_max": facts["overbound_db_max"],
-        "within_tolerance": facts["within_tolerance"],
-        "method": Method(facts.get("method", Method.GRID)),
-        "remaining_margin": _number(facts.get("remaining_margin")),
+        "method": Method(facts["method"]),
+        "remaining_margin": _number(facts["remaining_margin"]),
     }
     cover = Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
     if fields["structure"] is Structure.ENTRYWISE:

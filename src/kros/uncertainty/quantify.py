@@ -36,6 +36,7 @@ from .settings import UncertaintySettings
 Array = npt.NDArray[Any]
 
 _KIND, _BEST = "choice", "unit"
+_FACTS = ("nominal", "worst_off_nominal", "dropped", "max_order", "pooled")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -97,16 +98,9 @@ class UncertainModels:
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content: dict[str, Any] = {
-            "nominal": self.nominal,
-            "worst_off_nominal": self.worst_off_nominal,
-            "dropped": self.dropped,
-        }
-        content |= {
+        content = {name: getattr(self, name) for name in _FACTS} | {
             "kinds": list(self.sets),
             "outliers": list(self.outliers),
-            "max_order": self.max_order,
-            "pooled": self.pooled,
         }
         save_artifact(folder / "uncertainty", _KIND, content)
 
@@ -122,19 +116,9 @@ class UncertainModels:
         content, _ = load_artifact(folder / "uncertainty", _KIND)
         sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
         outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
+        facts = {name: content[name] for name in _FACTS} | {"dropped": tuple(content["dropped"])}
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
-        dropped, order = tuple(content["dropped"]), content["max_order"]
-        return cls(
-            models,
-            content["nominal"],
-            content["worst_off_nominal"],
-            dropped,
-            sets,
-            scores,
-            outliers,
-            order,
-            content.get("pooled", True),
-        )
+        return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
 
 
 @overload

@@ -26,7 +26,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -335,7 +335,7 @@ def _population(
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Checked responses, names and frequencies."""
     # type: ignore[union-attr]
-    listed = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in responses]
+    listed: Any = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in cast(Any, responses)]
     ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
     freqs = np.asarray(freqs_hz, float)
     for name, one in zip(ids, listed, strict=False):

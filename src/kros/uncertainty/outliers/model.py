@@ -334,7 +334,6 @@ def _population(
     responses: npt.ArrayLike | Sequence[npt.ArrayLike], unit_ids: tuple[str, ...] | None, freqs_hz: npt.ArrayLike
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Checked responses, names and frequencies."""
-    # type: ignore[union-attr]
     listed: Any = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in cast(Any, responses)]
     ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
     freqs = np.asarray(freqs_hz, float)

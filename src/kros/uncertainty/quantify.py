@@ -146,8 +146,7 @@ def quantify(
 
     Parameters
     ----------
-    models : IdentifiedModels, ModelSet, StateSpace, sequence or mapping of systems, array_like or sequence of response
-    data
+    models : IdentifiedModels, ModelSet, systems or responses
         Of `kros.identify`; or a batch, list or mapping by name of stable systems with `A, B, C, D, dt`, discrete or
         continuous (``dt = 0``), with as many states as they like; or frequency responses, complex, of shape (unit,
         frequency, p, m), or objects with `frdata, omega, dt` as python-control has them.

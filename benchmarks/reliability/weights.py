@@ -226,7 +226,7 @@ def loose_db(weight: Any, E: Array, freqs_hz: Array) -> float | None:
     """Overbound over the optimal cover where that is known in closed form: one entry, scalar and entrywise weights."""
     if weight.structure.value == "entrywise":
         sizes, allowed = np.abs(E).max(axis=0), np.abs(response(weight.matrix(), freqs_hz))
-    elif weight.structure.value == "scalar" or E.shape[2:] == (1, 1):
+    elif E.shape[2:] == (1, 1):
         sizes = np.linalg.norm(E, 2, axis=(-2, -1)).max(axis=0)
         left, right = response(weight.left, freqs_hz), response(weight.right, freqs_hz)
         allowed = np.abs(left[:, 0, 0] * right[:, 0, 0])

@@ -186,10 +186,11 @@ def read_response_data(
                 f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
                 f"{first.frdata.shape} and {first.dt}; bring them to one."
             )
-    if first.dt is True or freqs_hz is not None:
-        raise ConfigError(
-            f"Quantify: response data bring their own frequencies and sampling period in seconds, found freqs_hz = "
-            f"{freqs_hz!r} and dt = {first.dt}."
+    if freqs_hz is not None:
+        raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
+    if first.dt is True:
+        raise DimensionError(
+            "Quantify: the sampling period of the responses is not known (dt = True); give it in seconds."
         )
     options["sample_period_s"] = float(first.dt or 0.0)
     if beside:

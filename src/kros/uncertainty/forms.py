@@ -66,38 +66,10 @@ class Form(str, Enum):
         """Whether the perturbed plant is rebuilt by an inverse."""
         return self in (Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
-    @property
-    def dual(self) -> Form:
-        """The form of the transposed plants: input and output sides change places."""
-        return _DUAL[self]
-
-
-_DUAL = {
-    Form.ADDITIVE: Form.ADDITIVE,
-    Form.INPUT_MULTIPLICATIVE: Form.OUTPUT_MULTIPLICATIVE,
-    Form.OUTPUT_MULTIPLICATIVE: Form.INPUT_MULTIPLICATIVE,
-    Form.INVERSE_ADDITIVE: Form.INVERSE_ADDITIVE,
-    Form.INVERSE_INPUT_MULTIPLICATIVE: Form.INVERSE_OUTPUT_MULTIPLICATIVE,
-    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Form.INVERSE_INPUT_MULTIPLICATIVE,
-}
-
 
 def as_form(form: Form | str) -> Form:
     """Return the form of a name, or raise a `ConfigError`."""
     return member(Form, form, "Uncertainty form")
-
-
-def residual_shape(form: Form | str, n_outputs: int, n_inputs: int) -> tuple[int, int]:
-    """Return the rows and columns of a form's residual for a plant with `n_outputs` and `n_inputs`."""
-    p, m = n_outputs, n_inputs
-    return {
-        Form.ADDITIVE: (p, m),
-        Form.INPUT_MULTIPLICATIVE: (m, m),
-        Form.OUTPUT_MULTIPLICATIVE: (p, p),
-        Form.INVERSE_ADDITIVE: (m, p),
-        Form.INVERSE_INPUT_MULTIPLICATIVE: (m, m),
-        Form.INVERSE_OUTPUT_MULTIPLICATIVE: (p, p),
-    }[as_form(form)]
 
 
 def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, paper: bool = False) -> Array:
@@ -114,7 +86,8 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     Returns
     -------
     ndarray, shape (..., p', m')
-        See `residual_shape`.
+        Outputs by inputs for the additive form, inputs by outputs for the inverse additive one; inputs by inputs on the
+        input side, outputs by outputs on the output side.
 
     Examples
     --------

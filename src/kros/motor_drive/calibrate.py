@@ -1,4 +1,4 @@
-r"""How a known load shows in what an observer sees, collected from recordings of a few units.
+r"""The observer that learns from a known load, in recordings of a few units, how loads show in what it sees.
 
 The load is one more hidden state, the last: zero in recordings without load, known in the others. Both kinds count
 alike, however many there are. What is regressed is the part that can be seen (`without_level`), of the load and, since
@@ -22,13 +22,17 @@ from ..core.errors import DataError, DimensionError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..lifting import Lifting
-from ..observer.predictor.moments import PastMoments
+from ..observer.observer import Observer
+from ..observer.predictor.build import embedded
+from ..observer.predictor.moments import PastMoments, hidden_of
+from ..observer.predictor.tuning import tune_predictor
 from ..synthesis.residual_shaped.shaping_filter import Basis
 from .signals import low_passed, without_level
 
 Array = npt.NDArray[np.float64]
 LOAD = "load"
 _LOADED, _UNLOADED, _DELAYS = "loaded", "unloaded", 20
+_OTHERS = 0.1  # weight of the recorded states' errors beside the load's
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,3 +151,59 @@ def calibrate_load(
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened)
     past = PastMoments.of(with_load, tuple(measured), seen_batch, Basis(_DELAYS, (float(np.exp(-dt / level_s)),)))
     return LoadCalibration(past, seen_batch, level_s, tuple(used.tolist()), tuple(np.flatnonzero(at_limit).tolist()))
+
+
+def load_observer(
+    name: str,
+    calibration: LoadCalibration,
+    inputs: Sequence[str],
+    internal: int = 8,
+    deviation: float = 0.15,
+    samples: int = 6000,
+    iterations: int = 10,
+) -> Observer:
+    """Return an observer with the recorded states, ``load`` and ``memory_1, ...``, without current or load as inputs.
+
+    Parameters
+    ----------
+    name : str
+    calibration : LoadCalibration
+    inputs : sequence of str
+    internal : int
+        States besides the recorded ones and the load.
+    deviation : float
+        Share by which the lifted functions' effect may differ from machine to machine.
+    samples : int
+        The first so many of every recording are tuned on.
+    iterations : int
+        Most steps of tuning; none leaves the observer as reduced.
+
+    Returns
+    -------
+    Observer
+        It runs, is saved and certified (`relift_certificate`) as all are. `load`, and under load the current, lack
+        their level (`AngleLoad`).
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.motor_drive import calibrate_load, load_observer
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
+    >>> calibration = calibrate_load(Lifting(motors.states), (0,), batch, load)
+    >>> load_observer("motor/load", calibration, motors.inputs, internal=2, iterations=0).lifting.states
+    ('position', 'velocity', 'current', 'load', 'memory_1', 'memory_2')
+    """
+    past = calibration.past
+    hidden = len(hidden_of(past.lifting, past.measured))
+    importance = np.append(np.full(hidden - 1, _OTHERS), 1.0)
+    model, batch = (
+        past.model(hidden + internal, importance=importance, deviation=deviation),
+        calibration.batch.head(samples),
+    )
+    if iterations:
+        model, _ = tune_predictor(model, past, batch, importance, deviation, iterations=iterations)
+    return embedded(name, past, model, inputs, batch)

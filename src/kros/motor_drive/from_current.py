@@ -99,3 +99,42 @@ def load_from_current(measured: npt.ArrayLike, estimated: npt.ArrayLike, scale: 
     """
     error = np.asarray(measured, dtype=float) - np.asarray(estimated, dtype=float)
     return scale.torque_constant * (error - scale.bias)
+
+
+@dataclass(frozen=True)
+class LoadAccuracy:
+    """Errors of a load estimate, low-passed, in units of the load."""
+
+    floor_rms: float  # Of the estimate on episodes without load
+    error_rms: float  # Under load
+    load_rms: float  # Of the load itself
+
+    @property
+    def ratio(self) -> float:
+        """Error under load to the floor."""
+        return self.error_rms / self.floor_rms
+
+    @property
+    def percent(self) -> float:
+        """Error under load in percent of the load."""
+        return 100 * self.error_rms / self.load_rms
+
+
+def load_accuracy(
+    estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
+) -> LoadAccuracy:
+    """Judge estimates of the load, shape (n_samples, batch), against known ones."""
+    truth = np.asarray(load, dtype=float)
+    loaded = np.any(truth != 0, axis=0)
+    if loaded.all() or not loaded.any():
+        raise DataError(
+            f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} "
+            f"with load."
+        )
+    slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
+    error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values**2)))
+
+    return LoadAccuracy(rms(error[:, ~loaded]), rms(error[:, loaded]), rms(slow[:, loaded]))

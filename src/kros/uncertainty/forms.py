@@ -1,15 +1,15 @@
 r"""The six uncertainty forms of section II-A.4: residual from two plants, perturbed plant from a residual.
 
-======================  =====================================  =========================  =================================
+======================  =====================================  =========================  =============================
 form                    perturbed plant                        residual                   exact when
-======================  =====================================  =========================  =================================
+======================  =====================================  =========================  =============================
 additive                Gp = G + E                             Gp - G                     always
 input_multiplicative    Gp = G (1 + E)                         G^+ (Gp - G)               range(Gp - G) in range(G)
 output_multiplicative   Gp = (1 + E) G                         (Gp - G) G^+               rows(Gp - G) in rows(G)
-inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows too
+inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows
 inverse_input_...       Gp = G (1 - E)^-1                      Gp^+ (Gp - G)              range(G) in range(Gp)
 inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+              rows(G) in rows(Gp)
-======================  =====================================  =========================  =================================
+======================  =====================================  =========================  =============================
 
 The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, what it
 leaves out is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published

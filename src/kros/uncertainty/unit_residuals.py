@@ -94,7 +94,7 @@ def unit_residuals(
     max_order: int = 4,
     tolerance_db: float = 1.0,
 ) -> UnitResiduals:
-    """Return residuals of units against a nominal, responses (unit, frequency, p, m) scaled, beside weights or a cover."""
+    """Return residuals of units against a nominal, of shape (unit, frequency, p, m), beside weights or a cover."""
     inside = np.array([u not in outside for u in unit_ids], dtype=bool)
     if len(unit_ids) != len(responses) or not inside.any():
         raise DimensionError(

@@ -124,7 +124,7 @@ def check_edges(edges: npt.ArrayLike) -> Array:
 
 
 def cover(energies: Array, weight: Array | None = None) -> Array:
-    """Return no smaller than any energy (k, b, n, n), of least `tr(weight M)`: Jezek et al., Phys. Rev. A 65 (2002) 060301."""
+    """Return what no energy (k, b, n, n) exceeds, of least `tr(weight M)`: Jezek et al., Phys. Rev. A 65 060301."""
     n = energies.shape[-1]
     mean = np.sqrt(np.einsum("kbii->bi", energies).real / len(energies))
     mean[mean <= 0] = 1.0

@@ -22,7 +22,7 @@ class Separation:
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)
-    # (unit,), dB: excess minus the threshold at which the unit went out, or of the last step; minus infinity where nothing
+    # (unit,), dB: excess minus the threshold when the unit went out, or of the last step; minus infinity where nothing
     # can be told
     margin_db: Array
     threshold_db: float  # dB: what the largest excess of the inliers would have to exceed

@@ -123,21 +123,25 @@ def bound_responses(
     residuals = Residuals(form, lambda at_hz: _between(freqs, base[None], at_hz)[0], units_at, np.arange(len(ids)))
     bound = _bound(residuals, freqs, dt or BilinearAxis.over(freqs), options)
     fields = _fields(ids, index, freqs, scales, choices, bound)
-    certificate = (
-        f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
+    certificate, unresolved = _certificate(freqs, fields["bounds"][form])
+    return ResponseUncertainty(
+        nominal_response=chosen, sample_period_s=dt, certificate=certificate, unresolved_hz=unresolved, **fields
     )
-    unresolved = freqs[_unresolved(fields["bounds"][form])]
+
+
+def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
+    """Return where a bound of responses holds, in words, and the frequencies of peaks that are not resolved."""
+    text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
+    unresolved = freqs[_unresolved(bound)]
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
-        certificate += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
+        text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
         _LOG.warning(
             "Weights of responses: the residuals peak within less than a step of the frequencies given, at %s Hz, and "
             "may be larger beside them; measure more densely there.",
             some,
         )
-    return ResponseUncertainty(
-        nominal_response=chosen, sample_period_s=dt, certificate=certificate, unresolved_hz=unresolved, **fields
-    )
+    return text, unresolved
 
 
 def _axis(

@@ -18,7 +18,7 @@ from kros.identify.factors import reduce_episode
 from kros.identify.refine import refine_population
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf
-from kros.uncertainty import bounds, choose_nominal, fit_magnitude, quantify_systems
+from kros.uncertainty import bounds, choose_nominal, fit_magnitude, quantify
 from kros.uncertainty.weights.cover import optimal_cover
 
 FORM = "inverse_input_multiplicative"
@@ -92,12 +92,12 @@ def cover(freqs: int) -> Work:
 def magnitude(freqs: int) -> Work:
     grid = log_grid(DT, freqs)
     values = np.linalg.norm(problems.lags(1)[0].frequency_response(grid), 2, axis=(-2, -1))
-    return lambda: fit_magnitude(grid, values, DT, order=4)
+    return lambda: fit_magnitude(grid, values, DT, max_order=4, tolerance_db=0.0)
 
 
 def uncertain_model(units: int) -> Work:
     systems = problems.lags(units)
-    return lambda: quantify_systems(systems, max_order=3)
+    return lambda: quantify(systems, max_max_order=3, tolerance_db=0.0)
 
 
 CURVES: dict[str, dict[str, tuple[Callable[[int], Work], tuple[int, ...]]]] = {

@@ -30,7 +30,7 @@ from kros.identify.factors import reduce_episode
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf, mixed
 from kros.uncertainty import bounds, choose_nominal, fit_magnitude
-from kros.uncertainty.bilinear import BilinearAxis
+from kros.uncertainty.weights.bilinear import BilinearAxis
 from kros.uncertainty.weights.cover import optimal_cover
 
 pytestmark = pytest.mark.filterwarnings("default")
@@ -105,7 +105,8 @@ def models() -> Stage:
 
         def fit() -> Any:
             pipeline = KoopmanPipeline(
-                [("p", SplitPipeline([("p", PolynomialLiftingFn(order=2))], None))], Edmd(alpha=1.0)
+                [("p", SplitPipeline([("p", PolynomialLiftingFn(max_order=2, tolerance_db=0.0))], None))],
+                Edmd(alpha=1.0),
             )
             return pipeline.fit(np.hstack([x, u]), n_inputs=2, episode_feature=False).regressor_.coef_.T
 
@@ -124,7 +125,7 @@ def predictions() -> Stage:
     def pipeline() -> Any:
         from pykoop import Edmd, KoopmanPipeline, PolynomialLiftingFn, SplitPipeline
 
-        lifting = [("p", SplitPipeline([("p", PolynomialLiftingFn(order=2))], None))]
+        lifting = [("p", SplitPipeline([("p", PolynomialLiftingFn(max_order=2, tolerance_db=0.0))], None))]
         return KoopmanPipeline(lifting, Edmd(alpha=1e5)).fit(np.hstack([x, u]), n_inputs=2, episode_feature=False)
 
     found = edmd(reduce_episode(x, u, QUADRATIC).R, 9, 1e5)
@@ -215,7 +216,9 @@ def magnitudes() -> Stage:
     def ours() -> Any:
         axis = BilinearAxis.over(omega / (2 * np.pi))
         system = axis.continuous(
-            fit_magnitude(axis.discrete_hz(omega / (2 * np.pi)), magnitude, axis.period_s, order=2).system
+            fit_magnitude(
+                axis.discrete_hz(omega / (2 * np.pi)), magnitude, axis.period_s, max_order=2, tolerance_db=0.0
+            ).system
         )
         return np.abs(system.frequency_response(omega / (2 * np.pi))[:, 0, 0])
 

@@ -27,7 +27,7 @@ from kros.identify import ModelSet
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
-from kros.uncertainty import Form, UncertainModel, quantify_systems
+from kros.uncertainty import Form, UncertainModel, quantify
 from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]
@@ -81,7 +81,7 @@ def row(models: ModelSet, form: str, name: str, population: str, options: argpar
         {"max_order": options.max_order, "tolerance_db": options.tolerance_db},
     )
     start = time.process_time()
-    found = quantify_systems(models, form, grid, **limits)
+    found = quantify(models, form, grid, **limits)
     seconds = time.process_time() - start
     ratio = independent_cover_max(found, models.systems())
     weight: Weight = found.weight

@@ -99,7 +99,7 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     from kros.identify.presets import resolve_lifting, resolve_phase
     from kros.identify.settings import CalibrationSettings, LiftingSettings
     from kros.uncertainty.outliers.population import score_population
-    from kros.uncertainty.quantify import choose_unit, quantify_models
+    from kros.uncertainty.quantify import choose_unit, quantify_kind
     from kros.uncertainty.settings import UncertaintySettings
 
     times: Times = {}
@@ -136,7 +136,7 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
         first = models.models()
         nominal = choose_unit(first, list(first.unit_ids), settings)
     with stage("weights"):
-        found = quantify_models(first, list(first.unit_ids), settings, nominal)
+        found = quantify_kind(first, list(first.unit_ids), settings, nominal)
     return {
         "times": times,
         "memory": memory,

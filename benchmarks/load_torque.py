@@ -27,7 +27,7 @@ from kros.identify import PhaseSpec
 from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_from_current, load_observer
-from kros.motor_drive.accuracy import load_accuracy
+from kros.motor_drive.from_current import load_accuracy
 from kros.motor_drive.signals import low_passed, without_level
 from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
 from kros.observer.residual.models import one_step_rows

@@ -35,7 +35,7 @@ from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
 from kros.study.config import load_config, stored_config
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import OutlierModel, UncertainModel, quantify_systems, score_outliers
+from kros.uncertainty import OutlierModel, UncertainModel, quantify, score_outliers
 
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
@@ -453,7 +453,7 @@ def artifact_targets(root: Path) -> list[Target]:
     freqs = np.geomspace(0.1, 49, 60)
     responses = models.systems().frequency_response(freqs)
     score_outliers(responses, freqs, unit_ids=models.unit_ids).save(root / "outliers")
-    quantify_systems(models.systems(), "additive", freqs, max_order=1).save(root / "uncertainty")
+    quantify(models.systems(), "additive", freqs, max_order=1).save(root / "uncertainty")
     gain = StateSpace(np.zeros((1, 1)), np.ones((1, 1)), np.ones((2, 1)), np.ones((2, 1)), 0.01)
     Synthesis("mixed", gain, Status.OPTIMAL, Injection.STATE, 1.0).save(root / "synthesis")
     lifting = Lifting(("position", "velocity"), ("sin(3*position + phase)",), ("phase",))

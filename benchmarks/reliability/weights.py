@@ -1,4 +1,4 @@
-"""Random populations through `quantify_systems`, and their sampled responses through `quantify_responses`.
+"""Random populations through `quantify`, and their sampled responses through `quantify`.
 
 The truth is computed here, from the matrices of the units and the formulas of the forms: responses by linear solves, residuals by
 pseudo-inverses, ratios on a dense grid that looks around every pole of units, nominal and weights, then three times more finely around the
@@ -20,7 +20,7 @@ import numpy as np
 from campaign import LONGEST_S, Tally, main
 
 from kros.core import KrosError, StateSpace
-from kros.uncertainty import Form, quantify_responses, quantify_systems
+from kros.uncertainty import Form, quantify
 
 Array = np.ndarray[Any, Any]
 KINDS = ("generic", "lightly damped", "stiff", "nearly identical", "identical", "static", "delayed")
@@ -226,7 +226,7 @@ def loose_db(weight: Any, E: Array, freqs_hz: Array) -> float | None:
     """Overbound over the optimal cover where that is known in closed form: one entry, scalar and entrywise weights."""
     if weight.structure.value == "entrywise":
         sizes, allowed = np.abs(E).max(axis=0), np.abs(response(weight.matrix(), freqs_hz))
-    elif weight.structure.value == "scalar" or E.shape[2:] == (1, 1):
+    elif E.shape[2:] == (1, 1):
         sizes = np.linalg.norm(E, 2, axis=(-2, -1)).max(axis=0)
         left, right = response(weight.left, freqs_hz), response(weight.right, freqs_hz)
         allowed = np.abs(left[:, 0, 0] * right[:, 0, 0])
@@ -252,13 +252,13 @@ def limited(seconds: float) -> Iterator[None]:
 
 
 def models(case: Case) -> tuple[str, bool]:
-    """Judge `quantify_systems`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
+    """Judge `quantify`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
     options: dict[str, Any] = {
         "structure": case.structure,
         "max_order": case.max_order,
         "tolerance_db": case.tolerance_db,
     }
-    found = quantify_systems(case.units, case.form, case.freqs_hz, **options)
+    found = quantify(case.units, case.form, case.freqs_hz, **options)
     nominal, weight, remainder = found.scaled_nominal(), found.weight, found.remainder
     shown = [weight.left, weight.right] + ([remainder.left, remainder.right] if remainder else [])
 
@@ -283,10 +283,10 @@ def models(case: Case) -> tuple[str, bool]:
 
 
 def responses(case: Case) -> tuple[str, bool]:
-    """Judge `quantify_responses`: the bound at the frequencies given, and the statement about the tolerance."""
+    """Judge `quantify`: the bound at the frequencies given, and the statement about the tolerance."""
     given = np.array([response(u, case.freqs_hz) for u in case.units])
     options: dict[str, Any] = {"max_order": case.max_order, "tolerance_db": case.tolerance_db}
-    found = quantify_responses(given, case.freqs_hz, case.form, sample_period_s=case.units[0].dt, **options)
+    found = quantify(given, case.form, case.freqs_hz, sample_period_s=case.units[0].dt, **options)
     parts = [truth(case.form, found.nominal_response, G) for G in given]
     E, R = np.array([E for E, _ in parts]), np.array([R for _, R in parts])
     if excess(found.weight, E, case.freqs_hz).max() > 1 + ROUNDING:
@@ -326,7 +326,7 @@ def run(count: int, seed: int) -> list[Tally]:
     bound = "own responses and residuals on a dense grid around all poles, refined around the largest ratios; seconds are of the processor"
     tallies = [
         Tally("populations of models through quantify", bound),
-        Tally("sampled responses of them through quantify_responses", "own residuals at the given frequencies"),
+        Tally("sampled responses of them through quantify", "own residuals at the given frequencies"),
     ]
     for k in range(count):
         for tally, judge in zip(tallies, (models, responses), strict=True):

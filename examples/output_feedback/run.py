@@ -21,7 +21,7 @@ from kros.plants import PendulumPopulation
 from kros.synthesis import h2, hinf
 from kros.synthesis.generalized_plant import split
 from kros.synthesis.problem.interconnect import interconnect
-from kros.uncertainty import quantify_systems
+from kros.uncertainty import quantify
 
 DT, REFERENCE_RAD = 0.01, 0.25
 GRID_RAD = np.tan(np.pi * DT * np.geomspace(0.01, 45.0, 30))  # of the plant in continuous time, z = (1 + s) / (1 - s)
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--units", type=int, default=10)
     options = parser.parse_args()
     simulated = PendulumPopulation(options.units, 10, 20.0, 1, 1.0).simulate()
-    uncertain = quantify_systems(identify(simulated.population), "additive", np.geomspace(1e-3, 50.0, 300))
+    uncertain = quantify(identify(simulated.population), "additive", np.geomspace(1e-3, 50.0, 300))
     plant = generalized_plant(uncertain)
     controllers = {
         "nominal H2": h2(plant.channel(slice(1, None), slice(1, None))).controller,

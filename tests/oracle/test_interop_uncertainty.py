@@ -9,7 +9,7 @@ control = pytest.importorskip("control")
 
 from kros.core.errors import ConfigError, DataError, DimensionError  # noqa: E402
 from kros.interop import quantify_models  # noqa: E402
-from kros.uncertainty.bilinear import BilinearAxis  # noqa: E402
+from kros.uncertainty.weights.bilinear import BilinearAxis  # noqa: E402
 
 FREQS = np.geomspace(1e-3, 10.0, 80)
 
@@ -134,7 +134,7 @@ def test_bad_input_is_refused() -> None:
         quantify_models(data, "additive", FREQS)
     with pytest.raises(DimensionError, match="other frequencies"):
         quantify_models([data[0], control.frd(models[1], FREQS)])
-    with pytest.raises(DimensionError, match="found ndarray in one list"):
+    with pytest.raises(DimensionError, match="found one model, ndarray"):
         quantify_models(np.ones((3, 80, 1, 1)), "additive")
     with pytest.raises(DataError, match="NaN or infinity at 1 Hz"):
         quantify_models([control.FRD(g, np.pi * np.array([1.0, 2.0])) for g in ([1.0, 2.0], [1.0, np.nan])], "additive")

@@ -10,7 +10,7 @@ from load_baselines import disturbance_observer, load_direction, ripple_power
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
-from kros.motor_drive.accuracy import load_accuracy
+from kros.motor_drive.from_current import load_accuracy
 from kros.motor_drive.signals import without_level
 from kros.observer import Observer, relift_certificate, run_observer
 from kros.observer.residual.one_step import one_step_residual

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tests.support.residuals import of_function
 
 from kros.core import StateSpace
-from kros.uncertainty import Form, quantify_systems
-from kros.uncertainty.fits.sections import Sections
-from kros.uncertainty.weights.fit import fit_weight
+from kros.uncertainty import Form, quantify
+from kros.uncertainty.weights.fit import Target, fit_weight
+from kros.uncertainty.weights.sections import Sections
 
 DT = 1e-3
 FREQS = np.geomspace(5e-2, 500.0, 150)
@@ -31,20 +32,14 @@ def differences(function, size: int) -> np.ndarray:
     return np.array([(function(e) - function(-e)) / 2e-6 for e in 1e-6 * np.eye(size)])
 
 
-def test_slopes_and_curvature_are_those_of_finite_differences() -> None:
+def test_slopes_are_those_of_finite_differences() -> None:
     sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
-    weights, owner = np.random.default_rng(1).normal(size=(2, 40)), sections.owner
+    owner = sections.owner
     far = (-50.0, 50.0)
     slope = differences(lambda x: sections.moved(x, far).logs(tau)[owner].ravel(), len(owner)).reshape(
         len(owner), len(owner), 40
     )
     np.testing.assert_allclose(np.einsum("iif->if", slope), sections.slopes(tau), atol=1e-8)
-    hessian = differences(lambda x: (weights[owner] * sections.moved(x, far).slopes(tau)).sum(axis=1), len(owner))
-    found = sections.curvature(tau, weights)
-    for k in range(6):  # the positive part, section by section
-        rows = [2 + k, 8 + k] if sections.pair[k] else [2 + k]
-        values, vectors = np.linalg.eigh((hessian + hessian.T)[np.ix_(rows, rows)] / 2)
-        np.testing.assert_allclose(found[np.ix_(rows, rows)], (vectors * values.clip(0)) @ vectors.T, atol=1e-7)
 
 
 def test_systems_have_the_magnitudes_of_the_sections_and_are_stable_with_their_inverses() -> None:
@@ -62,7 +57,7 @@ def test_poles_on_zeros_change_nothing_until_they_are_taken_out_again() -> None:
     np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
     assert more.orders.tolist() == [4, 5]
     for entry in (0, 1):
-        more = more.without(more.idlest(entry, tau))
+        more = more.without(more.weakest(entry, tau))
     np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
 
 
@@ -74,7 +69,7 @@ def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
 
 
 def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() -> None:
-    weight, cover = fit_weight(lags_and_leads, FREQS, DT, tolerance_db=0.3)
+    weight, cover = fit_weight(of_function(lags_and_leads), FREQS, Target(DT, tolerance_db=0.3))
     assert weight.overbound_db_max <= 0.3
     assert weight.within_tolerance
     assert (
@@ -95,8 +90,8 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
             None, :, None, None
         ]
 
-    four, _ = fit_weight(peaks, freqs, DT)
-    six, _ = fit_weight(peaks, freqs, DT, max_order=6)
+    four, _ = fit_weight(of_function(peaks), freqs, Target(DT))
+    six, _ = fit_weight(of_function(peaks), freqs, Target(DT, max_order=6))
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max
 
@@ -115,7 +110,7 @@ def test_bounds_hold_by_the_means_of_the_benchmark(form: str) -> None:
     A = np.array([[0.9, 0.05], [-0.1, 0.7]]) * (1 + 0.01 * rng.normal(size=(4, 2, 2)))
     B = np.array([[0.1, 0.02], [0.0, 0.3]]) * (1 + 0.05 * rng.normal(size=(4, 2, 2)))
     units = StateSpace(A, B, np.broadcast_to(np.eye(2), A.shape), np.zeros(A.shape), DT)
-    found = quantify_systems(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
+    found = quantify(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
     covers = benchmark()
     assert covers.independent_cover_max(found, units) <= 1 + 1e-6
     lowered = found.weight.mapped(lambda s: StateSpace(s.A, s.B, 0.9 * s.C, 0.9 * s.D, s.dt))

@@ -7,15 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from tests.support.residuals import of_function, of_units
 
 from kros.core.lti import StateSpace, gain
 from kros.design.settings import SynthesisSettings
 from kros.design.uncertain_set import usable_problem
-from kros.uncertainty import UncertainModel, quantify_systems, residual
+from kros.uncertainty import Form, UncertainModel, quantify, residual
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import Structure
-from kros.uncertainty.weights.fit import fit_weight
-from kros.uncertainty.weights.pencils import ResidualSystems, ratio_systems
+from kros.uncertainty.weights.fit import Target, fit_entries
+from kros.uncertainty.weights.pencils import ResidualSystems
 from kros.uncertainty.weights.weight import EntrywiseWeight
 
 DT = 1e-3
@@ -33,12 +34,6 @@ def lags(gains: np.ndarray, corners_hz: np.ndarray) -> StateSpace:
     return StateSpace(A, B, C, 0.1 * gains, DT)
 
 
-def additive(units: StateSpace) -> tuple[ResidualSystems, object]:
-    """Residuals of units against a plant of zero."""
-    nominal = gain(np.zeros((units.n_outputs, units.n_inputs)), DT)
-    return ResidualSystems("additive", nominal, units), units.frequency_response
-
-
 def scattered(seed: int, p: int, m: int, units: int = 3) -> StateSpace:
     rng = np.random.default_rng(seed)
     return lags(rng.normal(size=(units, p, m)), np.exp(rng.uniform(0, 4, size=(units, p, m))))
@@ -47,10 +42,9 @@ def scattered(seed: int, p: int, m: int, units: int = 3) -> StateSpace:
 @pytest.mark.parametrize("shape", [(2, 2), (3, 2)])
 def test_every_entry_is_bounded_and_the_dyads_rebuild_the_residual(shape: tuple[int, int]) -> None:
     p, m = shape
-    systems, residuals = additive(scattered(1, p, m))
-    weight, cover = fit_weight(
-        residuals, GRID, DT, structure="entrywise", systems=systems, max_order=2, tolerance_db=3.0
-    )
+    units = scattered(1, p, m)
+    residuals = units.frequency_response
+    weight, cover = fit_entries(of_units(units), GRID, Target(DT, 2, 3.0))
     assert isinstance(weight, EntrywiseWeight)
     assert weight.structure is Structure.ENTRYWISE
     assert weight.method is Method.LEVEL_SETS
@@ -69,7 +63,7 @@ def test_known_magnitudes_are_found() -> None:
     gains = np.array([[1.0, -0.3], [0.02, 4.0]])
     corners = np.array([[1.0, 10.0], [100.0, 3.0]])
     units = lags(np.array([gains, 0.4 * gains]), np.array([corners, corners]))
-    weight, _ = fit_weight(additive(units)[1], GRID, DT, structure="entrywise", tolerance_db=0.05)
+    weight, _ = fit_entries(of_units(units), GRID, Target(DT, tolerance_db=0.05))
     assert weight.right_orders == (1, 1, 1, 1)
     expected = np.abs(units[0].frequency_response(GRID)).reshape(len(GRID), 4)
     np.testing.assert_allclose(20 * np.log10(weight.magnitudes(GRID).right / expected), 0, atol=0.05)
@@ -78,7 +72,7 @@ def test_known_magnitudes_are_found() -> None:
 def test_a_full_perturbation_is_exceeded_as_it_should_be() -> None:
     """The static example of the covers: W = [[1, 1], [1, 1.5]] bounds all entries; its inverse is [[3, -2], [-2, 2]]."""
     E = np.array([[[1.0, 1.0], [1.0, -1.0]], [[0.5, 0.5], [0.5, 1.5]]])
-    weight, _ = fit_weight(lambda f: np.repeat(E[:, None], len(f), axis=1) + 0j, GRID, DT, structure="entrywise")
+    weight, _ = fit_entries(of_function(lambda f: np.repeat(E[:, None], len(f), axis=1)), GRID, Target(DT))
     expected = np.linalg.norm(np.array([[3.0, -2.0], [-2.0, 2.0]]) @ E[0], 2)
     assert isinstance(weight, EntrywiseWeight)
     assert weight.unstructured_excess == pytest.approx(expected, rel=1e-6)
@@ -88,7 +82,7 @@ def test_a_full_perturbation_is_exceeded_as_it_should_be() -> None:
 
 def test_where_nothing_is_to_be_covered() -> None:
     E = np.array([[[1.0, 0.0], [0.0, 1.0]]])
-    weight, _ = fit_weight(lambda f: np.repeat(E[:, None], len(f), axis=1) + 0j, GRID, DT, structure="entrywise")
+    weight, _ = fit_entries(of_function(lambda f: np.repeat(E[:, None], len(f), axis=1)), GRID, Target(DT))
     np.testing.assert_allclose(weight.left.D @ weight.right.D, E[0], atol=1e-6)
     assert weight.cover_max <= 1
 
@@ -102,14 +96,14 @@ def test_realisations_of_entries(form: str) -> None:
     two, one = gain([[2.0]], DT), gain([[1.0]], DT)
     s = 1j * np.tan(np.pi * GRID[:-1] * DT)
     for i, j in np.ndindex(2, 2):
-        pencil = ratio_systems(ResidualSystems(form, nominal, units, (i, j)), two, one)[1]
+        pencil = ResidualSystems(Form(form), nominal, units, (i, j)).ratios(two, one)[1]
         found = [(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D)[0, 0] for x in s]
         np.testing.assert_allclose(np.abs(found), np.abs(E[1, :-1, i, j]) / 2, rtol=1e-6)
 
 
 def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) -> None:
     units = lags(1 + 0.1 * np.random.default_rng(4).normal(size=(3, 2, 2)) + np.eye(2), np.full((3, 2, 2), 5.0))
-    model = quantify_systems(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0)
+    model = quantify(units, freqs_hz=GRID, structure="entrywise", max_order=2, tolerance_db=3.0)
     model.save(tmp_path)
     loaded = UncertainModel.load(tmp_path).weight
     assert isinstance(loaded, EntrywiseWeight)
@@ -130,7 +124,7 @@ def test_continuous_models() -> None:
     units = StateSpace(
         poles, np.broadcast_to(coupled, (3, 2, 2)), np.broadcast_to(np.eye(2), (3, 2, 2)), np.zeros((3, 2, 2)), 0.0
     )
-    model = quantify_systems(
+    model = quantify(
         units, "additive", np.geomspace(0.01, 10, 60), structure="entrywise", max_order=2, tolerance_db=3.0
     )
     freqs = np.geomspace(0.01, 10, 500)

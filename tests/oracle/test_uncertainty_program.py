@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from kros.uncertainty.fits.program import solve
+from kros.uncertainty.weights.programs import minimised as solve
 
 
 def programs(seed: int, n: int, rows: int, count: int) -> list[tuple[np.ndarray, np.ndarray]]:

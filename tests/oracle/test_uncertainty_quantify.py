@@ -13,7 +13,7 @@ from scipy.linalg import expm
 
 from kros.core import StateSpace
 from kros.core.errors import ConfigError, DataError, DimensionError
-from kros.uncertainty import Form, UncertainModel, quantify_systems
+from kros.uncertainty import Form, UncertainModel, quantify
 
 DT = 1e-3
 
@@ -77,7 +77,7 @@ def slow_ratio(model: UncertainModel, units: StateSpace, freqs: np.ndarray) -> f
 @pytest.mark.parametrize("form", ["inverse_input_multiplicative", "additive"])
 def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
     units = drives(10, 1)
-    model = quantify_systems(units, form, np.geomspace(1e-1, 500.0, 150), output_scale=[1, 3, 1], input_scale=[1, 3])
+    model = quantify(units, form, np.geomspace(1e-1, 500.0, 150), output_scale=[1, 3, 1], input_scale=[1, 3])
     off_grid = np.random.default_rng(0).uniform(np.log(1e-1), np.log(500.0), 50)
     assert slow_ratio(model, units, np.concatenate([np.exp(off_grid), [1e-6, 500.0]])) <= 1 + 1e-6
     assert model.cover_max <= 1
@@ -93,14 +93,14 @@ def test_weights_of_drives_are_sound_and_tight(form: str) -> None:
 @pytest.mark.parametrize("form", list(Form))
 def test_weights_of_random_tall_systems_are_sound(form: Form) -> None:
     units = random_population(4, 2)
-    model = quantify_systems(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    model = quantify(units, form, np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
     assert slow_ratio(model, units, np.linspace(1.0, 500.0, 41)) <= 1 + 1e-6
     assert model.cover_max <= 1
 
 
 def test_remainder_covers_what_the_form_leaves_out() -> None:
     units = random_population(4, 3)
-    model = quantify_systems(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
+    model = quantify(units, "inverse_input_multiplicative", np.geomspace(1.0, 500.0, 60), tolerance_db=3.0)
     assert model.misfit_max > 0.01
     assert model.remainder is not None
     for f in np.linspace(2.0, 490.0, 23):
@@ -114,7 +114,7 @@ def test_remainder_covers_what_the_form_leaves_out() -> None:
             gp = response(units[k], z)
             rest = gp - g @ np.linalg.inv(np.eye(2) - np.linalg.pinv(gp) @ (gp - g))
             assert np.linalg.norm(np.linalg.solve(left, rest) @ np.linalg.inv(right), 2) <= 1 + 1e-6
-    additive = quantify_systems(units, "additive", np.geomspace(1.0, 500.0, 20), max_order=1, tolerance_db=20.0)
+    additive = quantify(units, "additive", np.geomspace(1.0, 500.0, 20), max_order=1, tolerance_db=20.0)
     assert additive.remainder is None
     assert additive.misfit_max < 1e-12
 
@@ -123,7 +123,7 @@ def test_scalar_first_order_population_has_the_residual_of_the_textbook() -> Non
     """Lags `(1 - a) / (z - a)`: inverse input residual `1 - G / Gp` is exact, zero at DC, and the gain ratio at Nyquist is known."""
     poles = np.array([0.88, 0.9, 0.92])[:, None, None]
     units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), DT)
-    model = quantify_systems(units, freqs_hz=np.geomspace(1e-3, 500.0, 300))
+    model = quantify(units, freqs_hz=np.geomspace(1e-3, 500.0, 300))
     assert model.nominal == 1
     at_top = max(abs(1 - (0.1 / 1.9) / ((1 - a) / (1 + a))) for a in (0.88, 0.92))
     np.testing.assert_allclose(model.bounds[model.form][-1], at_top, rtol=1e-10)
@@ -139,10 +139,10 @@ def test_units_of_measure_and_order_of_units_do_not_matter(seed: int, exponents:
     units, freqs = drives(5, seed), np.geomspace(1.0, 500.0, 24)
     out, into = 10.0 ** np.array(exponents[:3]), 10.0 ** np.array(exponents[3:])
     options = {"tolerance_db": 20.0, "max_order": 1}
-    plain = quantify_systems(units, "input_multiplicative", freqs, **options)
+    plain = quantify(units, "input_multiplicative", freqs, **options)
     other = StateSpace(units.A, units.B / into, units.C * out[:, None], units.D, DT)
-    scaled = quantify_systems(other, "input_multiplicative", freqs, output_scale=out, input_scale=into, **options)
-    shuffled = quantify_systems(units[[3, 1, 4, 0, 2]], "input_multiplicative", freqs, **options)
+    scaled = quantify(other, "input_multiplicative", freqs, output_scale=out, input_scale=into, **options)
+    shuffled = quantify(units[[3, 1, 4, 0, 2]], "input_multiplicative", freqs, **options)
     for form, peak in plain.peak_db.items():
         assert scaled.peak_db[form] == pytest.approx(peak, rel=1e-6)
         assert shuffled.peak_db[form] == pytest.approx(peak, rel=1e-9)
@@ -154,7 +154,7 @@ def test_units_of_measure_and_order_of_units_do_not_matter(seed: int, exponents:
 def test_identical_units_have_no_uncertainty() -> None:
     one = drives(1, 4)
     units = StateSpace(*(np.repeat(getattr(one, x), 3, axis=0) for x in "ABCD"), DT)
-    model = quantify_systems(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
+    model = quantify(units, freqs_hz=np.geomspace(1.0, 500.0, 20))
     assert model.cover_max == 0
     assert model.peak_db[model.form] == -np.inf
     assert not model.weight.left.D.any()
@@ -163,9 +163,9 @@ def test_identical_units_have_no_uncertainty() -> None:
 def test_nominal_may_be_named_or_brought_along(tmp_path: Path) -> None:
     units, freqs = drives(4, 5), np.geomspace(1.0, 500.0, 30)
     ids = ("a", "b", "c", "d")
-    assert quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1).nominal == 2
+    assert quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="c", max_order=1).nominal == 2
     mean = StateSpace(units.A.mean(axis=0), units.B.mean(axis=0), np.eye(3), np.zeros((3, 2)), DT)
-    pooled = quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal=mean, max_order=1)
+    pooled = quantify(units, freqs_hz=freqs, unit_ids=ids, nominal=mean, max_order=1)
     assert (pooled.nominal, pooled.nominal_id) == (-1, "pooled")
     assert slow_ratio(pooled, units, np.array([1.3, 40.0, 333.0])) <= 1 + 1e-6
     pooled.save(tmp_path)
@@ -176,41 +176,41 @@ def test_nominal_may_be_named_or_brought_along(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.weight.left.A, pooled.weight.left.A)
     np.testing.assert_array_equal(loaded.misfit, pooled.misfit)
     with pytest.raises(ConfigError, match="'z'"):
-        quantify_systems(units, freqs_hz=freqs, unit_ids=ids, nominal="z")
+        quantify(units, freqs_hz=freqs, unit_ids=ids, nominal="z")
     with pytest.raises(ConfigError, match="range"):
-        quantify_systems(units, freqs_hz=freqs, nominal=9)
+        quantify(units, freqs_hz=freqs, nominal=9)
 
 
 def test_bad_input_is_refused() -> None:
     units = drives(3, 6)
     with pytest.raises(DataError, match="two units"):
-        quantify_systems(units[[0]])
+        quantify(units[[0]])
     with pytest.raises(DimensionError, match="unit axis"):
-        quantify_systems(units[0])
+        quantify(units[0])
     with pytest.raises(ConfigError, match="Nyquist"):
-        quantify_systems(units, freqs_hz=[1.0, 600.0])
+        quantify(units, freqs_hz=[1.0, 600.0])
     with pytest.raises(ConfigError, match="unknown"):
-        quantify_systems(units, "nonsense")
+        quantify(units, "nonsense")
     with pytest.raises(ConfigError, match="entrywise"):
-        quantify_systems(units, freqs_hz=[1.0, 2.0], structure="block")
+        quantify(units, freqs_hz=[1.0, 2.0], structure="block")
     with pytest.raises(DimensionError, match="output_scale"):
-        quantify_systems(units, output_scale=[1, 2])
+        quantify(units, output_scale=[1, 2])
     with pytest.raises(DimensionError, match="differ"):
-        quantify_systems([units[0], StateSpace(units.A[1], units.B[1], np.eye(3), np.zeros((3, 2)), 2 * DT)])
+        quantify([units[0], StateSpace(units.A[1], units.B[1], np.eye(3), np.zeros((3, 2)), 2 * DT)])
     unstable = StateSpace(np.stack([units.A[0], 1.2 * np.eye(3)]), units.B[:2], units.C[:2], units.D[:2], DT)
     with pytest.raises(DataError, match="unstable"):
-        quantify_systems(unstable, unit_ids=("a", "b"))
+        quantify(unstable, unit_ids=("a", "b"))
     broken = StateSpace(units.A * np.array([1, np.nan, 1])[:, None, None], units.B, units.C, units.D, DT)
     with pytest.raises(DataError, match="unit 1 has NaN"):
-        quantify_systems(broken)
+        quantify(broken)
     with pytest.raises(DataError, match="largest real part of a pole"):
-        quantify_systems(StateSpace(np.abs(units.A), units.B, units.C, units.D, 0.0))
+        quantify(StateSpace(np.abs(units.A), units.B, units.C, units.D, 0.0))
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"structure": "diamond"}, "structure 'diamond' is unknown"),
+        ({"structure": "diamond"}, "diamond"),
         ({"max_order": -1}, "max_order = -1"),
         ({"tolerance_db": -1.0}, "tolerance_db = -1.0"),
         ({"nominal": 0.5}, "nominal 0.5 is out of range"),
@@ -219,13 +219,13 @@ def test_bad_input_is_refused() -> None:
 def test_options_out_of_range_are_refused(options, message):
     units = [StateSpace([[p]], [[1.0]], [[1.0]], [[0.0]], 0.01) for p in (0.9, 0.91)]
     with pytest.raises(ConfigError, match=message):
-        quantify_systems(units, **options)
+        quantify(units, **options)
 
 
 def test_an_unstable_nominal_is_refused_and_foreign_systems_are_read():
     units = [SimpleNamespace(A=[[p]], B=[[1.0]], C=[[1.0]], D=[[0.0]], dt=0.01) for p in (0.9, 0.91)]
-    assert quantify_systems(units, "additive").cover_max <= 1
+    assert quantify(units, "additive").cover_max <= 1
     with pytest.raises(DataError, match="the nominal is unstable"):
-        quantify_systems(units, nominal=StateSpace([[1.1]], [[1.0]], [[1.0]], [[0.0]], 0.01))
+        quantify(units, nominal=StateSpace([[1.1]], [[1.0]], [[1.0]], [[0.0]], 0.01))
     with pytest.raises(DimensionError, match="found int"):
-        quantify_systems(3)
+        quantify(3)

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.residuals import of_function
 
 from kros.core import StateSpace
-from kros.core.errors import ConfigError
-from kros.uncertainty import quantify_responses, quantify_systems
+from kros.uncertainty import quantify
 from kros.uncertainty.weights.cover import Structure
-from kros.uncertainty.weights.fit import fit_weight
+from kros.uncertainty.weights.fit import Target, fit_weight
 from kros.uncertainty.weights.weight import EntrywiseWeight
 
 Array = np.ndarray[Any, Any]
@@ -53,7 +53,7 @@ GRID = np.geomspace(1e-4, 0.4999, 30)
 
 
 def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_all_others() -> None:
-    found = quantify_systems(LIGHT, "additive", GRID, max_order=3)
+    found = quantify(LIGHT, "additive", GRID, max_order=3)
     freqs = around([*LIGHT, found.weight.left])
     G = response(found.nominal_system, freqs)
     E = np.array([response(u, freqs) - G for u in LIGHT])
@@ -69,7 +69,7 @@ def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_
 )
 def test_lightly_damped_units_of_any_order_get_a_weight(angles: tuple[float, ...], radius: float, order: int) -> None:
     units = [single(radius, angle, 1 + 0.1 * k) for k, angle in enumerate(angles)]
-    found = quantify_systems(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
+    found = quantify(units, "additive", np.geomspace(1e-4, 0.4999, 60), max_order=order, tolerance_db=3.0)
     assert found.weight.left.is_stable()
     assert max(found.weight.left_orders) <= order
     assert found.cover_max <= 1
@@ -88,7 +88,7 @@ def resonances(freqs: Array) -> Array:
 def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they_are(period: float) -> None:
     freqs = np.geomspace(1e-3, 0.4999, 40)
     given = resonances(freqs)
-    found = quantify_responses(given, freqs, "additive", sample_period_s=period, max_order=2)
+    found = quantify(given, "additive", freqs, sample_period_s=period, max_order=2)
     E = given - found.nominal_response
     allowed = np.abs(response(found.weight.matrix(), freqs))[:, 0, 0]
     ratio = np.abs(E).max(axis=0)[:, 0, 0] / allowed
@@ -105,13 +105,13 @@ def test_responses_that_do_not_resolve_a_peak_are_told_so(caplog: pytest.LogCapt
         np.geomspace(1e-3, 0.4, 60),
         np.unique(np.concatenate([np.geomspace(1e-3, 0.4, 60), np.linspace(0.028, 0.032, 81)])),
     )
-    found = quantify_responses(resonances(coarse), coarse, "additive", sample_period_s=1.0, max_order=1)
+    found = quantify(resonances(coarse), "additive", coarse, sample_period_s=1.0, max_order=1)
     assert found.unresolved_hz.size
     assert np.all(np.abs(found.unresolved_hz - 0.03) < 0.003)
     assert "do not resolve" in found.certificate
     assert "more densely" in caplog.text
     caplog.clear()
-    resolved = quantify_responses(resonances(fine), fine, "additive", sample_period_s=1.0, max_order=1)
+    resolved = quantify(resonances(fine), "additive", fine, sample_period_s=1.0, max_order=1)
     assert not resolved.unresolved_hz.size
     assert "resolve" not in resolved.certificate
     assert not caplog.records
@@ -128,11 +128,10 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
     if wide:
         form = form.replace("input", "output")
         units = [StateSpace(u.A.T, u.C.T, u.B.T, u.D.T, u.dt) for u in units]
-    found = quantify_systems(units, form, np.geomspace(1e-3, 0.49, 16), max_order=1)
+    found = quantify(units, form, np.geomspace(1e-3, 0.49, 16), max_order=1)
     weight = found.remainder
     assert weight is not None
-    if form != "inverse_additive":
-        assert weight.method.value == "level sets"
+    assert weight.method.value == "level sets"
     freqs = around([*units, weight.left, weight.right])
     G = response(found.nominal_system, freqs)
     parts = []
@@ -154,24 +153,15 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
 
 def test_one_entry_has_the_weight_of_the_structure_asked_for() -> None:
     units = [single(0.9, 0.5), single(0.88, 0.5, 1.2)]
-    found = quantify_systems(units, "additive", GRID, structure="entrywise")
+    found = quantify(units, "additive", GRID, structure="entrywise")
     assert isinstance(found.weight, EntrywiseWeight)
     assert found.weight.structure is Structure.ENTRYWISE
 
 
-def test_automatic_weights_are_scalar_where_diagonal_ones_come_close_to_an_ill_posed_set() -> None:
-    found = quantify_systems(
-        [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 3.0)], "inverse_input_multiplicative", GRID, max_order=1
-    )
-    assert found.weight.structure is Structure.SCALAR
-    with pytest.raises(ConfigError, match="is unknown"):
-        quantify_systems(LIGHT, "additive", GRID, structure="full")
-
-
-@pytest.mark.parametrize("structure", ["auto", "entrywise"])
+@pytest.mark.parametrize("structure", ["diagonal", "entrywise"])
 def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> None:
     units = [single(0.9, 0.5), single(0.88, 0.5, 1.2), single(0.92, 0.45, 0.9)]
-    found = quantify_systems(units, "additive", GRID, structure=structure)
+    found = quantify(units, "additive", GRID, structure=structure)
     freqs = np.geomspace(1e-5, 0.5, 500)
     E = np.array([response(u, freqs) - response(found.nominal_system, freqs) for u in units])
     ratio = np.abs(E).max(axis=0) / np.abs(response(found.weight.matrix(), freqs))
@@ -180,13 +170,13 @@ def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> Non
 
 def test_identical_units_and_single_frequencies_get_weights() -> None:
     units = [single(0.9, 0.5)] * 3
-    for structure in ("auto", "entrywise"):
-        found = quantify_systems(units, "additive", GRID, structure=structure)
+    for structure in ("diagonal", "entrywise"):
+        found = quantify(units, "additive", GRID, structure=structure)
         assert found.cover_max == 0
         assert found.weight.remaining_margin == 1 or structure == "entrywise"
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
-        assert quantify_systems(pair, "additive", freqs, max_order=2).cover_max <= 1
+        assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
 
 
 def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
@@ -195,7 +185,7 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     def residuals(freqs: np.ndarray) -> np.ndarray:
         return np.array([response(u, freqs) - response(units[0], freqs) for u in units])
 
-    weight, best = fit_weight(residuals, GRID, 1.0, max_order=1, tolerance_db=0.1)
+    weight, best = fit_weight(of_function(residuals), GRID, Target(1.0, 1, 0.1))
     assert weight.overbound_db_max == pytest.approx(
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )

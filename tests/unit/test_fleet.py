@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace
 from kros.identify.refine.metric import peak_residual_db
-from kros.uncertainty import many, quantify_systems, residual, score_outliers
+from kros.uncertainty import FitSettings, quantify, residual, score_outliers
 from kros.uncertainty.forms import completion
 from kros.uncertainty.outliers import model as outlier_model
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import cover_ratio
+from kros.uncertainty.weights.residuals import Residuals
 
 UNITS, DT = 210, 0.01
 
@@ -29,25 +28,16 @@ def fleet(n_units: int = UNITS, outputs: int = 2, seed: int = 0) -> StateSpace:
     return StateSpace(A, B, C, np.zeros((n_units, outputs, 1)), DT)
 
 
-@pytest.fixture
-def ordinary(monkeypatch) -> Any:
-    """Quantify as few units are."""
-
-    def quantified(*arguments: Any, **options: Any) -> Any:
-        with monkeypatch.context() as patch:
-            patch.setattr(many, "MANY", 10**9)
-            return quantify_systems(*arguments, **options)
-
-    return quantified
-
-
 @pytest.mark.parametrize(
     ("form", "outputs"), [("inverse_input_multiplicative", 2), ("additive", 2), ("output_multiplicative", 1)]
 )
-def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(ordinary, form, outputs):
+def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(form, outputs):
     units, freqs = fleet(outputs=outputs), np.geomspace(0.05, 49, 50)
     options = {"max_order": 2}
-    found, expected = quantify_systems(units, form, freqs, **options), ordinary(units, form, freqs, **options)
+    found, expected = (
+        quantify(units, form, freqs, **options),
+        quantify(units, form, freqs, fit=FitSettings(block=10**6), **options),
+    )
     assert found.nominal == expected.nominal
     np.testing.assert_allclose(found.bounds[found.form], expected.bounds[found.form], rtol=1e-9)
     np.testing.assert_allclose(found.misfit, expected.misfit, rtol=1e-9, atol=1e-12)
@@ -69,25 +59,22 @@ def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(
     assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
 
 
-def test_units_that_nobody_looked_at_join_the_fit_or_lift_the_weights(monkeypatch):
+@pytest.mark.parametrize("rounds", [3, 1])
+def test_units_that_were_not_looked_at_join_the_fit_or_lift_the_weights(monkeypatch, rounds):
     units, freqs = fleet(), np.geomspace(0.05, 49, 60)
-    for rounds in (3, 1):
-        monkeypatch.setattr(many, "_ROUNDS", rounds)
-        monkeypatch.setattr(many._Many, "deciding", lambda self: np.arange(3))
-        found = quantify_systems(units, "additive", freqs, max_order=2)
-        E, used = (
-            residual("additive", *(s.frequency_response(freqs) for s in (found.nominal_system, units))),
-            found.weight.magnitudes(freqs),
-        )
-        assert cover_ratio(E, used.left, used.right).max() <= 1 + 1e-9
-        assert found.cover_max <= 1
-        assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
+    monkeypatch.setattr(Residuals, "deciding", lambda self, freqs_hz, block: np.arange(3))
+    found = quantify(units, "additive", freqs, max_order=2, fit=FitSettings(rounds=rounds))
+    E = residual("additive", *(s.frequency_response(freqs) for s in (found.nominal_system, units)))
+    used = found.weight.magnitudes(freqs)
+    assert cover_ratio(E, used.left, used.right).max() <= 1 + 1e-9
+    assert found.cover_max <= 1
+    assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
 
 
 def test_a_fleet_of_units_that_are_all_the_same():
     one = fleet(1)
     same = StateSpace(*(np.repeat(M, UNITS, axis=0) for M in (one.A, one.B, one.C, one.D)), DT)
-    assert quantify_systems(same, "additive", np.geomspace(0.1, 49, 50), max_order=1).cover_max == 0
+    assert quantify(same, "additive", np.geomspace(0.1, 49, 50), max_order=1).cover_max == 0
 
 
 def test_the_spread_of_models_is_that_of_all_pairs():

@@ -13,7 +13,7 @@ from kros.data import Channel, Role
 from kros.identify import ModelSet
 from kros.interop import from_control, models_to_control, to_control, uncertainty_to_control
 from kros.lifting import Lifting
-from kros.uncertainty import quantify_systems
+from kros.uncertainty import quantify
 
 DT = 0.01
 FREQS_HZ = np.array([0.1, 3.0, 40.0])
@@ -125,7 +125,7 @@ def test_unknown_units_are_refused(units: list[str] | str) -> None:
 
 def test_weights_cover_the_residuals_in_python_control_too() -> None:
     population = models()
-    model = quantify_systems(population, form="additive", freqs_hz=np.geomspace(0.1, 45.0, 20))
+    model = quantify(population, form="additive", freqs_hz=np.geomspace(0.1, 45.0, 20))
     out = uncertainty_to_control(model)
     for unit in population.unit_ids:
         other = dataclasses.replace(model, nominal_system=population.systems([unit])[0]).scaled_nominal()

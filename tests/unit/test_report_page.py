@@ -44,7 +44,7 @@ from kros.report.plotting import PLOTS
 from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
-from kros.uncertainty import Form, OutlierModel, UncertainModel, quantify_systems, score_outliers
+from kros.uncertainty import Form, OutlierModel, UncertainModel, quantify, score_outliers
 from kros.uncertainty.quantify import UncertainModels
 from kros.uncertainty.unit_residuals import UnitResiduals
 
@@ -98,7 +98,7 @@ def models(name: str, condition: str, seed: int) -> ModelSet:
 def uncertain() -> dict[str, UncertainModel]:
     found = {}
     for name in ("koopman_edmd", "linear_edmd"):
-        found[name] = quantify_systems(
+        found[name] = quantify(
             models(name, "noload", 1), freqs_hz=np.geomspace(0.1, 500, 60), unit_ids=UNITS[1:], max_order=2
         )
     return found
@@ -179,7 +179,7 @@ def scores(condition: str) -> OutlierModel:
 
 def beside_others(name: str) -> UnitResiduals:
     found = models(name, "load", 2)
-    covered = quantify_systems(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2)
+    covered = quantify(found, freqs_hz=np.geomspace(0.1, 500, 40), unit_ids=UNITS[1:], max_order=2)
     inside = beside(covered, found)
     outer = (
         np.concatenate([3 * inside.entries[:1], inside.entries]),

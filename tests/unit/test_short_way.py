@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import kros
-from kros.core.errors import ConfigError, DataError, SynthesisError
+from kros.core.errors import ConfigError, DataError, DimensionError, SynthesisError
 from kros.data import Population
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
 from kros.plants import PLANTS
-from kros.uncertainty import UncertainModels, quantify_systems
+from kros.uncertainty import UncertainModels, quantify
 
 STATES, INPUTS = ("position", "velocity", "current"), ("target_position", "target_velocity")
 
@@ -59,9 +59,7 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         ConfigError, match=r"'memory': it is not made for these kinds of models.*known are linear_edmd/open_loop"
     ):
         kros.synthesize(uncertain, method="memory")
-    with pytest.raises(
-        ConfigError, match="Quantify: needs IdentifiedModels, found Population; identify the population first"
-    ):
+    with pytest.raises(DimensionError, match=r"Quantify: needs .*, found Population; .*the result of kros.identify"):
         kros.quantify(population)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Synthesize: needs UncertainModels, found IdentifiedModels"):
         kros.synthesize(uncertain.models)  # type: ignore[arg-type]
@@ -165,4 +163,4 @@ def test_systems_are_quantified_by_the_same_verb(uncertain: UncertainModels) -> 
     systems = uncertain.models.models().systems()
     options = {"freqs_hz": np.geomspace(0.5, 100, 40), "max_order": 1}
     found = kros.quantify(systems, "additive", **options)
-    assert found.peak_db == quantify_systems(systems, "additive", **options).peak_db
+    assert found.peak_db == quantify(systems, "additive", **options).peak_db

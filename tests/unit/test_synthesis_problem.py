@@ -10,7 +10,7 @@ from kros.data import Channel, Role
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.synthesis import Injection, ObserverProblem
-from kros.uncertainty import quantify_systems
+from kros.uncertainty import quantify
 
 DT = 0.01
 
@@ -41,7 +41,7 @@ def models() -> ModelSet:
 
 @pytest.fixture(scope="module")
 def uncertain(models):
-    return quantify_systems(models, form="inverse_input_multiplicative", freqs_hz=models.frequencies(60), max_order=2)
+    return quantify(models, form="inverse_input_multiplicative", freqs_hz=models.frequencies(60), max_order=2)
 
 
 def test_nothing_is_left_out(models, uncertain):
@@ -74,8 +74,6 @@ def test_a_nominal_that_is_no_unit_is_refused(models, uncertain):
 
 
 def test_entrywise_weights_are_refused(models):
-    entrywise = quantify_systems(
-        models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2
-    )
+    entrywise = quantify(models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2)
     with pytest.raises(SynthesisError, match="made for a diagonal perturbation"):
         ObserverProblem.from_uncertain(models, entrywise, [1e-3])

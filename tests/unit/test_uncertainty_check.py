@@ -8,41 +8,32 @@ import pytest
 from kros.core import KrosError, StateSpace
 from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
-from kros.uncertainty import quantify_systems
-from kros.uncertainty.fits.spectral import RationalMagnitude, cascade, spectral_factor
-from kros.uncertainty.weights.check import between_points, checking_grid
-from kros.uncertainty.weights.pencils import ResidualSystems, peaks_hz
+from kros.uncertainty import Form, quantify
+from kros.uncertainty.bounded import _between
+from kros.uncertainty.weights.fit import checking_grid, joined
+from kros.uncertainty.weights.pencils import ResidualSystems
+from kros.uncertainty.weights.rational import RationalMagnitude
 
 
-def test_the_checking_grid_reaches_from_zero_to_nyquist_and_holds_what_is_asked_for() -> None:
+def test_the_checking_grid_reaches_from_zero_to_nyquist_and_is_dense_everywhere() -> None:
     given = np.array([0.01, 0.1, 0.2])
-    grid = checking_grid(given, 1.0, 4, np.array([0.15]))
+    grid = joined(checking_grid(given, 1.0, 4), np.array([0.15, 0.2 * (1 + 1e-12)]))
     assert grid[0] == 0.0
     assert grid[-1] == 0.5
     assert np.isin([*given, 0.15], grid).all()
-    assert np.all(np.diff(grid) > 0)
-    assert ((grid > 0.01) & (grid < 0.1)).sum() == 3
-    below = grid[(grid > 0) & (grid < 0.01)]
-    assert len(below) == 16
-    assert np.tan(np.pi * below[0]) == pytest.approx(1e-4 * np.tan(np.pi * 0.01))
-    assert np.tan(np.pi * grid[-2]) ** 2 == pytest.approx(1e4 * np.tan(np.pi * 0.2) ** 2)
-    np.testing.assert_array_equal(checking_grid(np.array([0.0, 0.5]), 1.0, 1)[[0, -1]], [0.0, 0.5])
-    filled = checking_grid(given, 1.0, 1, filled=True)
-    assert np.isin(given, filled).all()
-    assert np.diff(filled).max() <= 0.0050001
-    inner = filled[filled > 0]
+    assert np.all(np.diff(grid) > 1e-12)
+    assert np.diff(grid).max() <= 0.0050001
+    inner = grid[grid > 0]
+    assert np.tan(np.pi * inner[0]) == pytest.approx(1e-2 * np.tan(np.pi * 0.01))
     assert (inner[1:] / inner[:-1]).max() <= 10 ** (1 / 29)
+    np.testing.assert_array_equal(checking_grid(np.array([0.0, 0.5]), 1.0, 1)[[0, -1]], [0.0, 0.5])
 
 
-def test_residuals_between_points_are_three_decibels_below_the_smaller_neighbour() -> None:
-    E = np.array([4.0, 1.0, 2.0, 0.0])[None, :, None, None] * np.array([[1.0, 0.0], [0.0, -0.5j]])
-    held = between_points(E, np.array([1.0, 2.0, 4.0, 8.0]))(
-        np.array([0.5, 1.0, 1.1, 1.9, 2.0, 2.5, 3.5, 4.5, 7.0, 20.0])
-    )
-    dip = 10 ** (-3 / 20)
-    np.testing.assert_allclose(np.abs(held[0, :, 0, 0]), [4, 4, dip, dip, 1, dip, dip, 0, 0, 0])
-    np.testing.assert_allclose(held[0, :, 1, 1], -0.5j * held[0, :, 0, 0])
-    np.testing.assert_allclose(between_points(E[:, :1], np.array([1.0]))(np.array([0.2, 3.0]))[0, :, 0, 0], 4.0)
+def test_responses_between_points_are_on_straight_lines_and_constant_beyond_the_ends() -> None:
+    values = np.array([4.0, 1.0, 2.0j])[None, :, None, None]
+    freqs, at = np.array([1.0, 2.0, 4.0]), np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 20.0])
+    np.testing.assert_allclose(_between(freqs, values, at)[0, :, 0, 0], [4, 4, 2.5, 1, 0.5 + 1j, 2j, 2j])
+    np.testing.assert_allclose(_between(freqs[:1], values[:, :1], at)[0, :, 0, 0], 4.0)
 
 
 def pair(radius: float, angle: float, gain: float = 1.0) -> StateSpace:
@@ -58,7 +49,7 @@ def test_zeros_of_what_is_inverted_are_peaks(form: str) -> None:
     unit = StateSpace(inverse.A - inverse.B @ inverse.C, inverse.B, -inverse.C, [[1.0]], 1.0)
     assert unit.is_stable()
     units = StateSpace(*(np.stack([getattr(s, x) for s in (unit, heavy)]) for x in "ABCD"), 1.0)
-    found = peaks_hz(ResidualSystems(form, heavy, units), np.linspace(0, 0.5, 50), 1.0)
+    found = ResidualSystems(Form(form), heavy, units).modes_hz(np.linspace(0, 0.5, 50))
     assert np.abs(found - 1.2 / (2 * np.pi)).min() < 1e-5
 
 
@@ -72,14 +63,12 @@ def test_a_magnitude_that_is_infinite_or_zero_at_an_end_has_no_spectral_factor()
         ([1, 1, 1], [1, 1, np.nan]),
     ):
         with pytest.raises(KrosError):
-            spectral_factor(RationalMagnitude(np.array(n, float), np.array(d, float), knots), 1.0)
+            RationalMagnitude(np.array(n, float), np.array(d, float), knots).factor()
 
 
 def test_a_pole_on_the_unit_circle_in_double_precision_is_refused() -> None:
     with pytest.raises(KrosError, match="unit circle"):
-        spectral_factor(RationalMagnitude(np.array([1.0, 1.0]), np.array([1.0, 1e-32]), np.array([1.0])), 1.0)
-    with pytest.raises(KrosError, match="conjugate pairs"):
-        cascade([-0.5 + 0.1j, -0.3 + 0j], [-0.2 + 0j, -0.1 + 0j], 1.0, 1.0)
+        RationalMagnitude(np.array([1.0, 1.0]), np.array([1.0, 1e-32]), np.array([1.0])).factor()
 
 
 def test_a_grid_does_not_begin_below_what_the_longest_recording_resolves() -> None:
@@ -99,6 +88,6 @@ def test_models_from_recordings_are_quantified_from_their_lowest_frequency() -> 
         def systems(self, units: tuple[str, ...]) -> list[StateSpace]:
             return [pair(0.7, 1.0), pair(0.7, 1.0, 1.2)]
 
-    found = quantify_systems(Recorded(), "additive", max_order=1, tolerance_db=20.0)
+    found = quantify(Recorded(), "additive", max_order=1, tolerance_db=20.0)
     assert found.freqs_hz[0] == pytest.approx(0.02)
     assert found.freqs_hz[-1] == 0.5

@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, KrosError
 from kros.core.frequency import bilinear_squared, check_grid, log_grid, nyquist_hz
-from kros.uncertainty.fits.spectral import RationalMagnitude, spectral_factor
+from kros.uncertainty.weights.rational import RationalMagnitude
 
 DT = 1e-3
 
@@ -38,7 +38,7 @@ def test_bad_grids_are_refused(bad: list[float]) -> None:
 def test_magnitudes_that_touch_zero_have_no_factor() -> None:
     knots = np.array([1.0])
     with pytest.raises(KrosError, match="positive"):
-        spectral_factor(RationalMagnitude(np.array([1.0, -1.0]), np.array([1.0, 1.0]), knots), DT)
+        RationalMagnitude(np.array([1.0, -1.0]), np.array([1.0, 1.0]), knots).factor()
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -56,7 +56,7 @@ def test_spectral_factor_has_the_magnitude(seed: int) -> None:
         return np.array([powers[k] / np.prod(knots[k:]) for k in range(5)])
 
     magnitude = RationalMagnitude(positive(), positive(), knots)
-    system = spectral_factor(magnitude, DT)
+    (system,) = magnitude.factor().systems(DT)
     freqs = log_grid(DT, 60)
     np.testing.assert_allclose(
         np.abs(system.frequency_response(freqs)[:, 0, 0]) ** 2, magnitude(bilinear_squared(freqs, DT)), rtol=1e-6

@@ -17,16 +17,20 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "synthesis.noise",
     ),
     (
-        "Structures of weights to choose from are no longer part of kros; remove the key structure, weights are diagonal, or "
-        "scalar where these are loose.",
+        "Structures of weights to choose from are no longer part of kros; remove the key structure, weights are diagonal.",
         "uncertainty.structure",
     ),
     (
-        "What the fit of a weight is made of is no longer public; use quantify_systems or quantify_responses.",
+        "Systems and responses are no longer quantified by functions of their own; use quantify, which takes systems, responses "
+        "(form before freqs_hz) and models of kros.identify.",
+        "kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses",
+    ),
+    (
+        "What the fit of a weight is made of is no longer public; use quantify.",
         "kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover",
     ),
     (
-        "Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db and proven_db.",
+        "Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db.",
         "kros.uncertainty.magnitude_tightness",
     ),
     (

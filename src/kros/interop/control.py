@@ -1,6 +1,6 @@
 """Systems to and from python-control, with the names of their signals.
 
-kros.core.StateSpace ── to_control ──► control.StateSpace ── from_control ──► kros.core.StateSpace
+kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ except ImportError as error:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyForControl:
-    """A nominal and weights as python-control systems: ``E = left Delta right``, ``||Delta|| <= 1`` for every model.
+    """A nominal and weights as python-control systems: every model is in the set of the form with ``E = left Delta right``, ``||Delta|| <= 1``.
 
     Parameters
     ----------
@@ -76,12 +76,10 @@ def to_control(
     Parameters
     ----------
     system : StateSpace
-        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its
-        ``dt`` is zero.
+        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its ``dt`` is zero.
     name : str, optional
     states, inputs, outputs : sequence of str, optional
-        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes
-        ``0·5*x``.
+        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes ``0·5*x``.
 
     Returns
     -------
@@ -97,29 +95,34 @@ def to_control(
     --------
     >>> from kros.core import StateSpace
     >>> from kros.interop import from_control, to_control
-    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
-    >>> system = to_control(lag, states=["position"], inputs=["target"])
+    >>> system = to_control(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), states=["position"], inputs=["target"])
     >>> system.state_labels, system.input_labels, system.dt
     (['position'], ['target'], 0.01)
     >>> from_control(system).A
     array([[0.5]])
     """
-    signals = {"states": states, "inputs": inputs, "outputs": outputs}
     if system.batch_shape:
-        return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
+        return [
+            to_control(system[i], name=name, states=states, inputs=inputs, outputs=outputs)
+            for i in range(system.batch_shape[0])
+        ]
     counts = {"states": system.n_states, "inputs": system.n_inputs, "outputs": system.n_outputs}
+    signals = {"states": states, "inputs": inputs, "outputs": outputs}
     for kind, names in signals.items():
-        if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == counts[kind]):
-            problem = f"{counts[kind]} {kind} need as many different names, found {names!r}"
-            raise DimensionError(f"to_control: {problem}; correct the list.")
+        if names is not None and (
+            isinstance(names, str) or len(names) != counts[kind] or len(set(names)) != counts[kind]
+        ):
+            raise DimensionError(
+                f"to_control: {counts[kind]} {kind} need as many different names, found {names!r}; correct the list."
+            )
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
-    # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
+    # Copies: python-control changes matrices in place where it is asked to. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
     return control.StateSpace(*matrices, system.dt, remove_useless_states=False, name=name and _label(name), **labels)
 
 
 def from_control(system: Any) -> StateSpace:
-    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero), without names.
+    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero); names of signals are not kept.
 
     Parameters
     ----------
@@ -145,11 +148,13 @@ def from_control(system: Any) -> StateSpace:
     [[0.5]]
     """
     if not is_system(system):
-        needed = "a control.StateSpace or control.TransferFunction"
-        raise DimensionError(f"from_control: needs {needed}, found {type(system).__name__}.")
+        raise DimensionError(
+            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
+        )
     if system.dt is None or system.dt is True:
-        remedy = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
-        raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {remedy}.")
+        raise DimensionError(
+            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, C, D, 0.001), or 0."
+        )
     if isinstance(system, control.TransferFunction):
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
@@ -171,8 +176,9 @@ def _realised(model: Any) -> StateSpace:
     for i, j in np.ndindex(p, m):
         numerator, denominator = np.trim_zeros(model.num[i][j], "f"), np.trim_zeros(model.den[i][j], "f")
         if len(numerator) > len(denominator):
-            problem = f"entry ({i}, {j}) of the transfer function is improper"
-            raise DataError(f"from_control: {problem}; give a causal model.")
+            raise DataError(
+                f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model."
+            )
         if len(denominator) == 1 and numerator.size:
             D[i, j] = numerator[0] / denominator[0]
         elif numerator.size:
@@ -214,54 +220,64 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     >>> len(systems), systems[motors.unit_ids[0]].input_labels
     (2, ['voltage'])
     """
-    chosen = models.unit_ids if units is None else tuple(units)
-    unknown = [unit for unit in chosen if unit not in models.unit_ids]
+    asked = models.unit_ids if units is None else tuple(units)
+    unknown = [unit for unit in asked if unit not in models.unit_ids]
     if unknown or isinstance(units, str):
-        problem = f"asked for units {units!r}, the models are of {list(models.unit_ids)}"
-        raise DimensionError(f"models_to_control: {problem}; correct the list.")
-    systems, names = models.systems(chosen), models.lifting.names
-    named = {"states": names, "inputs": models.inputs, "outputs": names}
-    return {unit: to_control(systems[i], name=unit, **named) for i, unit in enumerate(chosen)}
+        raise DimensionError(
+            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the list."
+        )
+    systems = models.systems(asked)
+    names = models.lifting.names
+    return {
+        unit: to_control(systems[i], name=unit, states=names, inputs=models.inputs, outputs=names)
+        for i, unit in enumerate(asked)
+    }
 
 
-def uncertainty_to_control(model: UncertainModel) -> UncertaintyForControl:
-    """Return the nominal and the weights of an uncertain model as `control.StateSpace`.
+def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
+    """Return the nominal and the weights of an uncertain model as `control.StateSpace`, a nominal response as `control.FRD`.
 
     Examples
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
     >>> from kros.interop import uncertainty_to_control
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
     >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> uncertainty_to_control(quantify_systems(units, "additive")).nominal.dt
+    >>> uncertainty_to_control(quantify(units, "additive")).nominal.dt
     0.01
     """
-    nominal = to_control(model.nominal_system, name="nominal")
-    scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
-    certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
-    if model.sample_period_s == 0:
-        certificate = (
-            f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, "
-            "checked between the points of the grid; from there on residuals count as constant"
+    if isinstance(model, UncertainModel):
+        nominal, scaled = (
+            to_control(model.nominal_system, name="nominal"),
+            to_control(model.scaled_nominal(), name="scaled_nominal"),
         )
-    return with_weights(nominal, scaled, model, certificate)
-
-
-def with_weights(
-    nominal: Any, scaled: Any, model: UncertainModel | ResponseUncertainty, certificate: str
-) -> UncertaintyForControl:
-    """Put the weights of an uncertain model beside its nominal."""
-    sides = [("weight", model.weight), ("remainder", model.remainder)]
-    left, right, remainder_left, remainder_right = (
-        None if weight is None else to_control(getattr(weight, side), name=f"{kind}_{side}")
-        for kind, weight in sides
-        for side in ("left", "right")
+        certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
+        if model.sample_period_s == 0:
+            certificate = (
+                f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, "
+                "checked between the points of the grid; from there on residuals count as constant"
+            )
+    else:
+        G, certificate = model.nominal_response, model.certificate
+        nominal, scaled = (
+            control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, model.sample_period_s or 0)
+            for g in (G, G / model.output_scale[:, None] * model.input_scale)
+        )
+    extra = model.remainder
+    return UncertaintyForControl(
+        nominal=nominal,
+        scaled_nominal=scaled,
+        left=to_control(model.weight.left, name="weight_left"),
+        right=to_control(model.weight.right, name="weight_right"),
+        remainder_left=None if extra is None else to_control(extra.left, name="remainder_left"),
+        remainder_right=None if extra is None else to_control(extra.right, name="remainder_right"),
+        model=model,
+        certificate=certificate,
     )
-    return UncertaintyForControl(nominal, scaled, left, right, remainder_left, remainder_right, model, certificate)
 
 
 def _label(name: str) -> str:
-    """Return a name without dots, which python-control reserves: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
+    """Return a name without dots, which separate system and signal in python-control: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
     return name.replace(".", "·")

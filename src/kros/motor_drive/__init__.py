@@ -1,7 +1,8 @@
-"""Load torque: from the current's error where the current is recorded, and by observers with a disturbance state where it is not.
+"""Load torque: from the error of a recorded current, or by observers with a disturbance state.
 
-`signals` computes what a mounted load does and how much of it can be seen; `from_current` is the paper's way; `calibrate` and `load_observer` give
-the observer that learns from one known load how loads show; `level` brings back what no measurement holds; `accuracy` judges all of them.
+`signals` computes what a mounted load does and how much of it can be seen; `from_current` is the paper's way;
+`calibrate` gives the observer that learns from one known load how loads show; `level` brings back
+what no measurement holds; `load_accuracy` judges all of them.
 
 Examples
 --------
@@ -11,10 +12,9 @@ Examples
 [0.0, 0.2]
 """
 
-from .calibrate import LoadCalibration, calibrate_load
+from .calibrate import LoadCalibration, calibrate_load, load_observer
 from .from_current import TorqueScale, calibrate_torque, load_from_current
 from .level import AngleLoad
-from .load_observer import load_observer
 from .signals import known_load
 
 __all__ = [

@@ -1,8 +1,9 @@
-r"""The paper's estimate (section IV-E.2): the error of the current that an observer of the unloaded machine makes under load.
+r"""The paper's estimate (section IV-E.2): the current's error of an observer of the unloaded machine under load.
 
-Where the current is recorded, ``tau = K (i - i_hat)``: the current in excess of what the unloaded machine would need for this motion. K is the
-torque constant; one known load gives it by least squares on signals low-passed without delay, together with a constant that takes up a bias.
-An observer that knows the current under load better than its unloaded model does hides the load: use one that follows the unloaded model.
+Where the current is recorded, ``tau = K (i - i_hat)``: the current in excess of what the unloaded machine would need
+for this motion. K is the torque constant; one known load gives it by least squares on signals low-passed without delay,
+together with a constant that takes up a bias. An observer that knows the current under load better than its unloaded
+model does hides the load: use one that follows the unloaded model.
 """
 
 from __future__ import annotations
@@ -78,7 +79,8 @@ def calibrate_torque(
     dx, dt = x - x.mean(), t - t.mean()
     if not dt @ dt > 0 or not dx @ dt > 0:
         raise DataError(
-            f"Torque constant: the known load should change and the current's error follow it; found deviations {t.std():.3g} and {x.std():.3g} "
+            f"Torque constant: the known load should change and the current's error follow it; found deviations "
+            f"{t.std():.3g} and {x.std():.3g} "
             f"and covariance {dx @ dt / len(t):.3g}; check signs, and that the observer is one of the unloaded machine."
         )
     constant = float(dx @ dt / (dx @ dx))
@@ -97,3 +99,42 @@ def load_from_current(measured: npt.ArrayLike, estimated: npt.ArrayLike, scale: 
     """
     error = np.asarray(measured, dtype=float) - np.asarray(estimated, dtype=float)
     return scale.torque_constant * (error - scale.bias)
+
+
+@dataclass(frozen=True)
+class LoadAccuracy:
+    """Errors of a load estimate, low-passed, in units of the load."""
+
+    floor_rms: float  # Of the estimate on episodes without load
+    error_rms: float  # Under load
+    load_rms: float  # Of the load itself
+
+    @property
+    def ratio(self) -> float:
+        """Error under load to the floor."""
+        return self.error_rms / self.floor_rms
+
+    @property
+    def percent(self) -> float:
+        """Error under load in percent of the load."""
+        return 100 * self.error_rms / self.load_rms
+
+
+def load_accuracy(
+    estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
+) -> LoadAccuracy:
+    """Judge estimates of the load, shape (n_samples, batch), against known ones."""
+    truth = np.asarray(load, dtype=float)
+    loaded = np.any(truth != 0, axis=0)
+    if loaded.all() or not loaded.any():
+        raise DataError(
+            f"Load accuracy: needs episodes with and without load, found {int(loaded.sum())} of {len(loaded)} "
+            f"with load."
+        )
+    slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
+    error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
+
+    def rms(values: Array) -> float:
+        return float(np.sqrt(np.mean(values**2)))
+
+    return LoadAccuracy(rms(error[:, ~loaded]), rms(error[:, loaded]), rms(slow[:, loaded]))

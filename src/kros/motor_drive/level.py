@@ -1,16 +1,18 @@
 r"""The level of a load that is fixed to an angle, and drives at their current limit.
 
-What is seen of a load lacks its level (`without_level`). A mass mounted off the axis takes ``tau = c_1 sin(theta) + c_2 cos(theta)`` plus what is fast. The
-same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that the seen part tells c by least squares as soon as the machine turns,
+What is seen of a load lacks its level (`without_level`). A mass mounted off the axis takes ``tau = c_1 sin(theta) + c_2
+cos(theta)`` plus what is fast. The same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that the
+seen part tells c by least squares as soon as the machine turns,
 
 .. math:: \hat c_k = \Bigl(\sum_j \psi_j \psi_j^T T + \epsilon I\Bigr)^{-1} \sum_j \psi_j \hat\tau_s(j) T, \qquad
           \hat\tau = \hat\tau_s + (\varphi - \psi)^T \hat c .
 
 Only what is missing is filled in: fast and unexpected loads pass as they are seen, and without load c stays near zero.
 
-A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where the total current comes out beyond
-the limit, the excess is taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from
-what c says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the unloaded machine needs.
+A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where
+the total current comes out beyond the limit, the excess is taken off the load, and forgotten as slowly as levels are.
+If that would move the load by more than `trusted` from what c says of the angle, it is no load: changes are counted
+again from there, and what excess remains is taken off what the unloaded machine needs.
 """
 
 from __future__ import annotations
@@ -80,7 +82,8 @@ class AngleLoad:
         seen, current, position = (np.asarray(x, dtype=float) for x in (seen, current, position))
         if seen.ndim != 2 or not seen.shape == current.shape == position.shape:
             raise DimensionError(
-                f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} should all be (n_samples, batch)."
+                f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} "
+                f"should all be (n_samples, batch)."
             )
         running, found = self.start(position[0]), LoadAndCurrent(np.empty_like(seen), np.empty_like(seen))
         for k in range(len(seen)):
@@ -112,7 +115,7 @@ class RunningAngleLoad:
         self._gram = np.stack([trust, np.zeros_like(position), trust])  # of sin sin, sin cos, cos cos
 
     def step(self, seen: Array, current: Array, position: Array) -> tuple[Array, Array]:
-        """Return load and total current now, from the observer's and the measured angles in rad; all of shape (batch,)."""
+        """Return load and total current now, from the observer's and the measured angles in rad."""
         phi = np.stack([np.sin(position), np.cos(position)])
         phi = np.where(np.isnan(phi), self._phi, phi)
         self._psi = psi = self._pole * self._psi + np.nan_to_num(phi - self._phi)

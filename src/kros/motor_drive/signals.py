@@ -1,12 +1,13 @@
 r"""Loads as signals: what a known load asks of a machine, and which part of any load a position measurement can tell.
 
-A drive under integral control stands at its target whatever it carries. The torque tau_0 that it holds at the start leaves no trace in positions
-and targets, then or later: tau and tau - tau_0 look the same. What can be seen is the change since the start, and with a leak, which keeps
-estimates from drifting, its high-passed part
+A drive under integral control stands at its target whatever it carries. The torque tau_0 that it holds at the start
+leaves no trace in positions and targets, then or later: tau and tau - tau_0 look the same. What can be seen is the
+change since the start, and with a leak, which keeps estimates from drifting, its high-passed part
 
 .. math:: \tau_s(k) = p\,\tau_s(k-1) + \tau(k) - \tau(k-1), \qquad \tau_s(0) = 0, \quad p = e^{-T/T_\ell},
 
-with the time T_l after which a constant load is forgotten. `AngleLoad` brings the level back where the load is fixed to an angle.
+with the time T_l after which a constant load is forgotten. `AngleLoad` brings the level back where the load is fixed to
+an angle.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _ORDER = 4
 
 
 def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
-    """Return signals without what is faster than a corner, and without delay: a Butterworth filter of order 4, forward and backward."""
+    """Return signals without what is faster than a corner, and without delay: Butterworth, forward and backward."""
     from scipy.signal import butter, sosfiltfilt
 
     if not 0 < corner_hz < 0.5 / sample_period_s:
@@ -61,7 +62,8 @@ def known_load(
         Recorded; its second difference is low-passed without delay.
     sample_period_s : float
     moment : float
-        Mass times gravity times lever arm, in any unit of torque, or divided by the torque constant: then the load is in units of current.
+        Mass times gravity times lever arm, in any unit of torque, or divided by the torque constant: then the load is
+        in units of current.
     inertia : float
         Of the load, the same unit times s^2/rad.
     angle_rad : float

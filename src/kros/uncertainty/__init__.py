@@ -1,34 +1,34 @@
-"""Uncertainty of a population: six forms, residuals, nominal, cover and weights, outliers. The stage's result is an `UncertainModel`.
+"""Uncertainty of a population: six forms, nominal, weights that cover all units, outliers, variation and noise.
 
 Examples
 --------
 >>> import numpy as np
 >>> from kros.core import StateSpace
->>> from kros.uncertainty import quantify_systems
+>>> from kros.uncertainty import quantify
 >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
 >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
->>> found = quantify_systems(units, "additive")
+>>> found = quantify(units, "additive")
 >>> found.unit_ids[found.nominal], found.cover_max <= 1
 ('1', True)
 """
 
 from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
-from .fits.magnitude import FittedMagnitude, fit_magnitude
 from .forms import Form, bounds, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal.choice import NominalChoice, choose_nominal
+from .nominal import NominalChoice, choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
-from .responses import quantify_responses
-from .systems import quantify_systems
+from .settings import FitSettings
 from .variation import VariationAndNoise, variation_and_noise
 from .weights.cover import Cover
+from .weights.magnitude import FittedMagnitude, fit_magnitude
 from .weights.weight import Weight
 
 __all__ = [
     "Cover",
+    "FitSettings",
     "FittedMagnitude",
     "Form",
     "NominalChoice",
@@ -44,8 +44,6 @@ __all__ = [
     "fit_magnitude",
     "misfit",
     "quantify",
-    "quantify_responses",
-    "quantify_systems",
     "rebuild",
     "residual",
     "score_outliers",

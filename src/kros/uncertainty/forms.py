@@ -1,15 +1,15 @@
 r"""The six uncertainty forms of section II-A.4: residual from two plants, perturbed plant from a residual.
 
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =============================
 form                    perturbed plant                        residual                   exact when
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =============================
 additive                Gp = G + E                             Gp - G                     always
 input_multiplicative    Gp = G (1 + E)                         G^+ (Gp - G)               range(Gp - G) in range(G)
 output_multiplicative   Gp = (1 + E) G                         (Gp - G) G^+               rows(Gp - G) in rows(G)
-inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows(Gp) in rows(G)
+inverse_additive        Gp = G (1 - E G)^-1                    Gp^+ (Gp - G) G^+          range(G) in range(Gp), rows
 inverse_input_...       Gp = G (1 - E)^-1                      Gp^+ (Gp - G)              range(G) in range(Gp)
 inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+              rows(G) in rows(Gp)
-======================  =====================================  =========================  ==========================================
+======================  =====================================  =========================  =============================
 
 The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, what it
 leaves out is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published
@@ -66,38 +66,10 @@ class Form(str, Enum):
         """Whether the perturbed plant is rebuilt by an inverse."""
         return self in (Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
-    @property
-    def dual(self) -> Form:
-        """The form of the transposed plants: input and output sides change places."""
-        return _DUAL[self]
-
-
-_DUAL = {
-    Form.ADDITIVE: Form.ADDITIVE,
-    Form.INPUT_MULTIPLICATIVE: Form.OUTPUT_MULTIPLICATIVE,
-    Form.OUTPUT_MULTIPLICATIVE: Form.INPUT_MULTIPLICATIVE,
-    Form.INVERSE_ADDITIVE: Form.INVERSE_ADDITIVE,
-    Form.INVERSE_INPUT_MULTIPLICATIVE: Form.INVERSE_OUTPUT_MULTIPLICATIVE,
-    Form.INVERSE_OUTPUT_MULTIPLICATIVE: Form.INVERSE_INPUT_MULTIPLICATIVE,
-}
-
 
 def as_form(form: Form | str) -> Form:
     """Return the form of a name, or raise a `ConfigError`."""
     return member(Form, form, "Uncertainty form")
-
-
-def residual_shape(form: Form | str, n_outputs: int, n_inputs: int) -> tuple[int, int]:
-    """Return the rows and columns of a form's residual for a plant with `n_outputs` and `n_inputs`."""
-    p, m = n_outputs, n_inputs
-    return {
-        Form.ADDITIVE: (p, m),
-        Form.INPUT_MULTIPLICATIVE: (m, m),
-        Form.OUTPUT_MULTIPLICATIVE: (p, p),
-        Form.INVERSE_ADDITIVE: (m, p),
-        Form.INVERSE_INPUT_MULTIPLICATIVE: (m, m),
-        Form.INVERSE_OUTPUT_MULTIPLICATIVE: (p, p),
-    }[as_form(form)]
 
 
 def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike, *, paper: bool = False) -> Array:
@@ -114,7 +86,8 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     Returns
     -------
     ndarray, shape (..., p', m')
-        See `residual_shape`.
+        Outputs by inputs for the additive form, inputs by outputs for the inverse additive one; inputs by inputs on the
+        input side, outputs by outputs on the output side.
 
     Examples
     --------
@@ -143,7 +116,7 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
 
 
 def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
-    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for; NaN where an inverse form's matrix is singular.
+    """Return the perturbed plants, shape (..., p, m), that a nominal and residuals stand for.
 
     Examples
     --------
@@ -222,7 +195,8 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     Returns
     -------
     ndarray, shape (unit, frequency)
-        NaN where the matrix that the form inverts has a condition number above 1e12; zero where the plant itself is zero.
+        NaN where the matrix that the form inverts has a condition number above 1e12; zero where the plant itself is
+        zero.
 
     Examples
     --------
@@ -245,7 +219,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
 def completion(
     form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None
 ) -> tuple[Array, Array]:
-    """Return residuals, zero where an inverse form is near singular, and the remainder: `Gp = rebuild(form, G, E) + R` everywhere."""
+    """Return residuals, zero where an inverse form is near singular, and the remainder."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
     if form.inverse:
@@ -268,7 +242,8 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
     G, Gp = np.asarray(nominal), np.asarray(perturbed)
     if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
         raise DimensionError(
-            f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}; bring them to the same channels."
+            f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}; bring "
+            f"them to the same channels."
         )
     axes = max(G.ndim, Gp.ndim)
     return G.reshape((1,) * (axes - G.ndim) + G.shape), Gp.reshape((1,) * (axes - Gp.ndim) + Gp.shape)

@@ -1,8 +1,9 @@
 r"""What a quantification gives: a nominal, and a bound on how the units of the population differ from it.
 
-Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u = diag(input_scale)` every response is
-`S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In physical units an output-side residual is `S_y E S_y^-1`, an
-input-side one `S_u E S_u^-1`, an additive one `S_y E S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signals.
+Outputs and inputs are divided by the population's ranges first: with `S_y = diag(output_scale)`, `S_u =
+diag(input_scale)` every response is `S_y^-1 G S_u`. Residuals, covers and weights live in these coordinates. In
+physical units an output-side residual is `S_y E S_y^-1`, an input-side one `S_u E S_u^-1`, an additive one `S_y E
+S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signals.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """A bound on how the units of a population differ from a nominal one, whether their models are known or their responses alone.
+    """A bound on how the units of a population differ from a nominal one.
 
     Parameters
     ----------
@@ -41,14 +42,14 @@ class Uncertainty:
     output_scale : ndarray, shape (p,)
     input_scale : ndarray, shape (m,)
     bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units, for the best nominal of each form (for the chosen form: the nominal used).
+        Largest residual over the other units for the best nominal of each form, and for the nominal of `form`.
     nominals : dict of Form to str
         Unit behind each of these bounds.
     cover : Cover
         Optimal cover of the residuals, frequency by frequency.
     weight : Weight
     misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular (condition above 1e12).
+        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular.
     remainder : Weight or None
         Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
     remainder_cover : Cover or None
@@ -94,7 +95,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResponseUncertainty(Uncertainty):
-    """Weights that bound how measured frequency responses differ from a nominal one, at the frequencies given and nowhere else.
+    """Weights that bound how measured responses differ from a nominal one, at the frequencies given and nowhere else.
 
     Parameters
     ----------
@@ -105,16 +106,16 @@ class ResponseUncertainty(Uncertainty):
     certificate : str
         Where the bound holds.
     unresolved_hz : ndarray, shape (n,), Hz
-        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not resolve, and
-        that may be higher beside it. All other fields are those of `Uncertainty`.
+        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the
+        grid does not resolve, and that may be higher beside it. All other fields are those of `Uncertainty`.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from kros.uncertainty import quantify_responses
+    >>> from kros.uncertainty import quantify
     >>> freqs_hz = np.geomspace(0.1, 40, 30)
     >>> lags = np.array([0.9, 1.0, 1.2])[:, None] / (1 + 1j * freqs_hz / 5)
-    >>> found = quantify_responses(lags[:, :, None, None], freqs_hz, "additive", sample_period_s=0.01)
+    >>> found = quantify(lags[:, :, None, None], "additive", freqs_hz, sample_period_s=0.01)
     >>> found.nominal_id, found.cover_max <= 1
     ('1', True)
     """
@@ -138,10 +139,10 @@ class UncertainModel(Uncertainty):
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
     >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> found = quantify_systems(units, "output_multiplicative")
+    >>> found = quantify(units, "output_multiplicative")
     >>> found.nominal_id, found.form.value, round(found.peak_db[found.form], 1)
     ('1', 'output_multiplicative', -14.0)
     """
@@ -159,20 +160,10 @@ class UncertainModel(Uncertainty):
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
-        arrays: dict[str, Array] = {
-            "freqs_hz": self.freqs_hz,
-            "output_scale": self.output_scale,
-            "input_scale": self.input_scale,
-            "misfit": self.misfit,
-            **{f"bound_{form.value}": bound for form, bound in self.bounds.items()},
-            **_pack_system("nominal", self.nominal_system),
-            **_pack_weight("weight", self.weight, self.cover),
-        }
-        content: dict[str, Any] = {
-            "form": self.form,
-            "unit_ids": self.unit_ids,
-            "nominal": self.nominal,
-            "nominal_id": self.nominal_id,
+        arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
+        arrays |= _pack_system("nominal", self.nominal_system) | _pack_weight("weight", self.weight, self.cover)
+        content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
             "peak_db": {form.value: peak for form, peak in self.peak_db.items()},
@@ -193,34 +184,32 @@ class UncertainModel(Uncertainty):
         content, arrays = load_artifact(Path(folder), "uncertain_model")
         axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {}, Path(folder))
-        dt = content["sample_period_s"]
+        dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
         weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
-        remainder, remainder_cover = (
-            _unpack_weight("remainder", content["remainder"], arrays, dt)
-            if content["remainder"] is not None
-            else (None, None)
-        )
+        remainder: tuple[Weight | None, Cover | None] = (None, None)
+        if content["remainder"] is not None:
+            remainder = _unpack_weight("remainder", content["remainder"], arrays, dt)
+        facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
+        facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
         return cls(
-            form=Form(content["form"]),
-            unit_ids=tuple(content["unit_ids"]),
-            nominal=content["nominal"],
-            nominal_id=content["nominal_id"],
             nominal_system=_unpack_system("nominal", arrays, dt),
-            freqs_hz=arrays["freqs_hz"],
-            output_scale=arrays["output_scale"],
-            input_scale=arrays["input_scale"],
-            bounds={Form(name): arrays[f"bound_{name}"] for name in content["nominals"]},
-            nominals={Form(name): unit for name, unit in content["nominals"].items()},
+            bounds={form: arrays[f"bound_{form.value}"] for form in nominals},
+            nominals=nominals,
             cover=cover,
             weight=weight,
-            misfit=arrays["misfit"],
-            remainder=remainder,
-            remainder_cover=remainder_cover,
+            remainder=remainder[0],
+            remainder_cover=remainder[1],
+            **facts,
         )
+
+
+_ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
+_FACTS = ("form", "unit_ids", "nominal", "nominal_id")
+_OF_WEIGHT = ("structure", "cover_max", "overbound_db_max", "within_tolerance", "method", "remaining_margin")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
-    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them, so that all matrices have entries of common sizes."""
+    """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them."""
     rows = 1.0 / output_scale[:, None]
     if system.n_states == len(output_scale) and np.all(np.eye(system.n_states) == system.C):
         A, B = system.A * output_scale * rows, system.B * rows * input_scale
@@ -229,16 +218,9 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
 
 
 def _facts(weight: Weight) -> dict[str, Any]:
-    own = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
-    same = (
-        "structure",
-        "cover_max",
-        "overbound_db_max",
-        "within_tolerance",
-        "method",
-        "remaining_margin",
-    )
-    return own | {"orders": [weight.left_orders, weight.right_orders]} | {name: getattr(weight, name) for name in same}
+    excess = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
+    orders = {"orders": [weight.left_orders, weight.right_orders]}
+    return excess | orders | {name: getattr(weight, name) for name in _OF_WEIGHT}
 
 
 def _number(value: float | None) -> float:
@@ -260,17 +242,14 @@ def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
-    fields: dict[str, Any] = {
+    fields: dict[str, Any] = {key: facts[key] for key in _OF_WEIGHT} | {
         "left": _unpack_system(f"{name}_left", arrays, dt),
         "right": _unpack_system(f"{name}_right", arrays, dt),
         "left_orders": tuple(facts["orders"][0]),
         "right_orders": tuple(facts["orders"][1]),
         "structure": as_structure(facts["structure"]),
-        "cover_max": facts["cover_max"],
-        "overbound_db_max": facts["overbound_db_max"],
-        "within_tolerance": facts["within_tolerance"],
-        "method": Method(facts.get("method", Method.GRID)),
-        "remaining_margin": _number(facts.get("remaining_margin")),
+        "method": Method(facts["method"]),
+        "remaining_margin": _number(facts["remaining_margin"]),
     }
     cover = Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
     if fields["structure"] is Structure.ENTRYWISE:

@@ -1,7 +1,8 @@
 """The verb: from models of every unit to how the units differ.
 
 models --scored against one another--> outliers, which may be dropped
-models of the others --smallest peak residual--> nominal --residuals, covered by weights--> one uncertain set a kind of model
+models of the others --smallest peak residual--> nominal --residuals, covered by weights--> one uncertain set a kind of
+model
 """
 
 from __future__ import annotations
@@ -13,25 +14,29 @@ from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
+import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_json, save_artifact, write_json
 from ..core.errors import IdentificationError
 from ..core.loading import loader
 from ..core.lti import StateSpace
-from ..core.settings import require_kind
 from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .forms import residual
-from .model import UncertainModel
-from .nominal.choice import choose_nominal
+from .bounded import Options, bound_responses, bound_systems
+from .forms import Form, as_form, residual
+from .inputs import read_response_data
+from .model import ResponseUncertainty, UncertainModel
+from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import UncertaintySettings
-from .systems import quantify_systems
+
+Array = npt.NDArray[Any]
 
 _KIND, _BEST = "choice", "unit"
+_FACTS = ("nominal", "worst_off_nominal", "dropped", "max_order", "pooled")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,7 +83,8 @@ class UncertainModels:
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
-        return f"<UncertainModels: {', '.join(self.sets)} around unit {self.nominal}, {flagged} of {len(self.scores)} outlier scores flagged>"
+        kinds, scores = ", ".join(self.sets), f"{flagged} of {len(self.scores)} outlier scores flagged"
+        return f"<UncertainModels: {kinds} around unit {self.nominal}, {scores}>"
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""
@@ -92,16 +98,9 @@ class UncertainModels:
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content: dict[str, Any] = {
-            "nominal": self.nominal,
-            "worst_off_nominal": self.worst_off_nominal,
-            "dropped": self.dropped,
-        }
-        content |= {
+        content = {name: getattr(self, name) for name in _FACTS} | {
             "kinds": list(self.sets),
             "outliers": list(self.outliers),
-            "max_order": self.max_order,
-            "pooled": self.pooled,
         }
         save_artifact(folder / "uncertainty", _KIND, content)
 
@@ -117,95 +116,129 @@ class UncertainModels:
         content, _ = load_artifact(folder / "uncertainty", _KIND)
         sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
         outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
+        facts = {name: content[name] for name in _FACTS} | {"dropped": tuple(content["dropped"])}
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
-        dropped, order = tuple(content["dropped"]), content["max_order"]
-        return cls(
-            models,
-            content["nominal"],
-            content["worst_off_nominal"],
-            dropped,
-            sets,
-            scores,
-            outliers,
-            order,
-            content.get("pooled", True),
-        )
+        return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
 
 
 @overload
 def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels: ...
 @overload
-def quantify(models: StateSpace | Sequence[Any], *arguments: Any, **settings: Any) -> UncertainModel: ...
 def quantify(
-    models: IdentifiedModels | StateSpace | Sequence[Any], *arguments: Any, work: Work | None = None, **settings: Any
+    models: Array, form: Form | str = ..., freqs_hz: npt.ArrayLike | None = None, **options: Any
+) -> ResponseUncertainty: ...
+@overload
+def quantify(
+    models: StateSpace | ModelSet | Sequence[Any] | Mapping[str, Any],
+    form: Form | str = ...,
+    freqs_hz: npt.ArrayLike | None = None,
+    **options: Any,
+) -> UncertainModel: ...
+def quantify(
+    models: Any,
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
+    freqs_hz: npt.ArrayLike | None = None,
+    *,
+    work: Work | None = None,
+    **options: Any,
 ) -> Any:
-    """Quantify how the units of a population differ.
+    """Quantify how the units of a population differ from a nominal one.
 
     Parameters
     ----------
-    models : IdentifiedModels
-        Of `kros.identify`. A batch or list of systems is taken as well; then all is as in `quantify_systems`.
-    *arguments
-        Of `quantify_systems` alone.
+    models : IdentifiedModels, ModelSet, systems or responses
+        Of `kros.identify`; or a batch, list or mapping by name of stable systems with `A, B, C, D, dt`, discrete or
+        continuous (``dt = 0``), with as many states as they like; or frequency responses, complex, of shape (unit,
+        frequency, p, m), or objects with `frdata, omega, dt` as python-control has them.
+    form : Form or str
+        Uncertainty form of the weights; the bounds of all six are reported.
+    freqs_hz : array_like, shape (frequency,), Hz, optional
+        By default 1000 logarithmic points over the six decades below Nyquist, not below what the longest episode of
+        recordings resolves; of continuous systems from a hundredth of the slowest to ten times the fastest pole. To the
+        grid of continuous systems points up to ten times its end are added; beyond these, residuals count as constant.
+        Arrays of responses need it.
     work : Work, optional
-        Where it runs.
-    **settings
-        Of `UncertaintySettings`: ``form``, ``nominal``, ``n_freqs``, ``max_order``, ``tolerance_db``, ``drop_outliers``,
-        ``outlier_form``, ``false_alarm_rate``.
+        Where models of `kros.identify` are quantified.
+    **options
+        Of models of `kros.identify`: those of `UncertaintySettings`. Of all others: ``unit_ids`` (names),
+        ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
+        row or name, or a model that is none; by default the unit with the lowest peak), ``structure`` ("diagonal", or
+        "entrywise" for the paper's bounds of entries, unsound for a full perturbation), ``max_order`` (of an entry),
+        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of arrays of
+        responses; zero for continuous time), ``fit`` (`FitSettings`).
 
     Returns
     -------
-    UncertainModels
+    UncertainModels, UncertainModel or ResponseUncertainty
+        For models of `kros.identify`, for systems, and for responses: weights that bound the residuals of all units at
+        all frequencies, or at those given. With all units identical: weights of zero and a peak of minus infinity.
 
     Raises
     ------
     IdentificationError
-        When fewer than two units are left, or the nominal is none of them.
+        Fewer than two identified units are left, or the nominal is none of them.
+    DimensionError
+        Sizes, sampling periods or frequencies differ, or scales do not fit.
+    DataError
+        Fewer than two units, unstable models, NaN.
+    ConfigError
+        Unknown form, structure, nominal or option, frequencies above Nyquist, an order or tolerance out of range.
 
     Examples
     --------
-    >>> import kros
-    >>> drives = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> models = kros.identify(drives, refine=False)
-    >>> uncertain = kros.quantify(models, n_freqs=50, max_order=1)
-    >>> uncertain.sets["linear_edmd"].cover_max <= 1  # no unit is outside of the set
-    True
+    >>> import numpy as np
+    >>> from kros.core import StateSpace
+    >>> from kros.uncertainty import quantify
+    >>> poles = np.array([0.88, 0.9, 0.91])[:, None, None]
+    >>> units = StateSpace(poles, 1 - poles, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
+    >>> model = quantify(units, "inverse_input_multiplicative")
+    >>> model.nominal, model.cover_max <= 1
+    (1, True)
     """
-    if isinstance(models, StateSpace | list | tuple):
-        return quantify_systems(models, *arguments, **settings)
-    models = require_kind(
-        models, IdentifiedModels, "Quantify", "identify the population first, kros.identify(population)"
-    )
-    asked = UncertaintySettings.of(settings, "Quantify")
-    outliers, scores = score_population(models, asked, work)
-    dropped = {row["unit"] for row in scores if row["outlier"]} if asked.drop_outliers else set()
+    if isinstance(models, IdentifiedModels):
+        given = {} if freqs_hz is None else {"freqs_hz": freqs_hz}
+        settings = UncertaintySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
+        return _quantify_population(models, settings, work)
+    if isinstance(models, Mapping):
+        options["unit_ids"], models = tuple(models), list(models.values())
+    if isinstance(models, list | tuple) and models and all(hasattr(model, "frdata") for model in models):
+        models, freqs_hz = read_response_data(models, freqs_hz, options)
+    read = Options.of(options)
+    if isinstance(models, np.ndarray):
+        return bound_responses(models, as_form(form), freqs_hz, read)
+    return bound_systems(models, as_form(form), freqs_hz, read)
+
+
+def _quantify_population(models: IdentifiedModels, settings: UncertaintySettings, work: Work | None) -> UncertainModels:
+    """Score outliers, choose the nominal of the first kind of models, and bound every kind around it."""
+    outliers, scores = score_population(models, settings, work)
+    dropped = {row["unit"] for row in scores if row["outlier"]} if settings.drop_outliers else set()
     first = models.models()
     modelled = set(first.unit_ids) - dropped
     units = [u for u in models.facts.pooled if u in modelled]
     if len(units) < 2:
         raise IdentificationError(
-            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped are {sorted(dropped)}. "
-            "Record more units in the condition that feeds synthesis, or keep outliers."
+            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped "
+            f"are {sorted(dropped)}. Record more units in the condition that feeds synthesis, or keep outliers."
         )
-    nominal = choose_unit(first, units, asked)
-    tasks = [partial(quantify_models, models.models(kind), units, asked, nominal) for kind in models.kinds]
+    nominal = choose_unit(first, units, settings)
+    tasks = [partial(quantify_kind, models.models(kind), units, settings, nominal) for kind in models.kinds]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
-    farthest = worst_off_nominal(first, sets[models.kinds[0]])
     return UncertainModels(
-        models,
-        nominal,
-        farthest,
-        tuple(sorted(dropped)),
-        sets,
-        tuple(scores),
-        outliers,
-        asked.max_order,
-        asked.nominal is None,
+        models=models,
+        nominal=nominal,
+        worst_off_nominal=worst_off_nominal(first, sets[models.kinds[0]]),
+        dropped=tuple(sorted(dropped)),
+        sets=sets,
+        scores=tuple(scores),
+        outliers=outliers,
+        max_order=settings.max_order,
+        pooled=settings.nominal is None,
     )
 
 
 def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySettings) -> str:
-    """Return the nominal unit: the one asked for, else the best of the first kind of models, which all others share as in the paper."""
+    """Return the nominal unit, by default the best of the first kind of models, shared by all as in the paper."""
     if settings.nominal is None or (settings.nominal == _BEST and _BEST not in units):
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
         return units[choose_nominal(responses, settings.form).index]
@@ -216,19 +249,10 @@ def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySetting
     return settings.nominal
 
 
-def quantify_models(models: ModelSet, units: list[str], settings: UncertaintySettings, nominal: str) -> UncertainModel:
+def quantify_kind(models: ModelSet, units: list[str], settings: UncertaintySettings, nominal: str) -> UncertainModel:
     """Quantify one kind of model over the pooled units."""
-    return quantify_systems(
-        models.systems(units),
-        settings.form,
-        models.frequencies(settings.n_freqs),
-        unit_ids=units,
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
-        nominal=nominal,
-        max_order=settings.max_order,
-        tolerance_db=settings.tolerance_db,
-    )
+    options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
+    return bound_systems(models, Form(settings.form), models.frequencies(settings.n_freqs), options)
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:

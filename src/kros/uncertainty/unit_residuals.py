@@ -1,10 +1,10 @@
 r"""Residuals of every unit beside weights, in both readings: entry by entry as in the paper's figures, and as a cover.
 
-    |E_ij|                               against  |W_ij|, the best fit to the largest of the covered units     entrywise: bounds numbers
-    sigma_max(W_L^-1 E W_R^-1)           against  one                                                          sound: bounds the perturbation
+    |E_ij|                       against  |W_ij|, the best fit to the largest of the covered units    entrywise
+    sigma_max(W_L^-1 E W_R^-1)   against  one                                                         sound
 
-Nothing here decides anything: it is what pictures of an uncertain model and of an outlier show. A unit that the weights were not made for
-exceeds one where it sticks out.
+Nothing here decides anything: it is what pictures of an uncertain model and of an outlier show. A unit that the weights
+were not made for exceeds one where it sticks out.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ import numpy.typing as npt
 from ..core.artifacts import load_artifact, save_artifact
 from ..core.errors import DimensionError
 from ..core.loading import check_shapes, loader
-from .fits.magnitude import fit_magnitude
 from .forms import Form, residual
 from .weights.cover import Cover, cover_ratio
+from .weights.magnitude import fit_magnitude
 from .weights.weight import EntrywiseWeight, Weight, unstructured_excess
 
 Array = npt.NDArray[Any]
@@ -94,11 +94,12 @@ def unit_residuals(
     max_order: int = 4,
     tolerance_db: float = 1.0,
 ) -> UnitResiduals:
-    """Return residuals of units against a nominal, responses (unit, frequency, p, m) in scaled coordinates, beside weights or a cover."""
+    """Return residuals of units against a nominal, of shape (unit, frequency, p, m), beside weights or a cover."""
     inside = np.array([u not in outside for u in unit_ids], dtype=bool)
     if len(unit_ids) != len(responses) or not inside.any():
         raise DimensionError(
-            f"Residuals of units: need a name for each of {len(responses)} responses and at least one unit that is covered, "
+            f"Residuals of units: need a name for each of {len(responses)} responses and at least one unit that "
+            f"is covered, "
             f"found {len(unit_ids)} names, {int(inside.sum())} of them covered."
         )
     E = residual(form, nominal, responses)
@@ -128,7 +129,7 @@ def unit_residuals(
 
 
 def weight_ratio(weights: Weight | Cover, E: Array, freqs_hz: Array) -> Array:
-    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency); the largest ratio of an entry where the weights are entrywise."""
+    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency)."""
     if isinstance(weights, EntrywiseWeight):
         size = np.abs(weights.matrix().frequency_response(freqs_hz))
         return np.asarray(np.divide(np.abs(E), size, out=np.zeros(E.shape), where=size > 0).max(axis=(-2, -1)))

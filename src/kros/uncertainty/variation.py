@@ -1,15 +1,17 @@
-r"""What is variation and what is noise: the residuals of a population beside those that finite recordings alone would make.
+r"""Variation between units, and the estimation noise of recordings of finite length.
 
     bootstrapped models of every unit --responses--> draws (unit, draw, frequency)
     total(f) = mean over pairs of units   |E(G_k, G_i)|_F^2          what is seen: variation and noise of both estimates
-    noise(f) = mean over pairs of draws   |E(G_i*, G_i**)|_F^2       of the same unit: what would be seen of identical units
+    noise(f) = mean over pairs of draws   |E(G_i*, G_i**)|_F^2       what would be seen of identical units
     ratio(f) = noise / total
 
-For the additive form the noise of both estimates adds to the squared difference, so the ratio is an unbiased comparison of mean squares (the
-within over the total mean square of a one-way random-effects analysis of variance); for the other forms it is one to first order in the
-residual. It scatters: with identical units around one, by about ``sqrt(2 / (units - 1))`` and less. The share is the ratio cut at one.
+For the additive form the noise of both estimates adds to the squared difference, so the ratio is an unbiased comparison
+of mean squares (the within over the total mean square of a one-way random-effects analysis of variance); for the other
+forms it is one to first order in the residual. It scatters: with identical units around one, by about ``sqrt(2 / (units
+- 1))`` and less. The share is the ratio cut at one.
 
-What the bootstrap does not see is not in it: a bias that all episodes share counts as variation where it differs between units.
+What the bootstrap does not see is not in it: a bias that all episodes share counts as variation where it differs
+between units.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ from ..core.loading import check_shapes, loader
 from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual
-from .validation import check_scale
+from .inputs import check_scale
 
 Array = npt.NDArray[Any]
 
@@ -55,7 +57,8 @@ class VariationAndNoise:
     residual : ndarray, shape (unit, frequency)
         Largest singular value of the residual against the nominal unit, in scaled coordinates.
     band : ndarray, shape (unit, frequency)
-        What the largest singular value of the residual between a unit and a resampled model of its own stays below with probability `level`.
+        What the largest singular value of the residual between a unit and a resampled model of its own stays below with
+        probability `level`.
     total, noise : ndarray, shape (frequency,)
         Mean squared Frobenius norms of residuals between units, and between resampled models of the same unit.
 
@@ -66,7 +69,8 @@ class VariationAndNoise:
     >>> from kros.uncertainty import variation_and_noise
     >>> poles = np.array([0.8, 0.9]).reshape(2, 1, 1)
     >>> draws = poles[:, None] + 0.001 * np.random.default_rng(0).normal(size=(2, 30, 1, 1))
-    >>> samples = ModelSamples(("a", "b"), KoopmanMatrices(poles, np.ones((2, 1, 1))), KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
+    >>> estimate = KoopmanMatrices(poles, np.ones((2, 1, 1)))
+    >>> samples = ModelSamples(("a", "b"), estimate, KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
     >>> found = variation_and_noise(samples, np.geomspace(0.1, 40, 20), 0.01)
     >>> found.residual.shape, found.level
     ((2, 20), 0.95)
@@ -157,7 +161,8 @@ def variation_and_noise(
     >>> from kros.uncertainty import variation_and_noise
     >>> poles = np.array([0.8, 0.9]).reshape(2, 1, 1)
     >>> draws = poles[:, None] + 0.001 * np.random.default_rng(0).normal(size=(2, 30, 1, 1))
-    >>> samples = ModelSamples(("a", "b"), KoopmanMatrices(poles, np.ones((2, 1, 1))), KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
+    >>> estimate = KoopmanMatrices(poles, np.ones((2, 1, 1)))
+    >>> samples = ModelSamples(("a", "b"), estimate, KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
     >>> found = variation_and_noise(samples, np.geomspace(0.1, 40, 20), 0.01)
     >>> bool((found.noise < found.total).all())  # these units differ by more than recordings of this length explain
     True
@@ -210,7 +215,8 @@ def _require(models: ModelSamples, nominal: int) -> tuple[int, int, int, int]:
     for unit, parts in zip(models.unit_ids, zip(*_matrices(models), strict=True), strict=True):
         if not all(np.isfinite(p).all() for p in parts):
             raise DataError(
-                f"Variation and noise: unit {unit} has a model or a draw that is not finite; leave the unit out, or raise alpha."
+                f"Variation and noise: unit {unit} has a model or a draw that is not finite; leave the unit out, "
+                f"or raise alpha."
             )
     if not 0 <= nominal < units:
         raise ConfigError(f"Variation and noise: the nominal should be a row of {units} units, found {nominal}.")

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...core.lti import StateSpace, gain
 from ...synthesis import Injection, ObserverProblem, mixed
-from ...uncertainty import quantify_systems
+from ...uncertainty import quantify
 from ...uncertainty.weights.weight import EntrywiseWeight
 from ..task import DesignResult, DesignTask
 
@@ -27,7 +27,7 @@ def design_published(task: DesignTask) -> DesignResult:
 def entrywise_weight(task: DesignTask) -> EntrywiseWeight:
     """Return bounds of all entries of the residuals of the units that the study's own set covers."""
     models = task.models
-    found = quantify_systems(
+    found = quantify(
         models.systems(task.covered),
         task.require_problem().form,
         unit_ids=task.covered,

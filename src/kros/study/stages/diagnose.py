@@ -24,7 +24,7 @@ from ...uncertainty import (
     residual,
     variation_and_noise,
 )
-from ...uncertainty.nominal.choice import choose_nominal
+from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals

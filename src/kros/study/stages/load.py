@@ -31,7 +31,7 @@ from ...motor_drive import (
     load_from_current,
     load_observer,
 )
-from ...motor_drive.accuracy import load_accuracy
+from ...motor_drive.from_current import load_accuracy
 from ...motor_drive.signals import low_passed
 from ...observer import Observer, run_observer
 from ..config import LoadConfig

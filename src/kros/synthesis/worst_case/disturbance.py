@@ -76,7 +76,7 @@ class Shaping:
 
 def default_fit() -> Fit:
     """Return `kros.uncertainty.fit_magnitude`."""
-    from ...uncertainty.fits.magnitude import fit_magnitude
+    from ...uncertainty.weights.magnitude import fit_magnitude
 
     return fit_magnitude
 

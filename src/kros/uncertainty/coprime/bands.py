@@ -1,15 +1,16 @@
 r"""Energies of signals in bands of frequency, exact for signals of finite length, and covers of many of them.
 
-A residual ``r_0 ... r_{N-1}`` that is zero before and after has the spectrum ``R = sum_k r_k e^{-j k theta}``, and what a stable T makes of
-it, for all time, has
+A residual ``r_0 ... r_{N-1}`` that is zero before and after has the spectrum ``R = sum_k r_k e^{-j k theta}``, and what
+a stable T makes of it, for all time, has
 
-.. math:: \sum_k |T r|_k^2 = \frac{1}{2\pi} \int_{-\pi}^{\pi} \mathrm{tr}(T^H T\, R R^H)\, d\theta \;\le\; \sum_b \mathrm{tr}(M_b \Phi_b), \qquad
+.. math:: \sum_k |T r|_k^2 = \frac{1}{2\pi} \int_{-\pi}^{\pi} \mathrm{tr}(T^H T\, R R^H)\, d\theta
+          \;\le\; \sum_b \mathrm{tr}(M_b \Phi_b), \qquad
           M_b \succeq T^H T \text{ throughout band } b, \qquad \Phi_b = \frac{1}{\pi} \int_b R R^H d\theta .
 
-Signals and systems are real, so that the two signs of frequency contribute alike; bands are those of the positive one. ``R R^H`` is a
-polynomial in ``e^{j theta}`` whose coefficients are the autocorrelation, so its integral over a band is a finite sum, taken as such: no window, no average,
-no samples of a spectrum between which something could stand out. Start and tail are inside: the error at the start is a sample in front of the residual.
-What rounding may miss is added.
+Signals and systems are real, so that the two signs of frequency contribute alike; bands are those of the positive one.
+``R R^H`` is a polynomial in ``e^{j theta}`` whose coefficients are the autocorrelation, so its integral over a band is
+a finite sum, taken as such: no window, no average, no samples of a spectrum between which something could stand out.
+Start and tail are inside: the error at the start is a sample in front of the residual. What rounding may miss is added.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ _BLOCKS = 4  # of weights that are kept
 _ITERATIONS, _TURNS = 60, 10  # at most; after so many it is looked which bands can be left
 _ENOUGH = 1.002  # of what is covered
 _REGULAR = 1e-14  # of the largest eigenvalue: what is smaller is rounding
-_RIDGE = 1e-6  # of the largest energy, in every direction: where all lie in fewer of them, the iteration needs its square above rounding
+# of the largest energy, in every direction: the iteration needs its square above rounding
+_RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +58,7 @@ class BandEnergies:
     def of(
         cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike, samples: npt.ArrayLike | None = None
     ) -> BandEnergies:
-        """Return energies (batch, b, n, n) of the episodes of a signal (n_samples, batch, n) that is zero before and after."""
+        """Return energies (batch, b, n, n) of the episodes of a signal (n_samples, batch, n)."""
         signal, lengths, edges = np.asarray(signal, dtype=float), np.asarray(lengths, dtype=int), check_edges(edges)
         if (
             signal.ndim != 3
@@ -64,7 +66,8 @@ class BandEnergies:
             or not ((lengths > 0) & (lengths <= len(signal))).all()
         ):
             raise DimensionError(
-                f"Band energies: {signal.shape} should be (n_samples, batch, n) with lengths between one and n_samples, found {lengths}."
+                f"Band energies: {signal.shape} should be (n_samples, batch, n) with lengths between one and "
+                f"n_samples, found {lengths}."
             )
         if not np.isfinite(signal).all():
             raise DimensionError(
@@ -78,7 +81,7 @@ class BandEnergies:
         )
 
     def of_units(self, units: Sequence[str]) -> BandEnergies:
-        """Return the mean over the episodes of every unit, units in order of appearance; `units` names that of every episode."""
+        """Return the mean over the episodes of every unit, units in order of appearance."""
         names = list(dict.fromkeys(units))
         member = np.array([[unit == name for unit in units] for name in names], dtype=float)
         return replace(self, energy=np.einsum("ue,ebij->ubij", member / member.sum(axis=1, keepdims=True), self.energy))
@@ -100,7 +103,7 @@ class BandEnergies:
 
 
 def band_edges(n_samples: int, bands: int = BANDS) -> Array:
-    """Return edges of bands: one from zero to the lowest frequency of an episode, the others equally wide on a logarithmic scale up to Nyquist."""
+    """Return edges of bands, logarithmic from the lowest frequency of an episode to Nyquist, and one below."""
     if n_samples < 2 or bands < 2:
         raise DimensionError(f"Bands: needs at least two samples and two bands, found {n_samples} and {bands}.")
     return np.concatenate([[0.0], np.geomspace(2 * np.pi / max(n_samples, 4), np.pi, bands)[:-1], [np.pi]])
@@ -121,7 +124,7 @@ def check_edges(edges: npt.ArrayLike) -> Array:
 
 
 def cover(energies: Array, weight: Array | None = None) -> Array:
-    """Return no smaller than any energy (k, b, n, n), of least `tr(weight M)`: Jezek, Rehacek, Fiurasek, Phys. Rev. A 65 (2002) 060301."""
+    """Return what no energy (k, b, n, n) exceeds, of least `tr(weight M)`: Jezek et al., Phys. Rev. A 65 060301."""
     n = energies.shape[-1]
     mean = np.sqrt(np.einsum("kbii->bi", energies).real / len(energies))
     mean[mean <= 0] = 1.0
@@ -144,7 +147,7 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
 
 
 def _least(E: Array) -> Array:
-    """Return the iteration's ``sum_k E_k Y_k`` in every band, for matrices (b, k, n, n); a band is left when hardly anything exceeds it any more."""
+    """Return the iteration's ``sum_k E_k Y_k`` in every band, for matrices (b, k, n, n)."""
     count, many, n = E.shape[:3]
     found, left = np.empty((count, n, n), complex), np.arange(count)
     G = np.broadcast_to(np.eye(n) / np.sqrt(many), E.shape).astype(complex)  # Y_k = G_k^H G_k
@@ -207,7 +210,7 @@ def _lags(signals: Array) -> Array:
 
 
 def _integrals(lags: Array, edges: Array) -> Array:
-    """Return the integrals from zero to every edge, shape (batch, edges, n, n); their weights are the same for all signals."""
+    """Return the integrals from zero to every edge, shape (batch, edges, n, n)."""
     batch, n_samples, n, _ = lags.shape
     lags = lags.reshape(batch, n_samples, n * n)
     even, odd = np.zeros((2, batch, len(edges), n * n))
@@ -222,7 +225,7 @@ def _integrals(lags: Array, edges: Array) -> Array:
 
 @lru_cache(maxsize=_BLOCKS)
 def _weights(edges: bytes, start: int, stop: int) -> tuple[Array, Array]:
-    """Return the integrals of cosines and sines of some lags from zero to every edge; recordings of one length share them."""
+    """Return the integrals of cosines and sines of some lags from zero to every edge."""
     lag = np.arange(start, stop)
     angle = np.frombuffer(edges)[:, None] * lag
     return np.sin(angle) / lag, 2 * np.sin(angle / 2) ** 2 / lag

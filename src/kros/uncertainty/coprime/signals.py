@@ -1,14 +1,16 @@
-r"""The uncertain set of signals: what recorded machines did that a model did not foresee, covered over units in frequency.
+r"""The uncertain set of signals: residuals of recorded machines, covered over units in frequency.
 
-Along any recording the model ``x+ = A theta(x) + B u + r`` leaves the residual r, which holds all that it does not know: the unit's own parameters,
-loads, unmodelled effects, the lifting's error. In front of it stands the error of the first estimate, as a sample: it excites the
-error of an observer as a residual does. With ``Phi_b`` the energies of r in bands, exact (`bands`), the set is
+Along any recording the model ``x+ = A theta(x) + B u + r`` leaves the residual r, which holds all that it does not
+know: the unit's own parameters, loads, unmodelled effects, the lifting's error. In front of it stands the error of the
+first estimate, as a sample: it excites the error of an observer as a residual does. With ``Phi_b`` the energies of r in
+bands, exact (`bands`), the set is
 
 .. math:: \mathcal{S} = \{ r : \Phi_b(r) \preceq \bar\Phi_b \text{ in every band } b \}, \qquad
           \bar\Phi_b \succeq \Phi_b(r_i) \text{ for every recorded unit } i .
 
-Nothing is in a loop and no form has to fit: tall plants cost nothing. It is valid for motion like that recorded. Another model has other residuals, so
-every model has a set of its own; what is compared is the error that observers are certified to stay below.
+Nothing is in a loop and no form has to fit: tall plants cost nothing. It is valid for motion like that recorded.
+Another model has other residuals, so every model has a set of its own; what is compared is the error that observers are
+certified to stay below.
 """
 
 from __future__ import annotations
@@ -46,7 +48,7 @@ class SignalSet:
         start: Array | None = None,
         edges: npt.ArrayLike | None = None,
     ) -> SignalSet:
-        """Return the set of one-step residuals (n_samples, batch, n) of episodes, with the error of the first estimate in front."""
+        """Return the set of one-step residuals (n_samples, batch, n) of episodes."""
         lengths = np.asarray(lengths, dtype=int)
         first = np.zeros((1, *residual.shape[1:])) if start is None else np.asarray(start, dtype=float)[None]
         signal, samples = np.concatenate([first, residual]), lengths + 1  # as many estimates, the first among them
@@ -59,7 +61,7 @@ class SignalSet:
         return self.energies.cover()
 
     def spectrum(self, n_points: int, weights: npt.ArrayLike | None = None) -> Array:
-        """Return a density (n_points, n, n) from zero to Nyquist, even over every band, of the cover or of a mixture of units."""
+        """Return a density (n_points, n, n) from zero to Nyquist, even over every band."""
         edges = self.energies.edges
         energy = (
             self.cover.energy

@@ -1,9 +1,10 @@
-"""Distances of units from one another: residuals of every unit against many nominals, in dB relative to their typical size.
+"""Distances of units from one another, in dB relative to their typical size.
 
-responses (unit, frequency, p, m) --residuals from every nominal--> scaled to typical entries of one --sigma_max, smoothed--> levels in dB
+responses (unit, frequency, p, m) --residuals from every nominal--> scaled to typical entries of one --sigma_max,
+smoothed--> levels in dB
 
-Entries are scaled by their typical size over all pairs (Sinkhorn scaling of the median squared magnitudes), so that every row and column
-of the residual counts alike, at every frequency by itself.
+Entries are scaled by their typical size over all pairs (Sinkhorn scaling of the median squared magnitudes), so that
+every row and column of the residual counts alike, at every frequency by itself.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Distances:
     """Distances of all units."""
 
     nominals: Array  # (nominal,): rows of the units that were the nominal in turn
-    # (nominal, unit, frequency), dB: largest singular value of the scaled residual, smoothed; NaN of a unit against itself
+    # (nominal, unit, frequency), dB: largest singular value of the scaled residual, smoothed; NaN against itself
     by_nominal: Array
     levels: Array  # (unit, frequency), dB: the median over the nominals
     left: Array  # (frequency, p'): typical size of the residual's rows
@@ -63,7 +64,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
 
 
 def joined(form: Form, known: Distances, rows: Array, nominals: Array, response: Array, freqs_hz: Array) -> Distances:
-    """Return distances of some units of a population, and of one more, which comes last, in the scales of the population."""
+    """Return distances of some units of a population, and of one more, which comes last."""
     there = np.flatnonzero(np.isin(known.nominals, rows))
     own = scaled_levels(form, nominals[there], response, known, freqs_hz)
     levels = np.concatenate([known.levels[rows], np.median(own, axis=0)[None]])
@@ -76,7 +77,7 @@ def joined(form: Form, known: Distances, rows: Array, nominals: Array, response:
 
 
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
-    """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB; responses broadcast against each other."""
+    """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
     return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), _LEAST)), freqs_hz)
 
@@ -106,13 +107,13 @@ def typical(squares: Array) -> tuple[Array, Array]:
 
 
 def balance(responses: Array) -> tuple[Array, Array]:
-    """Return ranges of outputs and inputs from responses themselves: the typical entry of the scaled responses is one."""
+    """Return ranges of outputs and inputs from responses themselves."""
     left, right = typical(np.median(squared(responses), axis=(0, 1))[None])
     return left[0], 1 / right[0]
 
 
 def _nominals(G: Array) -> Array:
-    """All units, or 64 (of thousands fewer) spread evenly over their distances from the entrywise median; their order does not matter."""
+    """All units, or 64 (of thousands fewer) spread evenly over their distances from the entrywise median."""
     if len(G) <= MOST_NOMINALS:
         return np.arange(len(G))
     middle = np.median(G.real, axis=0) + 1j * np.median(G.imag, axis=0)
@@ -151,7 +152,7 @@ def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:
 
 
 def _smooth(level: Array, freqs: Array) -> Array:
-    """Moving average over log frequency, to a billionth of a dB: equal units are rounded differently in other places of a batch, which flags nobody."""
+    """Moving average over log frequency, to a billionth of a dB."""
     x = np.log10(freqs)
     near = (np.abs(x[:, None] - x) <= _SMOOTHING_DECADES / 2).astype(float)
     return np.asarray(np.round(level @ (near / near.sum(axis=0)), 9))

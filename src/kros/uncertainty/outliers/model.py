@@ -1,20 +1,23 @@
 r"""Outliers (Appendix A): units whose residual exceeds the residuals of the others.
 
-For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant (`distances`). A unit's
-level at a frequency is the median over all nominals of the largest singular value, relative to its typical size there and averaged (in dB)
-over a third of a decade; its excess is what its largest level has beyond the largest of the others:
+For every pair of units the residual of the form is taken with the one as nominal and the other as perturbed plant
+(`distances`). A unit's level at a frequency is the median over all nominals of the largest singular value, relative to
+its typical size there and averaged (in dB) over a third of a decade; its excess is what its largest level has beyond
+the largest of the others:
 
     level_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
     excess_i   = max_f level_i(f) - max_(k != i) max_f level_k(f),    dB
 
-No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is computed with every unit as
-the only nominal, as the paper states its criterion: the range over the nominals, and the share of them under which the unit is conspicuous.
+No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is
+computed with every unit as the only nominal, as the paper states its criterion: the range over the nominals, and the
+share of them under which the unit is conspicuous.
 
-Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold rests on an exponential
-tail of the levels whose scale the others show, the mean over frequency (`tail`): an extrapolation, and labelled as such. Units are taken out
-one at a time while they are beyond (`separation`), up to a third of the units. Fewer than eight units flag nothing and decide nothing; two
-units are refused. All this compares estimates that are equally good: units that were recorded for too little are told apart before
-(`recorded`). What a score would have shown stands beside it (`scoring`, `score`).
+Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold
+rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
+extrapolation, and labelled as such. Units are taken out one at a time while they are beyond (`separation`), up to a
+third of the units. Fewer than eight units flag nothing and decide nothing; two units are refused. All this compares
+estimates that are equally good: units that were recorded for too little are told apart before (`recorded`). What a
+score would have shown stands beside it (`scoring`, `score`).
 """
 
 from __future__ import annotations
@@ -23,7 +26,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -32,7 +35,7 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
-from ..validation import check_scale
+from ..inputs import check_scale
 from .distances import Distances, balance, distances, joined, scaled_levels
 from .score import FEWEST_UNITS, OutlierScore, Status
 from .scoring import Nominals, scores_of
@@ -112,8 +115,9 @@ class OutlierModel:
         without : collection of str
             Inliers that are not compared with, such as the unit itself.
         motion_db : ndarray, shape (frequency,), dB, optional
-            Level by which responses of one unit differ between motions (`motion_levels`), where the unit was moved otherwise than the inliers: it is
-            taken from the unit's levels, in amplitude, and a unit that is beyond its bound without this alone has the status ``other motions``.
+            Level by which responses of one unit differ between motions (`motion_levels`), where the unit was moved
+            otherwise than the inliers: it is taken from the unit's levels, in amplitude, and a unit that is beyond its
+            bound without this alone has the status ``other motions``.
 
         Returns
         -------
@@ -134,7 +138,8 @@ class OutlierModel:
         G = np.asarray(response)
         if G.shape != self.responses.shape[1:]:
             raise DimensionError(
-                f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored frequencies, found {G.shape}."
+                f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored "
+                f"frequencies, found {G.shape}."
             )
         _require_finite(G[None], (unit,), self.freqs_hz)
         everyone = np.concatenate([self.responses[rows], (G / self.output_scale[:, None] * self.input_scale)[None]])
@@ -164,9 +169,10 @@ class OutlierModel:
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
 
     def motion_levels(self, one: Array, other: Array) -> Array:
-        """Return the level, shape (frequency,), dB, by which estimates differ where motions do, from those of halves of the episodes.
+        """Return the level, shape (frequency,), dB, by which estimates differ where motions do.
 
-        Responses have the shape (unit, frequency, p, m); the median over the units counts. Halves scatter twice as much as the whole, in variance.
+        Responses have the shape (unit, frequency, p, m); the median over the units counts. Halves scatter twice as much
+        as the whole, in variance.
         """
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
         return np.asarray(
@@ -245,7 +251,8 @@ def score_outliers(
     form : Form or str
     unit_ids : tuple of str, optional
     output_scale, input_scale : array_like, optional
-        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never matter.
+        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never
+        matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
 
@@ -268,7 +275,7 @@ def score_outliers(
     >>> import numpy as np
     >>> from kros.uncertainty import score_outliers
     >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = np.append(1 + 0.02 * rng.normal(size=20), 1.5), 5 + 0.2 * rng.normal(size=21)  # the last gain is not like the others
+    >>> gains, corners_hz = np.append(1 + 0.02 * rng.normal(size=20), 1.5), 5 + 0.2 * rng.normal(size=21)
     >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
     >>> [score.unit for score in score_outliers(responses[:, :, None, None], freqs_hz).scores if score.outlier]
     ['20']
@@ -327,19 +334,21 @@ def _population(
     responses: npt.ArrayLike | Sequence[npt.ArrayLike], unit_ids: tuple[str, ...] | None, freqs_hz: npt.ArrayLike
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Checked responses, names and frequencies."""
-    listed = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in responses]  # type: ignore[union-attr]
+    listed: Any = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in cast(Any, responses)]
     ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
     freqs = np.asarray(freqs_hz, float)
     for name, one in zip(ids, listed, strict=False):
         if one.shape != listed[0].shape:
             raise DimensionError(
-                f"Outlier scores: unit {name} has a response of shape {one.shape}, unit {ids[0]} one of shape {listed[0].shape}; "
+                f"Outlier scores: unit {name} has a response of shape {one.shape}, unit {ids[0]} one of shape "
+                f"{listed[0].shape}; "
                 "bring all units to the same frequencies and channels."
             )
     G = check_responses(np.asarray(listed))
     if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
         raise DataError(
-            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found {len(G)} units, {len(ids)} ids, "
+            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found "
+            f"{len(G)} units, {len(ids)} ids, "
             f"{freqs.size} frequencies for {G.shape[1]}."
         )
     if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
@@ -353,6 +362,7 @@ def _require_finite(G: Array, ids: tuple[str, ...], freqs: Array) -> None:
     if len(bad):
         unit, row, i, j = bad[0]
         raise DataError(
-            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, entry ({i}, {j}), and not finite at "
+            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, "
+            f"entry ({i}, {j}), and not finite at "
             f"{len(bad)} places in all; leave the unit out, or look at its model."
         )

@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 def score_population(
     models: IdentifiedModels, settings: UncertaintySettings, work: Work | None = None
 ) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
-    """Score every unit in every condition, whatever its group: models by place in `IdentifiedModels.sets`, and a row for each score."""
+    """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
     for condition, own in known.items():
@@ -73,7 +73,7 @@ def score_condition(
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
-    """Return a score as a row of metrics, with what was recorded (episodes, held-out ones too, and seconds) and what is needed."""
+    """Return a score as a row of metrics, with what was recorded and what is needed."""
     row = {
         "unit": score.unit,
         "condition": condition,

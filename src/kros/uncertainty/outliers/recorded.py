@@ -2,9 +2,10 @@
 
     factors of episodes --brought to one number of samples--> EDMD --> response of a unit
 
-Tikhonov's alpha stands against a Gram matrix that grows with the recording: at one alpha a unit that was recorded less is drawn further towards
-zero, which looks like another machine. For scores every unit counts as recorded as long as the middle one of the study. A shorter recording
-scatters more, too: of a unit recorded for less than half as long nothing is said.
+Tikhonov's alpha stands against a Gram matrix that grows with the recording: at one alpha a unit that was recorded less
+is drawn further towards zero, which looks like another machine. For scores every unit counts as recorded as long as the
+middle one of the study. A shorter recording scatters more, too: of a unit recorded for less than half as long nothing
+is said.
 """
 
 from __future__ import annotations
@@ -79,7 +80,7 @@ class Recorded:
         return float(np.median([e.n_samples for e in self.units.values()]))
 
     def response(self, evidence: Sequence[Evidence]) -> Array:
-        """Return responses of estimates, shape (estimate, frequency, n, m), each regularised as if it had the usual number of samples."""
+        """Return responses of estimates, shape (estimate, frequency, n, m)."""
         joined = [
             combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples)
             for e in evidence
@@ -90,7 +91,7 @@ class Recorded:
         )
 
     def halves(self) -> tuple[Array, Array] | None:
-        """Return the responses of all units from every second episode, and from the others; None where no unit has two episodes."""
+        """Return the responses of all units from every second episode, and from the others."""
         several = [e for e in self.units.values() if len(e.lifted) > 1]
         if not several:
             return None
@@ -98,7 +99,7 @@ class Recorded:
         return one, other
 
     def same_motions(self, factor: Factor) -> bool:
-        """Tell whether a unit was moved by inputs of the study alone: as many samples, and inputs of equal length as vectors."""
+        """Tell whether a unit was moved by inputs of the study alone."""
         first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
         own = {mark for e in self.units.values() for mark in _marks(e.factor, first, len(self.models.input_scale))}
         return set(_marks(factor, first, len(self.models.input_scale))) <= own

@@ -1,7 +1,7 @@
 """What is said about one unit: how far it exceeds the others, and what would have been seen had it differed.
 
-A score below the threshold means little by itself. Beside it stands what the unit would have to differ by to be flagged; where that is more
-than anybody would call a defect, nothing is said about the unit instead of "ok".
+A score below the threshold means little by itself. Beside it stands what the unit would have to differ by to be
+flagged; where that is more than anybody would call a defect, nothing is said about the unit instead of "ok".
 """
 
 from __future__ import annotations
@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-FEWEST_UNITS = 8  # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
+# below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
+FEWEST_UNITS = 8
 LARGEST_DB = 26.0  # beyond the largest of the others: twenty times as far away as any of them is
 LARGEST_PERCENT = 900.0  # change of gain: ten times as large
 
@@ -21,9 +22,10 @@ LARGEST_PERCENT = 900.0  # change of gain: ten times as large
 class Status(StrEnum):
     """What the recordings say about a unit.
 
-    ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough data``: too few recordings of this unit.
-    ``cannot tell``: fewer than eight units to compare with, or too unlike ones. ``other motions``: beyond the others, but by no more than one unit differs
-    from motion to motion, and its motions are none of theirs.
+    ``ok``: a change of the size that stands beside it would have been flagged. ``outlier``: flagged. ``not enough
+    data``: too few recordings of this unit. ``cannot tell``: fewer than eight units to compare with, or too unlike
+    ones. ``other motions``: beyond the others, but by no more than one unit differs from motion to motion, and its
+    motions are none of theirs.
     """
 
     OK = "ok"
@@ -41,8 +43,8 @@ class OutlierScore:
     ----------
     unit : str
     score_db : float, dB
-        The excess, referred to the threshold: the thresholds of units that went out earlier in the search differ, and the difference is added to their
-        excess, so that one threshold serves all units.
+        The excess, referred to the threshold: the thresholds of units that went out earlier in the search differ, and
+        the difference is added to their excess, so that one threshold serves all units.
     threshold_db : float, dB
     outlier : bool
     freq_hz : float, Hz
@@ -50,7 +52,8 @@ class OutlierScore:
     entry : tuple of int
         Row and column of the residual's largest entry there, relative to its typical size.
     excess_db : float, dB
-        What the unit's largest level has beyond the largest of the other inliers; negative for all units but one inlier.
+        What the unit's largest level has beyond the largest of the other inliers; negative for all units but one
+        inlier.
     lowest_db, highest_db : float, dB
         Range of the excess over all choices of one nominal unit.
     agreement : float
@@ -107,7 +110,7 @@ class OutlierScore:
 
 
 def room_db(detectable_db: float, detectable_percent: float) -> float:
-    """Return by how much a bound could be higher before the absence of an alarm means nothing, dB; negative where it means nothing already."""
+    """Return by how much a bound could be higher before the absence of an alarm means nothing, dB."""
     if not (np.isfinite(detectable_db) and np.isfinite(detectable_percent)):
         return float("-inf")
     return float(

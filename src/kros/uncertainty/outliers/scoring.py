@@ -1,8 +1,9 @@
 """Scores of units from distances: who covers whom, and what a unit exceeds that by.
 
-Beside a score stands the smallest change of a unit that it would have shown, as a change of gain: a level in dB says little to people who build
-machines. One entry of a unit's response, changed by one percent, is a residual of some level at every frequency; a level is proportional to the change
-to first order, so what it takes to reach the bound follows in percent.
+Beside a score stands the smallest change of a unit that it would have shown, as a change of gain: a level in dB says
+little to people who build machines. One entry of a unit's response, changed by one percent, is a residual of some level
+at every frequency; a level is proportional to the change to first order, so what it takes to reach the bound follows in
+percent.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _MOST = 12  # units whose changes are tried
 
 @dataclass(frozen=True, eq=False)
 class Nominals:
-    """Excess of every unit with one nominal at a time, shape (nominal, unit), and whether it is beyond its threshold."""
+    """Excess of every unit with one nominal at a time, shape (nominal, unit)."""
 
     excess_db: Array
     beyond: Array
@@ -100,7 +101,7 @@ def scores_of(
 
 
 def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Array) -> Array:
-    """Return levels, dB, of residuals between units and themselves with one entry changed by one percent: the median over units, shape (p, m, frequency)."""
+    """Return levels, dB, of residuals between units and themselves with one entry changed by one percent."""
     G = responses[np.unique(np.linspace(0, len(responses) - 1, min(_MOST, len(responses))).round().astype(int))]
     levels = np.empty((*G.shape[2:], G.shape[1]))
     for i, j in np.ndindex(*G.shape[2:]):
@@ -111,7 +112,7 @@ def change_levels(form: Form, responses: Array, found: Distances, freqs_hz: Arra
 
 
 def smallest_change(change: Array, cover: float, bound_db: float) -> tuple[float, int, tuple[int, int]]:
-    """Return the smallest change of gain that exceeds a cover by a bound, percent, its frequency and entry; infinity, and the first, without a bound."""
+    """Return the smallest change of gain that exceeds a cover by a bound, percent, its frequency and entry."""
     if not np.isfinite(bound_db):
         return float("inf"), 0, (0, 0)
     percent = _PERCENT * 10 ** ((cover + bound_db - change) / 20)

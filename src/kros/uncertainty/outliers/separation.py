@@ -1,4 +1,4 @@
-"""The search for outliers, one unit at a time: levels in dB, shape (unit, frequency), and how far each unit's largest exceeds those of the others."""
+"""The search for outliers, one unit at a time, from levels in dB, shape (unit, frequency)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Separation:
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)
-    # (unit,), dB: excess minus the threshold of the step at which the unit went out, or of the last step; minus infinity where nothing
+    # (unit,), dB: excess minus the threshold when the unit went out, or of the last step; minus infinity where nothing
     # can be told
     margin_db: Array
     threshold_db: float  # dB: what the largest excess of the inliers would have to exceed
@@ -38,7 +38,7 @@ def covers(levels: Array, inliers: Flags) -> Array:
 
 
 def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
-    """Return every unit's excess over the inliers, itself left out, and what it has beyond what a further unit exceeds them by at a rate, dB."""
+    """Return every unit's excess over the inliers, itself left out."""
     known, value = levels[inliers], np.zeros(len(levels))
     if len(known) < 2:
         return value, np.full(len(levels), -np.inf)
@@ -50,7 +50,7 @@ def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
 
 
 def separate(levels: Array, rate: float) -> Separation:
-    """Take units out while the largest excess is beyond the bound of the others; at most a third goes, of equal units the first."""
+    """Take units out while the largest excess is beyond the bound of the others."""
     n = len(levels)
     inliers, margin, most = np.ones(n, bool), np.full(n, -np.inf), n // 3
     if n < FEWEST_UNITS:

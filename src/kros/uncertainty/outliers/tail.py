@@ -1,16 +1,19 @@
 r"""What one further level may exceed the levels of others by: decibels of distances, or of innovations.
 
-Distances of good units are taken to fall off no slower than a power, so that levels have an exponential tail of unknown scale. The spacings of the levels
-``x_1 >= x_2 >= ... >= x_n`` of n others estimate the scale, each weighted as if the further level were above them (Renyi's representation):
+Distances of good units are taken to fall off no slower than a power, so that levels have an exponential tail of unknown
+scale. The spacings of the levels ``x_1 >= x_2 >= ... >= x_n`` of n others estimate the scale, each weighted as if the
+further level were above them (Renyi's representation):
 
     b = sum_j (j + 1) (x_j - x_(j+1)) / (n - 1) = (n (mean - x_n) + x_1 - x_n) / (n - 1)
 
-A further level is the largest with probability ``1 / (n + 1)``, and is then above ``x_1`` by an exponential that does not depend on the spacings; ``b / scale``
-has the gamma distribution of mean one and shape ``n - 1``. So without any simulation
+A further level is the largest with probability ``1 / (n + 1)``, and is then above ``x_1`` by an exponential that does
+not depend on the spacings; ``b / scale`` has the gamma distribution of mean one and shape ``n - 1``. So without any
+simulation
 
     P(x > x_1 + t b) = rate        t = (n - 1) ((rate (n + 1))^(-1 / (n - 1)) - 1)
 
-Levels of lighter tails (normal, bounded, of two suppliers) exceed this less often than `rate`. From a rate of 1 / (n + 1) on the bound is the largest level.
+Levels of lighter tails (normal, bounded, of two suppliers) exceed this less often than `rate`. From a rate of 1 / (n +
+1) on the bound is the largest level.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ LEAST_SCORES = 3
 
 
 def prediction_bound(scores: Array, rate: float) -> Array:
-    """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB; infinity of fewer than three."""
+    """Return what one further score exceeds with probability `rate`, from scores of shape (..., score), dB."""
     x = np.moveaxis(np.asarray(scores, float), -1, 0)
     if len(x) < LEAST_SCORES:
         return np.full(x.shape[1:], np.inf)

@@ -1,18 +1,19 @@
-r"""Optimal cover of a set of residuals, frequency by frequency: diagonal (or scalar) magnitudes left and right.
+r"""Optimal cover of a set of residuals, frequency by frequency: diagonal magnitudes left and right.
 
-A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R = exp(x_r)` and
-`s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
+A cover `W_L, W_R` is sound when `sigma_max(W_L^-1 E_k W_R^-1) <= 1` for every unit k. With `W_L = s exp(x_l)`, `W_R =
+exp(x_r)` and `s = max_k sigma_max(exp(-x_l) E_k exp(-x_r))` every choice of x is sound, and
 
     mean(log W_L) + mean(log W_R) = mean(x_l) + mean(x_r) + log s(x_l, x_r)
 
-is convex in x (three-lines theorem) and the same for all ways to share a common factor between left and right. The maximum over units and
-singular values is smoothed by a Schatten norm of order 2 q,
+is convex in x (three-lines theorem) and the same for all ways to share a common factor between left and right. The
+maximum over units and singular values is smoothed by a Schatten norm of order 2 q,
 
     log s  ~  1 / (2 q) log sum_k tr (M_k M_k^H)^q,     M_k = exp(-x_l) E_k exp(-x_r)
 
-whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at once with q rising to
-65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the optimum finite where residuals are triangular,
-and picks the smooth one where it is not unique; a stronger pull gives covers that are easier to fit (`weights`).
+whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at
+once with q rising to 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the
+optimum finite where residuals are triangular, and picks the smooth one where it is not unique; a stronger pull gives
+covers that are easier to fit (`weights`).
 """
 
 from __future__ import annotations
@@ -42,7 +43,6 @@ _TINY = 1e-300
 class Structure(str, Enum):
     """Which entries of the weights are free."""
 
-    SCALAR = "scalar"
     DIAGONAL = "diagonal"
     ENTRYWISE = "entrywise"
 
@@ -73,13 +73,8 @@ class Cover:
         return Cover(self.left[rows], self.right[rows])
 
     def entries(self) -> Array:
-        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m'); independent of the gauge."""
+        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m')."""
         return self.left[:, :, None] * self.right[:, None, :]
-
-    def regauged(self, reference: int) -> Cover:
-        """Return the same cover with right entry `reference` equal to one."""
-        scale = self.right[:, [reference]]
-        return Cover(self.left * scale, self.right / scale)
 
     def cost_db(self) -> Array:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
@@ -91,26 +86,18 @@ def as_structure(structure: Structure | str) -> Structure:
     return member(Structure, structure, "Weight structure")
 
 
-def optimal_cover(
-    E: Array,
-    structure: Structure | str = Structure.DIAGONAL,
-    pull: float = _PULL,
-    squarings: tuple[int, ...] = _SQUARINGS,
-) -> Cover:
-    """Return the cover of residuals (unit, frequency, p', m') with the smallest mean log magnitudes; a larger pull makes it smoother."""
+def optimal_cover(E: Array, pull: float = _PULL) -> Cover:
+    """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
     first = entries_first(E)
-    p, m = first.shape[:2]
-    size = sigma_max_first(first).max(axis=0)
-    if as_structure(structure) is Structure.SCALAR:
-        return Cover(np.repeat(size[:, None], p, axis=1), np.ones((len(size), m)))
-    x = _descend(first, size, p, pull, squarings)
+    p = first.shape[0]
+    x = _descend(first, sigma_max_first(first).max(axis=0), p, pull)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
 
 
 def cover_ratio(E: Array, left: Array, right: Array) -> Array:
-    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes (frequency, p') and (frequency, m')."""
+    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes of the frequencies."""
     first = entries_first(E)
     l_inv, r_inv = (1 / np.maximum(v, _TINY) for v in (left.T, right.T))
     return sigma_max_first(first * l_inv[:, None, None, :] * r_inv[None, :, None, :])
@@ -121,21 +108,18 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, pull: float, squarings: tuple[int, ...]) -> Array:
+def _descend(first: Array, size: Array, p: int, pull: float) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    chosen = alive[
-        np.unique(
-            np.linspace(0, len(alive) - 1, max(60, _ENTRIES // (first.shape[0] * first.shape[1]))).round().astype(int)
-        )
-    ]
+    count = max(60, _ENTRIES // (first.shape[0] * first.shape[1]))
+    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, count).round().astype(int))]
     E = first[..., chosen] / size[chosen]
     E = E[:, :, _largest(sigma_max_first(E))]
     x = np.zeros((n, len(chosen)))
-    for power in squarings:
+    for power in _SQUARINGS:
         for _ in range(_NEWTON):
             x, moved = _newton(_Smooth(E, p, power, pull), x)
             if moved < 1e-3:

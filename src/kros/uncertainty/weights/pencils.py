@@ -1,53 +1,30 @@
-r"""Descriptor realisations of `W_L^-1 E_k W_R^-1`: of the residual of a form, or of what the form leaves out.
+r"""Descriptor systems of residuals, of what forms leave out, and of their ratios to weights.
 
-With N and P the nominal and a unit, P the one that the form inverts, the residual solves a least-squares problem, whose pseudo-inverse needs no
-inversion: for a tall P, `x = P^+ d` is `P~ (d - P x) = 0`, and for a wide one `x = P~ y`, `P x = d`, with `P~` the adjoint system. The rest
-`r = P (w - v x) - N w` of a tall P is what the form does not rebuild; an inverse form rebuilds from `(1 - E) w`, so that `w = u + x` there.
-
-All systems are in `s = (z - 1) / (z + 1)`. Output-side forms are input-side ones of the transposed plants. The inverse additive form has no
-realisation here.
+`s F x = A x + B u, y = C x + D u` with `s = (z - 1) / (z + 1)`. Sums, products and inverses of descriptors are
+descriptors, and so is a pseudo-inverse, with P~ the adjoint system: for a tall P, `x = P^+ d` is `P~ (d - P x) = 0`,
+and for a wide one `x = P~ y`, `P x = d`. The formulas of `forms` are written with them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.lti import StateSpace, gain
+from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..fits.magnitude import invert
-from ..forms import Form, as_form, residual_shape
+from ..forms import Form
 
 Array = npt.NDArray[Any]
 
-_LARGEST = 300  # rows of a pencil beyond which eigenvalues take too long
+_LARGEST = 400  # rows of a pencil: eigenvalues of more take seconds for every unit
 _LIGHT = 0.1  # damping up to which a mode is a peak or a notch
 _AROUND = np.array([-3.0, -1.0, 0.0, 1.0, 3.0])  # half-widths
-_APART = 0.5  # half-widths: modes nearer than this are one
-_MOST = 400  # modes, the least damped ones first
-_OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
-
-
-class Part(str, Enum):
-    """Which part of the difference between units and nominal is bounded."""
-
-    RESIDUAL = "residual"
-    REMAINDER = "remainder"
-
-
-@dataclass(frozen=True, eq=False)
-class ResidualSystems:
-    """The systems behind residuals, scaled as these are; discrete, units with the unit axis first."""
-
-    form: Form | str
-    nominal: StateSpace
-    units: StateSpace
-    entry: tuple[int, int] | None = None  # row and column of the residual where that entry alone is bounded
-    part: Part = Part.RESIDUAL
+OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+_APART, _MOST = 0.5, 400  # half-widths, nearer than which modes are one; most modes, the least damped ones first
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,11 +39,18 @@ class Descriptor:
 
     @classmethod
     def of(cls, system: StateSpace) -> Descriptor:
-        """Return a system as a descriptor."""
-        return cls(np.eye(system.n_states), system.A, system.B, system.C, system.D)
+        """Return a discrete system."""
+        mapped = to_continuous(system)
+        return cls(np.eye(mapped.n_states), mapped.A, mapped.B, mapped.C, mapped.D)
+
+    @classmethod
+    def identity(cls, size: int) -> Descriptor:
+        """Return ones."""
+        none = np.zeros((0, 0))
+        return cls(none, none, np.zeros((0, size)), np.zeros((size, 0)), np.eye(size))
 
     def __matmul__(self, first: Descriptor) -> Descriptor:
-        """Series: the other one first."""
+        """Return the series connection, the other one first."""
         none = np.zeros((len(first.A), len(self.A)))
         return Descriptor(
             np.block([[first.F, none], [none.T, self.F]]),
@@ -76,10 +60,60 @@ class Descriptor:
             self.D @ first.D,
         )
 
-    def crossings(self, gamma: float) -> Array:
-        """Eigenvalues s of the pencil at a level."""
-        from scipy.linalg import eigvals
+    def __sub__(self, other: Descriptor) -> Descriptor:
+        """Return the difference of two systems with the same input."""
+        none = np.zeros((len(self.A), len(other.A)))
+        return Descriptor(
+            np.block([[self.F, none], [none.T, other.F]]),
+            np.block([[self.A, none], [none.T, other.A]]),
+            np.vstack([self.B, other.B]),
+            np.hstack([self.C, -other.C]),
+            self.D - other.D,
+        )
 
+    def inverse(self) -> Descriptor:
+        """Return the inverse of a square system: its input is one more unknown, `C x + D u = y`."""
+        n, m = self.B.shape
+        F = np.diag(np.zeros(n + m))
+        F[:n, :n] = self.F
+        A = np.block([[self.A, self.B], [self.C, self.D]])
+        B = np.vstack([np.zeros((n, m)), -np.eye(m)])
+        return Descriptor(F, A, B, np.hstack([np.zeros((m, n)), np.eye(m)]), np.zeros((m, m)))
+
+    def pseudo_inverse(self) -> Descriptor:
+        """Return the least-squares or least-norm inverse of a system with F = 1, by its adjoint system."""
+        n, (p, m) = len(self.A), self.D.shape
+        zero = np.zeros
+        if p >= m:  # unknowns: states, adjoint states, x; P~ r = 0 with r = d - P x
+            r = np.hstack([-self.C, zero((p, n)), -self.D])
+            A = np.block([[self.A, zero((n, n)), self.B], [-self.C.T @ r], [self.D.T @ r]])
+            A[n : 2 * n, n : 2 * n] -= self.A.T
+            A[2 * n :, n : 2 * n] += self.B.T
+            B = np.vstack([zero((n, p)), -self.C.T, self.D.T])
+            C = np.hstack([zero((m, 2 * n)), np.eye(m)])
+        else:  # unknowns: states, adjoint states, y; x = P~ y and P x = d
+            C = np.hstack([zero((m, n)), self.B.T, self.D.T])
+            top = np.hstack([self.A, zero((n, n + p))]) + self.B @ C
+            middle = np.hstack([zero((n, n)), -self.A.T, -self.C.T])
+            A = np.vstack([top, middle, np.hstack([self.C, zero((p, n + p))]) + self.D @ C])
+            B = np.vstack([zero((2 * n, p)), -np.eye(p)])
+        F = np.diag(np.concatenate([np.ones(2 * n), zero(min(p, m))]))
+        return Descriptor(F, A, B, C, zero((m, p)))
+
+    def entry(self, row: int, column: int) -> Descriptor:
+        """Return one entry."""
+        rows, columns = [row], [column]
+        return Descriptor(self.F, self.A, self.B[:, columns], self.C[rows], self.D[np.ix_(rows, columns)])
+
+    def crossings(self, gamma: float) -> Array:
+        r"""Return the s at which a singular value may equal gamma.
+
+        They are the finite eigenvalues of
+
+        [ A - s F     0                B                ]
+        [ -C^T C      -A^T - s F^T     -C^T D           ]
+        [ D^T C       B^T              D^T D - gamma^2  ]
+        """
         n, m = self.B.shape
         left = np.block(
             [
@@ -90,144 +124,106 @@ class Descriptor:
         )
         right = np.zeros_like(left)
         right[:n, :n], right[n : 2 * n, n : 2 * n] = self.F, self.F.T
-        for _ in range(6):
-            for axis in (0, 1):
-                size = np.maximum(
-                    np.abs(left).max(axis=axis, keepdims=True), np.abs(right).max(axis=axis, keepdims=True)
-                )
-                scale = 2.0 ** -np.round(np.log2(np.where(size > 0, size, 1.0)) / 2)
-                left, right = left * scale, right * scale
-        with np.errstate(all="ignore"):
-            found = eigvals(left, right)
-        return found[np.isfinite(found)]
+        return _eigenvalues(left, right)
 
     def poles(self) -> Array:
         """Return the finite eigenvalues of the pencil."""
-        from scipy.linalg import eigvals
-
-        with np.errstate(all="ignore"):
-            found = eigvals(self.A, self.F)
-        return np.asarray(found[np.isfinite(found)])
+        return _eigenvalues(self.A, self.F)
 
 
-def ratio_systems(systems: ResidualSystems, left: StateSpace, right: StateSpace) -> list[Descriptor]:
-    """Return `W_L^-1 E_k W_R^-1` for every unit; none where there is no exact realisation, or only a large one."""
-    form, nominal = as_form(systems.form), systems.nominal
-    if form is Form.INVERSE_ADDITIVE:
-        return []
-    first, last = invert(right), invert(left)
-    if systems.entry is not None:
-        rows, columns = (np.eye(size) for size in residual_shape(form, nominal.n_outputs, nominal.n_inputs))
-        first, last = (
-            gain(columns[:, [systems.entry[1]]], right.dt) @ first,
-            last @ gain(rows[[systems.entry[0]]], left.dt),
-        )
-    if form in _OUTPUT_SIDE:
-        first, last = _transposed(last), _transposed(first)
-    before, after = (Descriptor.of(to_continuous(w)) for w in (first, last))
-    parts = _of_units(systems, form)
-    small = parts and 2 * len(parts[0].A) + parts[0].B.shape[1] + 2 * (len(before.A) + len(after.A)) <= _LARGEST
-    return [after @ part @ before for part in parts] if small else []
+def _eigenvalues(left: Array, right: Array) -> Array:
+    """Return the finite eigenvalues of a pencil whose rows and columns are brought to sizes near one."""
+    from scipy.linalg import eigvals
 
-
-def peaks_hz(systems: ResidualSystems, grid_hz: Array, sample_period_s: float) -> Array:
-    """Return frequencies in and around every mode of the residuals that a grid from DC to Nyquist passes over, not beyond the grid."""
-    form = as_form(systems.form)
-    wide = systems.nominal.n_outputs < systems.nominal.n_inputs
-    inverted = [Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE] if wide else []
-    inverted = inverted or [Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE]
-    forms = inverted if form is Form.INVERSE_ADDITIVE else [form]
-    residual = ResidualSystems(form, systems.nominal, systems.units)
-    plants = [
-        to_continuous(s).poles()
-        for s in (systems.nominal, *(systems.units[k] for k in range(systems.units.batch_shape[0])))
-    ]
-    modes = np.concatenate([part.poles() for f in forms for part in _of_units(residual, f)] + plants).astype(complex)
-    light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
-    at_hz = np.arctan(light.imag) / (np.pi * sample_period_s)
-    width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * sample_period_s)
-    light = light[(width < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])]
-    light = light[np.argsort(np.abs(light.real) / np.abs(light), kind="stable")]
-    kept: list[tuple[float, float]] = []
-    for half, middle in zip(np.abs(light.real), light.imag, strict=True):
-        if len(kept) < _MOST and all(abs(middle - other) > _APART * max(half, width) for width, other in kept):
-            kept.append((float(half), float(middle)))
-    if not kept:
+    if not len(left):
         return np.zeros(0)
-    halves, middles = np.array(kept).T
-    omega = (middles[:, None] + halves[:, None] * _AROUND).ravel()
-    found = np.unique(np.arctan(omega[omega > 0]) / (np.pi * sample_period_s))
-    return found[found <= grid_hz[-1]]
+    for axis in (0, 1) * 6:
+        size = np.maximum(np.abs(left).max(axis=axis, keepdims=True), np.abs(right).max(axis=axis, keepdims=True))
+        scale = 2.0 ** -np.round(np.log2(np.where(size > 0, size, 1.0)) / 2)
+        left, right = left * scale, right * scale
+    with np.errstate(all="ignore"):
+        values = eigvals(left, right)
+    return np.asarray(values[np.isfinite(values)])
 
 
-def _of_units(systems: ResidualSystems, form: Form) -> list[Descriptor]:
-    """Residual or remainder of every unit; none of a remainder that is rounding."""
-    nominal, units = systems.nominal, systems.units
-    if form in _OUTPUT_SIDE:
-        form, nominal, units = form.dual, _transposed(nominal), _transposed(units)
-    remainder = systems.part is Part.REMAINDER
-    if remainder and (form is Form.ADDITIVE or nominal.n_outputs <= nominal.n_inputs):
-        return []
-    G = to_continuous(nominal)
-    plants = (to_continuous(units[k]) for k in range(units.batch_shape[0]))
-    return [_additive(G, Gp) if form is Form.ADDITIVE else _least_squares(form, G, Gp, remainder) for Gp in plants]
+@dataclass(frozen=True, eq=False)
+class ResidualSystems:
+    """The discrete systems behind residuals, scaled as these are; units with the unit axis first."""
 
+    form: Form
+    nominal: StateSpace
+    units: StateSpace
+    entry: tuple[int, int] | None = None  # row and column of the residual where that entry alone is bounded
+    remainder: bool = False  # what the form leaves out is bounded in place of the residual
 
-def _transposed(system: StateSpace) -> StateSpace:
-    A, B, C, D = (np.swapaxes(x, -1, -2) for x in (system.A, system.C, system.B, system.D))
-    return StateSpace(A, B, C, D, system.dt)
+    def __iter__(self) -> Iterator[Descriptor]:
+        G = Descriptor.of(self.nominal)
+        for k in range(self.units.batch_shape[0]):
+            Gp = Descriptor.of(self.units[k])
+            system = _remainder(self.form, G, Gp) if self.remainder else _residual(self.form, G, Gp)
+            yield system if self.entry is None else system.entry(*self.entry)
 
+    def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
+        """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""
+        if self.remainder and leaves_nothing(self.form, self.nominal.n_outputs, self.nominal.n_inputs):
+            return []
+        before, after = (Descriptor.of(invert(w)) for w in (right, left))
+        parts = [after @ part @ before for part in self]
+        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= _LARGEST else []
 
-def _additive(G: StateSpace, Gp: StateSpace) -> Descriptor:
-    n, k = Gp.n_states, G.n_states
-    A = np.block([[Gp.A, np.zeros((n, k))], [np.zeros((k, n)), G.A]])
-    return Descriptor(np.eye(n + k), A, np.vstack([Gp.B, G.B]), np.hstack([Gp.C, -G.C]), Gp.D - G.D)
-
-
-def _least_squares(form: Form, G: StateSpace, Gp: StateSpace, remainder: bool) -> Descriptor:
-    """Residual of an input-side form, or its remainder: with P inverted, N the other and v the sign, `P (w - v x) - N w` is orthogonal to P."""
-    P, N, sign = (G, Gp, -1.0) if form is Form.INPUT_MULTIPLICATIVE else (Gp, G, 1.0)
-    if P.D.shape[0] < P.D.shape[1]:
-        return _wide(P, N, sign)
-    k, n, (p, m) = N.n_states, P.n_states, P.D.shape
-    zero = np.zeros
-    # unknowns: states of N, P and the adjoint of P, then x; r = P (w - v x) - N w
-    r = np.hstack([-N.C, P.C, zero((p, n)), -sign * P.D])
-    r_w = P.D - N.D
-    A = np.block(
-        [
-            [N.A, zero((k, 2 * n + m))],
-            [zero((n, k)), P.A, zero((n, n)), -sign * P.B],
-            [-P.C.T @ r],
-            [P.D.T @ r],
+    def modes_hz(self, grid_hz: Array) -> Array:
+        """Return frequencies in and around every mode of residuals and plants."""
+        dt = self.nominal.dt
+        plants = [
+            Descriptor.of(self.nominal),
+            *(Descriptor.of(self.units[k]) for k in range(self.units.batch_shape[0])),
         ]
-    )
-    A[k + n : k + 2 * n, k + n : k + 2 * n] -= P.A.T
-    A[k + 2 * n :, k + n : k + 2 * n] += P.B.T
-    B = np.vstack([N.B, P.B, -P.C.T @ r_w, P.D.T @ r_w])
-    F = np.diag(np.concatenate([np.ones(k + 2 * n), zero(m)]))
-    if not remainder:
-        return Descriptor(F, A, B, np.hstack([zero((m, k + 2 * n)), np.eye(m)]), zero((m, m)))
-    if form is Form.INPUT_MULTIPLICATIVE:
-        return Descriptor(F, A, B, -r, -r_w)
-    A[:, k + 2 * n :] += B  # w = u + x
-    r[:, k + 2 * n :] += r_w
-    return Descriptor(F, A, B, r, r_w)
+        modes = np.concatenate([system.poles() for system in (*self, *plants)]).astype(complex)
+        light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
+        at_hz = np.arctan(light.imag) / (np.pi * dt)
+        width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * dt)
+        light = light[(width < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])]
+        light = light[np.argsort(np.abs(light.real) / np.abs(light), kind="stable")]
+        apart: list[tuple[float, float]] = []
+        for half, middle in zip(np.abs(light.real), light.imag, strict=True):
+            if len(apart) < _MOST and all(abs(middle - other) > _APART * max(half, w) for w, other in apart):
+                apart.append((float(half), float(middle)))
+        halves, middles = np.array(apart).reshape(-1, 2).T
+        omega = (middles[:, None] + halves[:, None] * _AROUND).ravel()
+        found = np.unique(np.arctan(omega[omega > 0]) / (np.pi * dt))
+        return found[found <= grid_hz[-1]]
 
 
-def _wide(P: StateSpace, N: StateSpace, sign: float) -> Descriptor:
-    """The same for more inputs than outputs: unknowns are states of N, P and the adjoint of P, then y; x = P~ y and P (w - v x) = N w."""
-    k, n, (p, m) = N.n_states, P.n_states, P.D.shape
-    zero = np.zeros
-    C = np.hstack([zero((m, k + n)), P.B.T, P.D.T])
-    A = np.block(
-        [
-            [N.A, zero((k, 2 * n + p))],
-            [np.hstack([zero((n, k)), P.A, zero((n, n + p))]) - sign * P.B @ C],
-            [zero((n, k + n)), -P.A.T, -P.C.T],
-            [np.hstack([-N.C, P.C, zero((p, n + p))]) - sign * P.D @ C],
-        ]
-    )
-    B = np.vstack([N.B, P.B, zero((n, m)), P.D - N.D])
-    F = np.diag(np.concatenate([np.ones(k + 2 * n), zero(p)]))
-    return Descriptor(F, A, B, C, zero((m, m)))
+def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
+    """Tell whether a form rebuilds every regular unit of a shape exactly."""
+    if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
+        return form is Form.ADDITIVE or n_outputs == n_inputs
+    return n_outputs >= n_inputs if form in OUTPUT_SIDE else n_outputs <= n_inputs
+
+
+def _residual(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
+    """Return the residual of a form, as in `forms.residual`."""
+    difference = Gp - G
+    if form is Form.ADDITIVE:
+        return difference
+    inverse = (Gp if form.inverse else G).pseudo_inverse()
+    if form in OUTPUT_SIDE:
+        return difference @ inverse
+    return inverse @ difference @ G.pseudo_inverse() if form is Form.INVERSE_ADDITIVE else inverse @ difference
+
+
+def _remainder(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
+    """Return what a form leaves out, the unit minus what `forms.rebuild` makes of the residual."""
+    E = _residual(form, G, Gp)
+    if not form.inverse:
+        return (Gp - G) - (E @ G if form in OUTPUT_SIDE else G @ E)
+    loop = E @ G if form is Form.INVERSE_ADDITIVE else E
+    inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
+    return Gp - (inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse)
+
+
+def invert(system: StateSpace) -> StateSpace:
+    """Return the inverse of a square system with a regular feedthrough."""
+    D = np.linalg.inv(system.D)
+    B = system.B @ D
+    return StateSpace(system.A - B @ system.C, B, -D @ system.C, D, system.dt)

@@ -6,9 +6,10 @@ Entrywise weights bound every entry of the residual by itself, for a diagonal pe
 
     E_ij = W_ij delta_ij,  |delta_ij| <= 1        E = L diag(delta_11, delta_12, ...) R
 
-L picks rows, R holds the weights: entry (i, j) is the dyad of row `e_i` of L and `W_ij e_j^T` of R. The paper bounds residuals this way (its
-Figure 8) and then puts `W Delta` with a full Delta into its generalized plant. For that set the bound does not hold: `|W_ij| >= |E_ij|` says
-nothing about `sigma_max(W^-1 E)`, which `unstructured_excess` measures. With the diagonal Delta it holds, and mu analysis can use it.
+L picks rows, R holds the weights: entry (i, j) is the dyad of row `e_i` of L and `W_ij e_j^T` of R. The paper bounds
+residuals this way (its Figure 8) and then puts `W Delta` with a full Delta into its generalized plant. For that set the
+bound does not hold: `|W_ij| >= |E_ij|` says nothing about `sigma_max(W^-1 E)`, which `unstructured_excess` measures.
+With the diagonal Delta it holds, and mu analysis can use it.
 """
 
 from __future__ import annotations
@@ -20,9 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.lti import StateSpace, gain
+from ...core.lti import StateSpace, dense_response, gain
 from ...core.small_matrices import sigma_max
-from ..fits.diagonal_response import diagonal_response
 from .certificate import Method
 from .cover import Cover, Structure
 
@@ -47,10 +47,11 @@ class Weight:
     cover_max : float
         Largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid, for the weights as used; at most one.
     overbound_db_max : float, dB
-        Largest excess over the grid of `mean_i log left_i + mean_j log right_j`, by which covers are compared, over the optimal cover.
+        Largest excess over the grid of `mean_i log left_i + mean_j log right_j`, by which covers are compared, over the
+        optimal cover.
     within_tolerance : bool
-        Whether the overbound of the weight as returned, at every frequency of the grid, is within the tolerance asked for: `overbound_db_max`,
-        and of entrywise weights that of every entry.
+        Whether the overbound of the weight as returned, at every frequency of the grid, is within the tolerance asked
+        for: `overbound_db_max`, and of entrywise weights that of every entry.
     method : Method
         How the bound between grid points is known, see `certificate`.
     remaining_margin : float
@@ -60,10 +61,10 @@ class Weight:
     --------
     >>> import numpy as np
     >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify_systems
+    >>> from kros.uncertainty import quantify
     >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
     >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> weight = quantify_systems(units, "output_multiplicative").weight
+    >>> weight = quantify(units, "output_multiplicative").weight
     >>> weight.structure.value, weight.cover_max <= 1
     ('diagonal', True)
     """
@@ -81,10 +82,11 @@ class Weight:
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
-        return Cover(np.abs(diagonal_response(self.left, freqs_hz)), np.abs(diagonal_response(self.right, freqs_hz)))
+        left, right = (dense_response(side, freqs_hz) for side in (self.left, self.right))
+        return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
 
     def matrix(self) -> StateSpace:
-        """Return the p' by m' system `W_L 1 W_R`, with 1 a matrix of ones, that bounds every entry of the residuals: `|E_ij| <= |W_ij|`."""
+        """Return the p' by m' system `W_L 1 W_R`, with 1 a matrix of ones."""
         ones = gain(np.ones((self.left.n_inputs, self.right.n_outputs)), self.left.dt)
         return self.left @ ones @ self.right
 
@@ -98,7 +100,7 @@ class Weight:
         return replace(self, left=StateSpace(left.A, left.B, left.C * factor, left.D * factor, left.dt))
 
     def measured(self, freqs_hz: Array, best: Cover, tolerance_db: float) -> Weight:
-        """Return the weight with its overbounds over the optimal cover at some frequencies; zero where nothing is to be covered."""
+        """Return the weight with its overbounds over the optimal cover at some frequencies."""
         used, some = self.magnitudes(freqs_hz), best.left.min(axis=1) > 0
         excess = float((used.at(some).cost_db() - best.at(some).cost_db()).max()) if some.any() else 0.0
         return replace(self, overbound_db_max=excess, within_tolerance=excess <= tolerance_db)
@@ -122,7 +124,7 @@ class EntrywiseWeight(Weight):
 
 
 def unstructured_excess(W: Array, E: Array) -> float:
-    """Return the largest ``sigma_max(W^-1 E)`` of entrywise weights (frequency, p, p) over residuals; NaN where W has no inverse."""
+    """Return the largest ``sigma_max(W^-1 E)`` of entrywise weights (frequency, p, p) over residuals."""
     if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
         return float("nan")
     usable = np.linalg.cond(W) < _SINGULAR

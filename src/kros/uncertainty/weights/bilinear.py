@@ -2,21 +2,22 @@ r"""The imaginary axis as a unit circle: continuous weights by a discrete fit, w
 
     s = (2 / T) (z - 1) / (z + 1)        j 2 pi f = j (2 / T) tan(theta / 2),   theta = 2 pi f_d T
 
-maps the unit circle onto the imaginary axis one to one, Nyquist to infinity, and stable minimum-phase systems to stable minimum-phase systems of the
-same order. A magnitude that bounds residuals at the mapped frequencies f_d bounds them at f: nothing is sampled. The period T is that of the map and
-of nothing else.
+maps the unit circle onto the imaginary axis one to one, Nyquist to infinity, and stable minimum-phase systems to stable
+minimum-phase systems of the same order. A magnitude that bounds residuals at the mapped frequencies f_d bounds them at
+f: nothing is sampled. The period T is that of the map and of nothing else.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
-from ..core.lti import StateSpace
+from ...core.errors import ConfigError
+from ...core.lti import StateSpace
+from .residuals import Residuals
 
 Array = npt.NDArray[Any]
 
@@ -30,7 +31,7 @@ class BilinearAxis:
     """Map between a continuous and a discrete frequency axis."""
 
     period_s: float  # s: period T of the map
-    # Hz: end of the grid, from which on residuals count as constant, infinity included: numerically a strictly proper plant has no
+    # Hz: end of the grid, from which on residuals count as constant: numerically a strictly proper plant has no
     # pseudo-inverse there, and an additive residual vanishes faster than a weight with a stable inverse may
     last_hz: float
 
@@ -48,6 +49,24 @@ class BilinearAxis:
         """Return the frequencies on the continuous axis, at most `last_hz`."""
         angle = np.pi * self.period_s * np.asarray(freqs_hz, float)
         return np.asarray(np.minimum(np.tan(np.minimum(angle, np.pi / 2)) / (np.pi * self.period_s), self.last_hz))
+
+    def mapped(self, residuals: Residuals) -> Residuals:
+        """Return residuals at mapped frequencies, constant from `last_hz` on."""
+
+        def units(freqs_hz: Array, rows: Array) -> Array:
+            return residuals.units(self.continuous_hz(freqs_hz), rows)
+
+        systems = None
+        if residuals.systems is not None:
+            systems = self.discrete(residuals.systems[0]), self.discrete(residuals.systems[1])
+        nominal = residuals.nominal
+        return replace(
+            residuals,
+            nominal=lambda freqs_hz: nominal(self.continuous_hz(freqs_hz)),
+            units=units,
+            systems=systems,
+            proven=False,
+        )
 
     def continuous(self, system: StateSpace) -> StateSpace:
         """Return the continuous system with the same response at mapped frequencies."""
@@ -80,7 +99,7 @@ def beyond(freqs_hz: Array) -> Array:
 
 
 def continuous_grid(system: StateSpace) -> Array:
-    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz; without poles a `ConfigError`."""
+    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz."""
     sizes = np.abs(system.poles()) / (2 * np.pi)
     sizes = sizes[sizes > 0]
     if not sizes.size:

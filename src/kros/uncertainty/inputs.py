@@ -1,4 +1,4 @@
-"""What a quantification is given: models or responses of units, a nominal, scales and options, read and checked, every refusal by name."""
+"""What a quantification is given: models, responses, a nominal and scales, read and checked."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from ..core.lti import StateSpace
 Array = npt.NDArray[Any]
 
 
-def read_models(
+def read_systems(
     models: Any, unit_ids: Sequence[str] | None, output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None
 ) -> tuple[StateSpace, tuple[str, ...], tuple[Array, Array]]:
-    """Models as a checked batch, ids and scales."""
+    """Return models as a checked batch, with ids and scales."""
     if hasattr(models, "systems") and hasattr(models, "unit_ids"):
         output_scale = models.output_scale if output_scale is None else output_scale
         input_scale = models.input_scale if input_scale is None else input_scale
@@ -25,7 +25,7 @@ def read_models(
         models = models.systems(unit_ids)
     system = stack_systems(models)
     ids = check_ids(unit_ids, system.batch_shape[0])
-    _check(system, tuple(f"unit {name}" for name in ids))
+    _check_stable(system, tuple(f"unit {name}" for name in ids))
     return (
         system,
         ids,
@@ -34,15 +34,17 @@ def read_models(
 
 
 def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """Return the names of units, ``0, 1, ...`` by default, or say what is wrong with them or that there are too few units."""
+    """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
     ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
     if len(ids) != count or len(set(ids)) != count:
         raise DimensionError(
-            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} ({', '.join(ids[:5])} ...)."
+            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} "
+            f"({', '.join(ids[:5])} ...)."
         )
     if count < 2:
         raise DataError(
-            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); record more units."
+            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); "
+            f"record more units."
         )
     return ids
 
@@ -52,7 +54,8 @@ def stack_systems(models: Any) -> StateSpace:
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
             raise DimensionError(
-                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of systems."
+                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of "
+                "systems, an array of responses, or the result of kros.identify."
             )
         systems = [StateSpace.of(system) for system in models]
         found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
@@ -68,7 +71,8 @@ def stack_systems(models: Any) -> StateSpace:
         models = StateSpace(A, B, C, D, systems[0].dt)
     if len(models.batch_shape) != 1:
         raise DimensionError(
-            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; stack the units."
+            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; "
+            f"stack the units."
         )
     return models
 
@@ -98,20 +102,21 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
 
 
 def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> None:
-    """Raise a `DimensionError` or `DataError` when a candidate for the nominal is not one stable system like the units."""
+    """Raise a `DimensionError` or `DataError` when a candidate is not one stable system like the units."""
     if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (
         system.n_outputs,
         system.n_inputs,
         system.dt,
     ):
         raise DimensionError(
-            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} inputs at {system.dt} s, found "
+            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} "
+            f"inputs at {system.dt} s, found "
             f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
         )
-    _check(candidate[None], (name,))
+    _check_stable(candidate[None], (name,))
 
 
-def _check(system: StateSpace, names: tuple[str, ...]) -> None:
+def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     count = (len(names),)
     finite = np.ones(count, bool)
@@ -119,7 +124,8 @@ def _check(system: StateSpace, names: tuple[str, ...]) -> None:
         finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
     if not finite.all():
         raise DataError(
-            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it again."
+            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or "
+            f"identify it again."
         )
     stable = np.broadcast_to(system.is_stable(), count)
     if not stable.all():
@@ -137,7 +143,7 @@ def _check(system: StateSpace, names: tuple[str, ...]) -> None:
 
 
 def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output: at rest after one sample, or decaying as fast as the system's slowest mode."""
+    """Add states without input and output, at rest after a sample or as slow as the slowest."""
     more = n_states - system.n_states
     if not more:
         return system
@@ -148,3 +154,46 @@ def _padded(system: StateSpace, n_states: int) -> StateSpace:
         A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
     return StateSpace(A, B, C, system.D, system.dt)
+
+
+def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
+    """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
+    if response.shape != shape:
+        raise DimensionError(
+            f"Quantify: the response of {name!r} should have the shape {shape}, found {response.shape}."
+        )
+    finite = np.isfinite(response).all(axis=(1, 2))
+    if not finite.all():
+        at = freqs[int(np.argmin(finite))]
+        raise DataError(
+            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out."
+        )
+
+
+def read_response_data(
+    data: Sequence[Any], freqs_hz: npt.ArrayLike | None, options: dict[str, Any]
+) -> tuple[Array, Array]:
+    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
+    first, nominal = data[0], options.get("nominal")
+    beside = [("the nominal", nominal)] if nominal is not None and hasattr(nominal, "frdata") else []
+    for name, other in [*((f"response {k}", one) for k, one in enumerate(data)), *beside]:
+        if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
+            raise DimensionError(
+                f"Quantify: {name} has other frequencies than the first response; interpolate or measure on one grid."
+            )
+        if other.dt != first.dt or other.frdata.shape != first.frdata.shape:
+            raise DimensionError(
+                f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
+                f"{first.frdata.shape} and {first.dt}; bring them to one."
+            )
+    if freqs_hz is not None:
+        raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
+    if first.dt is True:
+        raise DimensionError(
+            "Quantify: the sampling period of the responses is not known (dt = True); give it in seconds."
+        )
+    options["sample_period_s"] = float(first.dt or 0.0)
+    if beside:
+        options["nominal"] = np.moveaxis(np.asarray(beside[0][1].frdata), -1, 0)
+    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in data])
+    return responses, np.asarray(first.omega, float) / (2 * np.pi)

@@ -1,1 +1,0 @@
-"""Rational magnitudes: the tightest bound of data, alone or several at once."""

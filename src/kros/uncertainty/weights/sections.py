@@ -1,0 +1,232 @@
+r"""Magnitudes as products of sections of first and second order, stable and minimum phase.
+
+With `w = (z - 1) / (z + 1)` and `tau = -w^2` on the unit circle, a pair of zeros or poles is `w^2 + b w + c` with
+b, c > 0, real or complex, and a single one is `w + a`:
+
+    |w^2 + b w + c|^2 / c^2 = (1 + u)^2 (1 + (e^y - 4) v),   u = tau / c,  v = u / (1 + u)^2,
+                                                               x = log c,  y = log(b^2 / c)
+    |w + a|^2 / a^2         = 1 + u,                         u = tau / a^2,  x = log a^2
+
+Sums of logarithms keep their precision over any number of decades. The systems are cascades of sections in
+`zeta = z - 1`: poles next to `z = 1` keep their relative precision.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.lti import StateSpace, gain
+
+Array = npt.NDArray[Any]
+
+_FAR = 1e30  # tau at Nyquist
+_NARROW, _WIDE = np.log(4 * 3e-3**2), 40.0  # y: a damping of 0.003, and two real ones 17 decades apart
+_TINY = 1e-300
+_REAL = 1e-9  # relative imaginary part below which a root is real: rounding
+
+
+@dataclass(frozen=True, eq=False)
+class Sections:
+    """Magnitudes, one for every entry of a weight."""
+
+    level: Array  # (entry,), nepers: log magnitude at DC
+    entry: Array  # (section,): the entry that a section belongs to
+    sign: Array  # (section,): 1 for zeros, -1 for poles
+    pair: Array  # (section,): whether it is of second order
+    corner: Array  # (section,): x
+    width: Array  # (section,): y; of no effect in sections of first order
+
+    @classmethod
+    def spread(cls, corners: Sequence[Array], orders: Sequence[int], width: float) -> Sections:
+        """Return magnitudes of one: a pole on a zero section at every corner, the last single for odd orders."""
+        rows = [
+            (entry, sign, 2 * (i + 1) <= order, x)
+            for entry, (values, order) in enumerate(zip(corners, orders, strict=True))
+            for i, x in enumerate(values)
+            for sign in (1.0, -1.0)
+        ]
+        entry, sign, pair, corner = np.array(rows).reshape(-1, 4).T
+        widths = np.full(len(rows), width)
+        return cls(np.zeros(len(corners)), entry.astype(int), sign, pair.astype(bool), corner, widths)
+
+    @classmethod
+    def of_roots(cls, level: float, zeros: Sequence[complex], poles: Sequence[complex]) -> Sections:
+        """Return the magnitude with equally many zeros and poles in w, and its log at DC."""
+        sides = [(sign, *row) for sign, roots in ((1.0, zeros), (-1.0, poles)) for row in _paired(roots)]
+        sign, pair, corner, width = np.array(sides).reshape(-1, 4).T
+        return cls(np.array([level]), np.zeros(len(sides), int), sign, pair.astype(bool), corner, width)
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Sections]) -> Sections:
+        """Return the entries of several, one after the other."""
+        first = np.cumsum([0, *(len(part.level) for part in parts)])
+        entry = np.concatenate([part.entry + n for part, n in zip(parts, first[:-1], strict=True)])
+        names = ("sign", "pair", "corner", "width")
+        rest = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
+        return cls(np.concatenate([part.level for part in parts]), entry, *rest)
+
+    @property
+    def orders(self) -> Array:
+        """Order of every entry."""
+        poles = self.sign < 0
+        return np.bincount(self.entry[poles], 1 + self.pair[poles], minlength=len(self.level)).astype(int)
+
+    @property
+    def owner(self) -> Array:
+        """Entry of every parameter: levels, corners, widths of pairs."""
+        return np.concatenate([np.arange(len(self.level)), self.entry, self.entry[self.pair]])
+
+    def logs(self, tau: Array) -> Array:
+        """Return log magnitudes, nepers, shape (entry, frequency)."""
+        total = np.repeat(self.level[:, None], len(tau), axis=1)
+        np.add.at(total, self.entry, self._section_logs(tau))
+        return total
+
+    def _section_logs(self, tau: Array) -> Array:
+        u, q = self._variables(tau)
+        return np.where(self.pair[:, None], np.log(q) + 2 * np.log1p(u), np.log1p(u)) * (self.sign / 2)[:, None]
+
+    def slopes(self, tau: Array) -> Array:
+        """Return derivatives of the owner's log magnitude, shape (parameter, frequency)."""
+        u, q = self._variables(tau)
+        share, half = u / (1 + u), (self.sign / 2)[:, None]
+        v, extra = share / (1 + u), np.exp(self.width)[:, None]
+        by_corner = np.where(self.pair[:, None], (extra - 4) * v * (1 - 2 * share) / q + 2 * share, share)
+        by_width = (extra * v / q)[self.pair]
+        return np.vstack([np.ones((len(self.level), len(tau))), -half * by_corner, half[self.pair] * by_width])
+
+    def moved(self, step: Array, ends: tuple[float, float]) -> Sections:
+        """Return sections with all parameters moved, corners kept within ends."""
+        n, k = len(self.level), len(self.corner)
+        width = self.width.copy()
+        width[self.pair] = np.clip(width[self.pair] + step[n + k :], _NARROW, _WIDE)
+        corner = np.clip(self.corner + step[n : n + k], *ends)
+        return replace(self, level=self.level + step[:n], corner=corner, width=width)
+
+    def lifted(self, entries: slice, by: float) -> Sections:
+        """Return sections with the levels of some entries raised."""
+        level = self.level.copy()
+        level[entries] += by
+        return replace(self, level=level)
+
+    def with_pairs(self, entries: Array, corners: Array, width: float) -> Sections:
+        """Return the same magnitudes with a pair of zeros and one of poles on each other in some entries."""
+        twice = np.repeat(np.arange(len(entries)), 2)
+        return Sections(
+            self.level,
+            np.concatenate([self.entry, np.asarray(entries)[twice]]),
+            np.concatenate([self.sign, np.tile([1.0, -1.0], len(entries))]),
+            np.concatenate([self.pair, np.ones(len(twice), bool)]),
+            np.concatenate([self.corner, np.asarray(corners)[twice]]),
+            np.concatenate([self.width, np.full(len(twice), width)]),
+        )
+
+    def weakest(self, entry: int, tau: Array) -> Dipole | None:
+        """Return the pole and the zero section of an entry that cancel best, None where there are none of one order."""
+        rows = np.flatnonzero(self.entry == entry)
+        zeros, poles = rows[self.sign[rows] > 0], rows[self.sign[rows] < 0]
+        logs = self._section_logs(tau)
+        both = logs[zeros][:, None] + logs[poles]
+        span = np.where(self.pair[zeros][:, None] == self.pair[poles], np.ptp(both, axis=2), np.inf)
+        if not np.isfinite(span).any():
+            return None
+        i, j = np.unravel_index(int(span.argmin()), span.shape)
+        middle = float(both[i, j].max() + both[i, j].min()) / 2
+        return Dipole(entry, int(zeros[i]), int(poles[j]), float(span[i, j]), middle)
+
+    def without(self, dipole: Dipole) -> Sections:
+        """Return the magnitudes without a pole and a zero section that nearly cancel."""
+        rows = np.setdiff1d(np.arange(len(self.entry)), [dipole.zero, dipole.pole])
+        level = self.level.copy()
+        level[dipole.entry] += dipole.middle
+        return Sections(level, self.entry[rows], self.sign[rows], self.pair[rows], self.corner[rows], self.width[rows])
+
+    def halved(self, dipole: Dipole) -> Sections:
+        """Return the magnitudes with sections of first order in place of two of second order."""
+        pair = self.pair.copy()
+        pair[[dipole.zero, dipole.pole]] = False
+        return replace(self, pair=pair)
+
+    def systems(self, sample_period_s: float) -> list[StateSpace]:
+        """Return the systems of the entries."""
+        return [self._system(i, sample_period_s) for i in range(len(self.level))]
+
+    def _system(self, entry: int, dt: float) -> StateSpace:
+        """Return `factor * prod (w - q) / prod (w - p)` as a cascade, poles beside the zeros next to them in size."""
+        constant = (np.where(self.pair, 1.0, 0.5) * self.corner * self.sign)[self.entry == entry].sum()
+        total, sections = np.exp(self.level[entry] - constant), []
+        for q, p in zip(self._roots(entry, 1.0), self._roots(entry, -1.0), strict=True):
+            total *= float(np.real(np.prod([1 - x for x in q]) / np.prod([1 - x for x in p])))
+            sections.append(_section([_to_zeta(x) for x in q], [_to_zeta(x) for x in p], dt))
+        system = gain([[total]], dt)
+        for section in sections:
+            system = section @ system
+        return system
+
+    def _roots(self, entry: int, sign: float) -> list[list[complex]]:
+        """Return the roots in w of every section, pairs first."""
+        rows = np.flatnonzero((self.entry == entry) & (self.sign == sign))
+        roots: list[list[complex]] = []
+        for k in rows[np.lexsort((self.corner[rows], ~self.pair[rows]))]:
+            size, half = np.exp(self.corner[k] / 2), np.exp(self.width[k] / 2) / 2
+            if not self.pair[k]:
+                roots.append([complex(-size)])
+            elif half < 1:
+                root = size * complex(-half, np.sqrt((1 - half) * (1 + half)))
+                roots.append([root, root.conjugate()])
+            else:
+                large = half + np.sqrt((half - 1) * (half + 1))
+                roots.append([complex(-size * large), complex(-size / large)])
+        return roots
+
+    def _variables(self, tau: Array) -> tuple[Array, Array]:
+        u = np.minimum(tau, _FAR) * np.exp(-self.corner)[:, None]
+        return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _TINY)
+
+
+@dataclass(frozen=True)
+class Dipole:
+    """A zero and a pole section that nearly cancel: range and middle of the log magnitude of both, nepers."""
+
+    entry: int
+    zero: int
+    pole: int
+    span: float
+    middle: float
+
+
+def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:
+    """Return sections (pair, x, y) of roots: complex pairs, real ones with their neighbours."""
+    real = sorted(-r.real for r in roots if abs(r.imag) <= _REAL * abs(r))
+    upper = [r for r in roots if r.imag > _REAL * abs(r)]
+    rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in upper]
+    if len(real) % 2:
+        rows.append((False, 2 * np.log(real.pop(len(real) // 2)), 0.0))
+    pairs = zip(real[::2], real[1::2], strict=True)
+    return rows + [(True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in pairs]
+
+
+def _to_zeta(w: complex) -> complex:
+    """From w to zeta = z - 1, without a subtraction near one."""
+    return 2 * w / (1 - w)
+
+
+def _section(q: list[complex], p: list[complex], dt: float) -> StateSpace:
+    """Section `(zeta - q) / (zeta - p)` of first or second order, with unit feedthrough."""
+    if len(p) == 1:
+        step = p[0].real - q[0].real
+        size = np.sqrt(abs(step))
+        A, B, C = np.array([[1 + p[0].real]]), np.array([[size]]), np.array([[np.copysign(size, step)]])
+        return StateSpace(A, B, C, np.ones((1, 1)), dt)
+    # Numerator minus denominator: b1 zeta + b0.
+    b1, b0 = np.real(p[0] + p[1] - q[0] - q[1]), np.real(q[0] * q[1] - p[0] * p[1])
+    kappa, slow = np.sqrt(np.real(p[0] * p[1])), -p[0].real
+    A = np.array([[1 - slow, kappa], [-(p[0].imag ** 2) / kappa, 1 + p[1].real]])
+    C = np.array([[(b0 - b1 * slow) / kappa, b1]])
+    size = np.sqrt(max(float(np.abs(C).max()), np.finfo(float).tiny))
+    return StateSpace(A, np.array([[0.0], [size]]), C / size, np.ones((1, 1)), dt)

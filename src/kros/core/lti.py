@@ -147,6 +147,11 @@ class StateSpace:
         """Return the largest pole magnitude, shape (...); zero without states."""
         return np.abs(self.poles()).max(axis=-1, initial=0.0)
 
+    def largest_pole(self) -> float:
+        """Return the spectral radius, or the largest real part of a pole in continuous time, of one system."""
+        poles = self.poles()
+        return float(np.abs(poles).max(initial=0.0) if self.dt > 0 else poles.real.max(initial=-np.inf))
+
     def is_stable(self) -> Array:
         """Tell whether every pole is inside the unit circle (or the left half-plane)."""
         poles = self.poles()

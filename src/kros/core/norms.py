@@ -149,7 +149,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = to_continuous(system) if system.dt > 0 else system
-    at, lower = _largest(system, _first_frequencies(continuous))
+    at, lower = _largest(system, first_frequencies(continuous.poles()))
     at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda found: found[1])
     if lower == 0.0:
         return 0.0
@@ -169,7 +169,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
 def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower: float, error: float) -> float:
     """Search the peak between the frequencies that level sets and poles name, in balanced coordinates, and return its gain in multiple precision."""
     continuous = balanced(continuous)
-    known = _first_frequencies(continuous)
+    known = first_frequencies(continuous.poles())
     for _ in range(_MAX_ITERATIONS):
         found, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
         before, (at, lower) = lower, (found, best) if best > lower else (at, lower)
@@ -238,9 +238,8 @@ def _rounding(system: StateSpace, nu: float) -> float:
     return float(_EPSILON * np.linalg.norm(inside, 2))
 
 
-def _first_frequencies(system: StateSpace) -> Array:
-    """Frequencies for the first lower bound: DC, all poles, a logarithmic grid around them."""
-    poles = system.poles()
+def first_frequencies(poles: Array) -> Array:
+    """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a logarithmic grid around them."""
     sizes = np.abs(poles)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman
-    from .riccati.h2_optimal import h2
-    from .riccati.hinf_optimal import hinf
+    from .riccati.h2 import h2
+    from .riccati.hinf import hinf
     from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
 
@@ -39,8 +39,8 @@ _HOME = {
     "Synthesis": "result",
     "UnitCheck": "worst_case.unit_check",
     "check_units": "worst_case.unit_check",
-    "h2": "riccati.h2_optimal",
-    "hinf": "riccati.hinf_optimal",
+    "h2": "riccati.h2",
+    "hinf": "riccati.hinf",
     "kalman": "riccati.constant_gain",
     "mixed": "mixed_norms.optimal",
     "reduce_controller": "reduction.truncation",

@@ -24,7 +24,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import gramian
 from ..generalized_plant import GeneralizedPlant
-from ..riccati.h2_optimal import h2
+from ..riccati.h2 import h2
 
 Array = npt.NDArray[Any]
 

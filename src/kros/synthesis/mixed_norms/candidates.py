@@ -13,7 +13,7 @@ from ...core.errors import KrosError, SynthesisError
 from ...core.lti import StateSpace
 from ..generalized_plant import GeneralizedPlant
 from ..reduction.truncation import truncate
-from ..riccati.h2_optimal import absorb_feedthrough
+from ..riccati.equations import absorb_feedthrough
 from .balance import balance, reached
 from .barrier import Ending, minimise
 from .channels import Verified, scaled, verify

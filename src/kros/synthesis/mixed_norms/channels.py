@@ -10,8 +10,7 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
-from ..riccati.h2_optimal import stability_margin
-from ..riccati.hinf_bound import proven_bound
+from ..riccati.hinf import proven_bound
 
 _TOLERANCE = 1e-4
 
@@ -41,7 +40,7 @@ def verify(
     if not all(np.isfinite(getattr(controller, name)).all() for name in "ABCD"):
         return f"{origin}: the controller is not finite"
     closed = plant.close(controller)
-    margin = stability_margin(closed)
+    margin = closed.largest_pole()
     if not closed.is_stable():
         return f"{origin}: closed loop unstable, spectral radius {margin:.6g}"
     norm, peak = h2_norm(part(plant, closed, 1)), hinf_norm(part(plant, closed, 2))
@@ -75,7 +74,7 @@ def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float | N
     if attained is None:
         loop = two.open_loop()
         attained = hinf_norm(loop) if loop.is_stable() else 10 * gamma
-    least = proven_bound(two, max(attained, 2 * gamma), _TOLERANCE)
+    least = proven_bound(two, max(attained, 2 * gamma))
     if least >= gamma:
         raise SynthesisError(
             f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise gamma, or make the weights of "

@@ -26,7 +26,8 @@ from ..assumptions import require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
-from ..riccati.h2_optimal import absorb_feedthrough, h2
+from ..riccati.equations import absorb_feedthrough
+from ..riccati.h2 import h2
 from .balance import balance, reached
 from .candidates import by_inequalities
 from .channels import Verified, part, require_reachable, verify

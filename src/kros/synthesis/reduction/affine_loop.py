@@ -27,7 +27,7 @@ import numpy.typing as npt
 from ...core.lti import StateSpace
 from ...core.norms import gramian
 from ..generalized_plant import GeneralizedPlant
-from ..riccati.h2_optimal import absorb_feedthrough
+from ..riccati.equations import absorb_feedthrough
 
 Array = npt.NDArray[Any]
 

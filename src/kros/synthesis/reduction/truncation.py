@@ -24,7 +24,6 @@ from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import generalized_plant
 from ..result import Status, Synthesis, enclosed
-from ..riccati.h2_optimal import stability_margin
 from ..worst_case.certificate import certify
 from .balancing import Balancing, gramian_root
 
@@ -156,7 +155,7 @@ def _restated(problem: ObserverProblem | GeneralizedPlant, synthesis: Synthesis,
         split = problem.n_w1 is not None or problem.n_z1 is not None
         gain = hinf_norm(two.close(K) if split else closed)
         found = replace(
-            synthesis, worst_case_h2=None, h2_norm=value, hinf_norm=gain, spectral_radius=stability_margin(closed)
+            synthesis, worst_case_h2=None, h2_norm=value, hinf_norm=gain, spectral_radius=closed.largest_pole()
         )
         bounded = synthesis.method in ("h2", "mixed")
     lower, gap, notes = enclosed(value, synthesis.lower_bound) if bounded else (None, None, ())

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
+from ...core.lti import StateSpace
 
 Array = npt.NDArray[Any]
 
@@ -84,3 +85,16 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     return None
+
+
+def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
+    """Turn a controller for ``y - D22 u`` into one for ``y``."""
+    if not np.any(D22):
+        return K
+    loop = np.eye(K.n_outputs) + K.D @ D22
+    if np.linalg.cond(loop) > 1e12:
+        raise SynthesisError(
+            "Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22."
+        )
+    C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
+    return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)

@@ -29,7 +29,7 @@ from ..problem.plants import shaped_plant
 from ..result import Injection
 from ..riccati.constant_gain import predictor
 from ..riccati.filter_bound import predictor_bound
-from ..riccati.h2_optimal import h2
+from ..riccati.h2 import h2
 from .disturbance import Shaping
 
 Array = npt.NDArray[Any]

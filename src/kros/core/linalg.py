@@ -44,6 +44,20 @@ def balanced_size(A: Array) -> Array:
     return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
 
 
+def balancing(
+    R: npt.NDArray[Any], S: npt.NDArray[Any], negligible: float = 0.0
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Balance the Gramians ``R R'`` and ``S S'``, factors of shape (n, any): ``left``, ``right``, ``left @ right = I``, and the Hankel singular values.
+
+    The balanced state is ``left x``; Gramians are never formed, so states that matter little keep their digits. Values below a share of the largest
+    are left out.
+    """
+    U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
+    k = int(np.sum(values > negligible * values.max(initial=0.0)))
+    root = np.sqrt(values[:k])
+    return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
+
+
 def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
     """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first: units of measure change nothing."""
     size = balanced_size(A)

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError, KrosError
-from .linalg import balanced_size
+from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
 from .precise import precise_gain, precise_h2_norm
 
@@ -63,6 +63,25 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
             break
         power = power @ power
     return (P + P.T) / 2
+
+
+def gramian_root(A: Array, B: Array, dt: float) -> Array:
+    """Return R with ``R R'`` the controllability Gramian of a stable pair, shape (n, at most n) in discrete time.
+
+    Discrete time. ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor: ``R_2k`` is the triangle of ``[R_k, A^k R_k]``. Poles near one
+    cost a few more doublings and no accuracy.
+    """
+    if dt == 0:
+        values, vectors = np.linalg.eigh(gramian(A, B, dt))
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    power, R = A, qr_triangle(B.T).T
+    for _ in range(_MAX_ITERATIONS):
+        step = power @ R
+        R = qr_triangle(np.hstack([R, step]).T).T
+        if np.abs(step).max(initial=0.0) <= 1e-9 * np.abs(R).max(initial=0.0):
+            break
+        power = power @ power
+    return R
 
 
 def h2_norm(system: Any) -> float:
@@ -241,9 +260,10 @@ def _rounding(system: StateSpace, nu: float) -> float:
 def first_frequencies(poles: Array) -> Array:
     """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a logarithmic grid around them."""
     sizes = np.abs(poles)
+    low, high = max(sizes.min(), 1e-300), max(sizes.max(), 1e-300)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))
-    grid = np.geomspace(max(sizes.min(), 1e-300) / 10, sizes.max() * 10, 100)
+    grid = np.geomspace(low / 10, 10 * high, 100)
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.optimal import mixed
     from .problem.observer_problem import ObserverProblem
-    from .reduction.truncation import reduce_controller
+    from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
     from .riccati.constant_gain import kalman
@@ -43,7 +43,7 @@ _HOME = {
     "hinf": "riccati.hinf",
     "kalman": "riccati.constant_gain",
     "mixed": "mixed_norms.optimal",
-    "reduce_controller": "reduction.truncation",
+    "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",
 }

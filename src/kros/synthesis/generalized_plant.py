@@ -152,21 +152,21 @@ class GeneralizedPlant:
         first = sum(parts[other] for other in names[: names.index(name)])
         return np.arange(first, first + parts[name])
 
-    def channel(self, rows: slice, columns: slice) -> GeneralizedPlant:
+    def channel(self, rows: slice | Array, columns: slice | Array) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
-        D11 = self.D11[rows][:, columns]
-        return GeneralizedPlant(
-            self.A,
-            self.B1[:, columns],
-            self.B2,
-            self.C1[rows],
-            self.C2,
-            D11,
-            self.D12[rows],
-            self.D21[:, columns],
-            self.D22,
-            self.dt,
-        )
+        C1, D12, D11 = self.C1[rows], self.D12[rows], self.D11[rows][:, columns]
+        B1, D21 = self.B1[:, columns], self.D21[:, columns]
+        return GeneralizedPlant(self.A, B1, self.B2, C1, self.C2, D11, D12, D21, self.D22, self.dt)
+
+    @property
+    def performance(self) -> GeneralizedPlant:
+        """The plant of channel 1 alone, from w1 to z1."""
+        return self.channel(self.rows(1), self.columns(1))
+
+    @property
+    def uncertainty(self) -> GeneralizedPlant:
+        """The plant of channel 2 alone, from w2 to z2."""
+        return self.channel(self.rows(2), self.columns(2))
 
     def open_loop(self) -> StateSpace:
         """Return the plant as one system from (w, u) to (z, y)."""
@@ -211,19 +211,9 @@ class GeneralizedPlant:
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:
     """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` as in `GeneralizedPlant`."""
-    B, C, D = system.B, system.C, system.D
-    matrices = (
-        system.A,
-        B[:, :n_w],
-        B[:, n_w:],
-        C[:n_z],
-        C[n_z:],
-        D[:n_z, :n_w],
-        D[:n_z, n_w:],
-        D[n_z:, :n_w],
-        D[n_z:, n_w:],
-    )
-    return GeneralizedPlant(*matrices, system.dt, **parts)
+    (B1, B2), (C1, C2) = np.split(system.B, [n_w], axis=1), np.split(system.C, [n_z])
+    (D11, D12), (D21, D22) = (np.split(D, [n_w], axis=1) for D in np.split(system.D, [n_z]))
+    return GeneralizedPlant(system.A, B1, B2, C1, C2, D11, D12, D21, D22, system.dt, **parts)
 
 
 def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:

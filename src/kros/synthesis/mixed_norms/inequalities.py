@@ -26,14 +26,17 @@ X, Y, A_n, B_n, C_n, D_n, Z : the variables
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import balancing
 from ...core.lti import StateSpace
-from .balance import Balanced
+from ...core.norms import gramian, h2_norm
+from ..generalized_plant import GeneralizedPlant
+from ..riccati.h2 import h2
 from .barrier import Block
 
 Array = npt.NDArray[Any]
@@ -41,6 +44,64 @@ Values = dict[str, Array]
 
 # Least eigenvalue of the scaled Lyapunov matrices: keeps I - Y X away from singular, without which the controller cannot be recovered.
 _MARGIN = 1e-3
+_KNOWN = (
+    1e-3  # error, in a state's standard deviations, for which coordinates are chosen where a state is known exactly
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """A plant in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect."""
+
+    plant: GeneralizedPlant
+    size: float
+    spread: Array
+    controls: Array
+    measurements: Array
+
+    def inside(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the balanced plant for one of the original."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B * m, K.C / c, K.D * m / c, K.dt)
+
+    def controller(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the original plant."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B / m, c * K.C, c * K.D / m, K.dt)
+
+
+def balance(plant: GeneralizedPlant) -> Balanced:
+    """Balance a regular plant (D22 = 0) for the mixed inequalities, in the coordinates (error, estimate) of its H2-optimal observer.
+
+    An accurate sensor makes the error ``e = x - x_hat`` of the optimal estimate many decades smaller than the state, so nothing here subtracts one
+    covariance from another: those of e, of x_hat and between them are E, W and F, and ``X = E + F + F' + W`` is that of x. T makes ``X = E^-1 = diag(s)``.
+    """
+    n = plant.sizes[0]
+    rows, K = plant.rows(1), h2(plant.channel(plant.rows(1), slice(None))).controller
+    L = K.B - plant.B2 @ K.D  # predictor gain: e+ = (A - L C2) e + ...
+    A = np.block([[plant.A - L @ plant.C2, np.zeros((n, n))], [K.B @ plant.C2, K.A + K.B @ plant.C2]])
+    P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
+    E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
+    X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
+    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > 1e-28 * np.diag(X), 0.0, np.diag(X)))
+    T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
+    size = h2_norm(plant.channel(rows, slice(None)).close(K))
+    scale = np.ones((plant.sizes[3], 1))
+    scale[rows] = 1 / max(size, 1e-300)
+    measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
+    controls = size / np.linalg.norm(plant.D12[rows], axis=0)
+    balanced = replace(
+        plant,
+        A=T @ plant.A @ back,
+        B1=T @ plant.B1,
+        B2=T @ plant.B2 * controls,
+        C1=(plant.C1 * scale) @ back,
+        C2=plant.C2 @ back / measurements[:, None],
+        D11=plant.D11 * scale,
+        D12=plant.D12 * scale * controls,
+        D21=plant.D21 / measurements[:, None],
+    )
+    return Balanced(balanced, size, s, controls, measurements)
 
 
 @dataclass(frozen=True, eq=False)

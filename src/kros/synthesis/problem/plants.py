@@ -35,6 +35,11 @@ from .observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
 
+_LEAST_NOISE, _LEAST_PENALTY = (
+    1e-3,
+    3e-2,
+)  # in matrix inequalities: share of the measured channel's range, weight of the scaled correction
+
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there are any."""
@@ -84,66 +89,48 @@ def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> Gene
     return penalise(shape_inputs(problem.error_plant(), filters), problem.correction_penalty)
 
 
-def mixed_plant(problem: ObserverProblem, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
-    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2)."""
+def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
+    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
+
+    Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, nor a penalty as small: both have a floor here, and a result is
+    certified for the true noise.
+    """
     whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
-    sigma = np.maximum(1.0, noise_floor * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
-    penalty = max(problem.correction_penalty, penalty_floor)
-    w = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
-    z1, z2 = whole.part("z", "z1"), whole.part("z", "z2")
-    size = np.ones(whole.B1.shape[1])
-    size[whole.part("w", "n")] = sigma
-    B1, D11, D21 = (matrix[:, w] * size[w] for matrix in (whole.B1, whole.D11, whole.D21))
-    n, _, n_u, _, _ = whole.sizes
-
-    def rows(matrix: Array, middle: Array) -> Array:
-        return np.vstack([matrix[z1], middle, matrix[z2]])
-
-    return GeneralizedPlant(
-        whole.A,
-        B1,
-        whole.B2,
-        rows(whole.C1, np.zeros((n_u, n))),
-        whole.C2,
-        rows(D11, np.zeros((n_u, len(w)))),
-        rows(whole.D12, penalty * np.eye(n_u)),
-        D21,
-        whole.D22,
-        whole.dt,
-        n_w1=whole.w_parts["w1"] + whole.w_parts["n"],
-        n_z1=len(z1) + n_u,
-    )
+    whole = penalise(whole, max(problem.correction_penalty, _LEAST_PENALTY))
+    noise = np.maximum(1.0, _LEAST_NOISE * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
+    size = np.ones(whole.sizes[1])
+    size[whole.part("w", "n")] = noise
+    columns = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
+    rows = np.concatenate([whole.part("z", name) for name in ("z1", "penalty", "z2")])
+    w1, z2 = len(columns) - whole.w_parts["w2"], len(rows) - whole.z_parts["z2"]
+    scaled = replace(whole, B1=whole.B1 * size, D11=whole.D11 * size, D21=whole.D21 * size)
+    return replace(scaled.channel(rows, columns), n_w1=w1, n_z1=z2)
 
 
 def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
     """Put a filter in front of the disturbances: w = weight * nu."""
     n, k = plant.A.shape[0], weight.n_states
-    return GeneralizedPlant(
-        np.block([[plant.A, plant.B1 @ weight.C], [np.zeros((k, n)), weight.A]]),
-        np.vstack([plant.B1 @ weight.D, weight.B]),
-        np.vstack([plant.B2, np.zeros((k, plant.B2.shape[1]))]),
-        np.hstack([plant.C1, plant.D11 @ weight.C]),
-        np.hstack([plant.C2, plant.D21 @ weight.C]),
-        plant.D11 @ weight.D,
-        plant.D12,
-        plant.D21 @ weight.D,
-        plant.D22,
-        plant.dt,
+    return replace(
+        plant,
+        A=np.block([[plant.A, plant.B1 @ weight.C], [np.zeros((k, n)), weight.A]]),
+        B1=np.vstack([plant.B1 @ weight.D, weight.B]),
+        B2=np.vstack([plant.B2, np.zeros((k, plant.B2.shape[1]))]),
+        C1=np.hstack([plant.C1, plant.D11 @ weight.C]),
+        C2=np.hstack([plant.C2, plant.D21 @ weight.C]),
+        D11=plant.D11 @ weight.D,
+        D21=plant.D21 @ weight.D,
+        w_parts={},
+        n_w1=None,
     )
 
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:
-    """Append the weighted control to the performance outputs."""
+    """Append the weighted control to the performance outputs, as the part "penalty" where these have names."""
     n, n_w, n_u, _, _ = plant.sizes
-    return GeneralizedPlant(
-        plant.A,
-        plant.B1,
-        plant.B2,
-        np.vstack([plant.C1, np.zeros((n_u, n))]),
-        plant.C2,
-        np.vstack([plant.D11, np.zeros((n_u, n_w))]),
-        np.vstack([plant.D12, penalty * np.eye(n_u)]),
-        plant.D21,
-        plant.D22,
-        plant.dt,
+    return replace(
+        plant,
+        C1=np.vstack([plant.C1, np.zeros((n_u, n))]),
+        D11=np.vstack([plant.D11, np.zeros((n_u, n_w))]),
+        D12=np.vstack([plant.D12, penalty * np.eye(n_u)]),
+        z_parts=plant.z_parts | {"penalty": n_u} if plant.z_parts else {},
     )

@@ -23,7 +23,7 @@ import numpy as np
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
-from ..assumptions import require
+from ..assumptions import h2_violations, require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis
 from .h2 import h2
@@ -158,11 +158,11 @@ def _attempt(frame: Frame, level: float) -> tuple[_Loop, float]:
 
 def proven_bound(plant: GeneralizedPlant, level: float) -> float:
     """Return a number that the H-infinity norm of no stable closed loop is below, tight for a regular plant and a level just above the optimum."""
-    try:
-        frame = Frame.of(plant)
-        return max(pointwise_bound(frame.scaled), _attempt(frame, level)[1])
-    except (SynthesisError, np.linalg.LinAlgError):
-        return pointwise_bound(scale(plant))
+    best = pointwise_bound(scale(plant))
+    if h2_violations(plant, proper=False):
+        return best
+    frame = Frame.of(plant)
+    return max(best, level_bound(frame, frame.halves(level)))
 
 
 def _out_of_reach(gamma: float, best: _Loop, lower: float) -> SynthesisError:

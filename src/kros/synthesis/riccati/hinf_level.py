@@ -28,7 +28,7 @@ import numpy.typing as npt
 from scipy.linalg import LinAlgError, schur
 
 from ...core.errors import SynthesisError
-from ...core.linalg import balanced_size
+from ...core.linalg import balanced_size, balancing
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..generalized_plant import GeneralizedPlant, split
@@ -209,11 +209,10 @@ def _balancing(p: GeneralizedPlant) -> tuple[Array, Array]:
     try:
         X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, method)
         Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, p.D21 @ p.D21.T, p.B1 @ p.D21.T, p.dt, method)
-        left, right = _root(X, p.A, p.C1), _root(Y, p.A, p.B1)
-        U, s, Vh = np.linalg.svd(left.T @ right)
+        left, right, _ = balancing(_root(Y, p.A, p.B1), _root(X, p.A, p.C1))
     except (SynthesisError, LinAlgError):
         return np.eye(len(p.A)), np.eye(len(p.A))
-    return (U / np.sqrt(s)).T @ left.T, right @ Vh.T / np.sqrt(s)
+    return left, right
 
 
 def _root(M: Array, A: Array, source: Array) -> Array:

@@ -18,7 +18,9 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
+from ...core.norms import h2_norm
 from ..problem.observer_problem import ObserverProblem
+from ..result import Status, Synthesis
 from .ball import spread
 from .disturbance import uncertain_ball
 from .quadrature import circle_mean
@@ -54,6 +56,23 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
     )
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
+
+
+def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:
+    """Return a controller in physical units with its certificate; ``h2_norm`` is that of measurement and process noise alone."""
+    value, error = certify(problem, controller, rtol)
+    loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
+    return Synthesis(
+        method=method,
+        controller=controller,
+        status=Status.CERTIFIED,
+        injection=problem.injection,
+        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt)),
+        worst_case_h2=value,
+        quadrature_error=error,
+        spectral_radius=loop.largest_pole(),
+        solver="riccati",
+    )
 
 
 def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:

@@ -124,7 +124,7 @@ def test_states_of_no_consequence_go_without_loss():
 @pytest.fixture(scope="module")
 def designs():
     problems = [drive_problem(Injection.STATE, remainder=True), drive_problem(Injection.INPUT)]
-    return [(p, worst_case_h2(p, order=2, refinements=0)) for p in problems]
+    return [(p, worst_case_h2(p, max_order=2, tolerance_db=0.1)) for p in problems]
 
 
 def test_the_lowest_order_within_the_loss_and_its_certificate(designs):

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
-    from .riccati.constant_gain import kalman
     from .riccati.h2 import h2
     from .riccati.hinf import hinf
+    from .riccati.kalman import kalman
     from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
 
@@ -41,7 +41,7 @@ _HOME = {
     "check_units": "worst_case.unit_check",
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
-    "kalman": "riccati.constant_gain",
+    "kalman": "riccati.kalman",
     "mixed": "mixed_norms.optimal",
     "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",

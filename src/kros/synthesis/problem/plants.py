@@ -83,10 +83,9 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise through shaping filters at the input and at the state, penalty on the correction: w = (nu_d, nu_r, n, v)."""
+    """White noise through shaping filters at the input and at the state: w = (nu_d, nu_r, n, v), states (xi, W_p, d, r)."""
     q, n = len(problem.C), problem.nominal.n_states
-    filters = block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)])
-    return penalise(shape_inputs(problem.error_plant(), filters), problem.correction_penalty)
+    return shape_inputs(problem.error_plant(), block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)]))
 
 
 def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:

@@ -26,8 +26,8 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, dense_response
 from ...core.norms import gramian, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.constant_gain import kalman
 from ..riccati.filter_bound import predictor_bound
+from ..riccati.kalman import kalman
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]

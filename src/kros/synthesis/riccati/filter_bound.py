@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.norms import gramian
-from .constant_gain import predictor
+from .kalman import predictor
 
 Array = npt.NDArray[Any]
 

@@ -1,11 +1,10 @@
 r"""Certified worst-case H2 norm of an observer, for any correction filter, however it was found.
 
 .. math::
-    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta,
-    \qquad b_\Delta = \|T X_c M\|_F + \Big(\sum_i \sigma_i(T R_l)^2 \sigma_i(R_r M)^2\Big)^{1/2}
+    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta
 
-or the sharper dual bound of `dual_bound`, whichever is smaller. ``b_r`` bounds the additive remainder in the same way (a ball around zero);
-it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
+``b_Delta`` bounds ``||T X M||_F`` over the matrix ball (`ball`), ``b_r`` the additive remainder, a ball around zero; it adds by the triangle
+inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
 frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
 """
 
@@ -21,8 +20,7 @@ from ...core.lti import StateSpace
 from ...core.norms import h2_norm
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
-from .ball import spread
-from .disturbance import uncertain_ball
+from .ball import spread, uncertain_ball
 from .quadrature import circle_mean
 
 Array = npt.NDArray[Any]

@@ -19,7 +19,7 @@ A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -94,8 +94,8 @@ class ObserverProblem:
     --------
     >>> from kros.core import StateSpace, gain
     >>> from kros.synthesis import ObserverProblem
-    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
-    >>> problem = ObserverProblem(lag, [[1.0]], W_L=gain([[0.1]], 0.01), W_R=gain([[1.0]], 0.01), input_scale=[1.0], output_scale=[1.0], noise=[0.1])
+    >>> lag, W_L, W_R = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), gain([[0.1]], 0.01), gain([[1.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], W_L, W_R, input_scale=[1.0], output_scale=[1.0], noise=[0.1])
     >>> problem.form.value, problem.injection.value
     ('inverse_input_multiplicative', 'state')
     """
@@ -118,58 +118,64 @@ class ObserverProblem:
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "form", as_form(self.form))
-        object.__setattr__(self, "injection", member(Injection, self.injection, "Observer problem: the injection"))
-        for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, StateSpace.of(getattr(self, name)))
-        object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
+        put = partial(object.__setattr__, self)
+        put("form", as_form(self.form))
+        put("injection", member(Injection, self.injection, "Observer problem: the injection"))
+        put("nominal", StateSpace.of(self.nominal))
+        put("C", np.atleast_2d(np.asarray(self.C, dtype=float)))
         n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
-        if self.C.shape[1] != n:
-            raise DimensionError(
-                f"Observer problem: C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity."
-            )
-        if self.n_original is not None and not 1 <= self.n_original <= n:
-            raise DimensionError(f"Observer problem: n_original = {self.n_original} should lie between 1 and {n}.")
+        self._require(
+            self.C.shape[1] == n,
+            f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity",
+        )
+        kept = n if self.n_original is None else self.n_original
+        self._require(1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
         for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            if value.shape != (size,) or not np.all(np.isfinite(value) & (value > 0)):
-                raise DimensionError(
-                    f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)."
-                )
-            object.__setattr__(self, name, value)
+            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value > 0)))
+            self._require(
+                valid,
+                f"{name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)",
+            )
+            put(name, value)
         level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
-        if level.shape != (n,) or not np.all(np.isfinite(level) & (level >= 0)):
-            raise DimensionError(
-                f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}."
-            )
-        object.__setattr__(self, "process_noise", level)
-        if self.W_p is None:
-            kept = n if self.n_original is None else self.n_original
-            object.__setattr__(self, "W_p", np.diag(1 / self.output_scale)[:kept])
-        if not isinstance(self.W_p, StateSpace):
-            object.__setattr__(self, "W_p", np.atleast_2d(np.asarray(self.W_p, dtype=float)))
-        if self.correction_penalty <= 0:
-            raise DimensionError(
-                f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default."
-            )
-        if self.injection is Injection.NONE:
-            raise DimensionError(
-                "Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE."
-            )
-        if (self.remainder_left is None) != (self.remainder_right is None):
-            raise DimensionError(
-                "Observer problem: remainder_left and remainder_right come together, found only one of them."
-            )
+        valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
+        self._require(valid, f"process_noise should be {n} numbers of at least zero, found {level}")
+        put("process_noise", level)
+        W_p = np.diag(1 / self.output_scale)[:kept] if self.W_p is None else self.W_p
+        put("W_p", gain(W_p, self.nominal.dt) if isinstance(W_p, np.ndarray | list) else W_p)
+        self._require(
+            self.correction_penalty > 0,
+            f"correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default",
+        )
+        self._require(
+            self.injection is not Injection.NONE, "injection should be Injection.INPUT or Injection.STATE, found NONE"
+        )
+        together = (self.remainder_left is None) == (self.remainder_right is None)
+        self._require(together, "remainder_left and remainder_right come together, found only one of them")
         rows, columns = self.location.sizes(n, m)
-        sizes: dict[str, tuple[int | None, int | None]] = {
-            "W_L": (rows, None),
-            "W_R": (None, columns),
-            "W_u": (m, m),
-            "W_p": (None, n),
-        }
-        for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
-            self._check_weight(name, *size)
+        left_right = {"remainder_left": (n, None), "remainder_right": (None, m)}
+        for name, size in (
+            {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)} | left_right
+        ).items():
+            if getattr(self, name) is not None:
+                put(name, StateSpace.of(getattr(self, name)))
+                self._check_weight(name, *size)
+
+    def _require(self, condition: bool, message: str) -> None:
+        if not condition:
+            raise DimensionError(f"Observer problem: {message}.")
+
+    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
+        weight, dt = getattr(self, name), self.nominal.dt
+        size = weight.n_outputs, weight.n_inputs
+        fits = size == (rows or size[0], columns or size[1]) and not weight.batch_shape
+        wanted = f"{name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty"
+        self._require(fits, f"{wanted}, found {size[0]} x {size[1]}{weight.batch_shape or ''}")
+        self._require(
+            weight.dt == dt,
+            f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s; fit it at the model's period",
+        )
 
     @classmethod
     def from_uncertain(
@@ -235,21 +241,6 @@ class ObserverProblem:
             )
         return problem
 
-    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
-        weight = getattr(self, name)
-        if weight is None:
-            return
-        found = weight.shape if isinstance(weight, np.ndarray) else (weight.n_outputs, weight.n_inputs)
-        if found != (rows or found[0], columns or found[1]) or getattr(weight, "batch_shape", ()):
-            raise DimensionError(
-                f"Observer problem: {name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty, "
-                f"found {found[0]} x {found[1]}{getattr(weight, 'batch_shape', None) or ''}."
-            )
-        if isinstance(weight, StateSpace) and weight.dt != self.nominal.dt:
-            raise DimensionError(
-                f"Observer problem: {name} is sampled at {weight.dt} s, the nominal model at {self.nominal.dt} s; fit it at the model's period."
-            )
-
     @property
     def location(self) -> UncertaintyLocation:
         """Where the perturbation acts and what it sees."""
@@ -263,22 +254,15 @@ class ObserverProblem:
     @cached_property
     def performance(self) -> StateSpace:
         """W_p on scaled states."""
-        W_p, x = self.W_p, self.output_scale
-        if isinstance(W_p, StateSpace):
-            return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
-        assert W_p is not None
-        return gain(W_p * x, self.nominal.dt)
+        W_p, x = StateSpace.of(self.W_p), self.output_scale
+        return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
 
     @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
         """A, B, C and the direct part of W_p in scaled coordinates; the measurement noise has unit covariance."""
         x, u = self.output_scale, self.input_scale
-        return (
-            self.nominal.A * x / x[:, None],
-            self.nominal.B * u / x[:, None],
-            self.C * x / self.noise[:, None],
-            self.performance.D,
-        )
+        A, B = self.nominal.A * x / x[:, None], self.nominal.B * u / x[:, None]
+        return A, B, self.C * x / self.noise[:, None], self.performance.D
 
     @cached_property
     def scaled_model(self) -> StateSpace:
@@ -372,18 +356,18 @@ class ObserverProblem:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
 
-    def _scales(self) -> tuple[Array, Array]:
+    @property
+    def _scales(self) -> tuple[StateSpace, StateSpace]:
+        """Sizes of the correction and of the measurements, as gains."""
         correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale
-        return correction, self.noise
+        return gain(np.diag(correction), self.nominal.dt), gain(np.diag(self.noise), self.nominal.dt)
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        out, noise = self._scales()
-        K = controller
-        return StateSpace(K.A, K.B * noise, K.C / out[:, None], K.D * noise / out[:, None], K.dt)
+        correction, noise = self._scales
+        return gain(np.linalg.inv(correction.D), noise.dt) @ controller @ noise
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        out, noise = self._scales()
-        K = controller
-        return StateSpace(K.A, K.B / noise, K.C * out[:, None], K.D / noise * out[:, None], K.dt)
+        correction, noise = self._scales
+        return correction @ controller @ gain(np.linalg.inv(noise.D), noise.dt)

@@ -48,11 +48,7 @@ _ACCURACY = 1e-4  # of the inequalities' optimum, relative
 
 
 def mixed(
-    plant: GeneralizedPlant | ObserverProblem,
-    *,
-    gamma: float = 1.0,
-    max_states: int = 8,
-    time_limit_s: float = 20.0,
+    plant: GeneralizedPlant | ObserverProblem, *, gamma: float = 1.0, max_states: int = 8, time_limit_s: float = 20.0
 ) -> Synthesis:
     """Return a controller with a small H2 norm in channel 1 and an H-infinity norm below `gamma` in channel 2.
 
@@ -213,11 +209,7 @@ def _candidate(
     """Solve the inequalities of the small plant and verify the controller on the whole one."""
     inequalities = MixedInequalities(balance(small), gamma)
     solved = minimise(
-        inequalities.objective(),
-        inequalities.blocks(),
-        inequalities.start(),
-        rtol=_ACCURACY,
-        time_limit_s=time_limit_s,
+        inequalities.objective(), inequalities.blocks(), inequalities.start(), rtol=_ACCURACY, time_limit_s=time_limit_s
     )
     if solved.x is None or not np.isfinite(solved.value):
         raise SynthesisError(f"{note}: {solved.ending.value}")

@@ -44,12 +44,7 @@ _BOUND_ORDERS = (1, 2)  # of filters in lower bounds: W_L is behind them as it i
 
 
 def worst_case_h2(
-    problem: ObserverProblem,
-    *,
-    max_order: int = 4,
-    tolerance_db: float = 1.0,
-    fit: Any = None,
-    bounded: bool = True,
+    problem: ObserverProblem, *, max_order: int = 4, tolerance_db: float = 1.0, fit: Any = None, bounded: bool = True
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
 

@@ -2,7 +2,8 @@
 
     UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | kalman --> Synthesis
 
-Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
+Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError`
+that says why.
 
 Examples
 --------

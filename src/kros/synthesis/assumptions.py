@@ -1,6 +1,7 @@
 """The assumptions of H2 and H-infinity synthesis, each with its label and what to do when it fails.
 
-The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 14.5 (continuous time) and 21.7 (discrete time).
+The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 14.5 (continuous time) and 21.7
+(discrete time).
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _REMEDY = {
 
 
 def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
-    """Return the eigenvalues of A on or beyond the stability boundary that B does not reach (Hautus test, in balanced units of the states)."""
+    """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
@@ -84,12 +85,13 @@ def require_plant(plant: object, method: str) -> None:
     """Raise a `DimensionError` when it is no generalized plant."""
     if not isinstance(plant, GeneralizedPlant):
         raise DimensionError(
-            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found {type(plant).__name__}; build one first."
+            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found "
+            f"{type(plant).__name__}; build one first."
         )
 
 
 def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
-    """Raise a `SynthesisError` that names every violated assumption, or a `DimensionError` when it is no generalized plant."""
+    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
     require_plant(plant, method)
     failed = [f"{a.value} ({found}): {_REMEDY[a]}" for a, found in h2_violations(plant, proper).items()]
     if failed:
@@ -97,7 +99,7 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
 
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
-    """States in units that balance A, and inputs in units that make B as large as A: the test must not depend on anyone's units."""
+    """Balance A and make B as large as A, so that a test does not depend on units."""
     if not A.size:
         return A, B
     size = balanced_size(A)
@@ -112,7 +114,10 @@ def _rank(matrix: Array) -> int:
 
 
 def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
-    """Invariant zeros on the stability boundary; D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C."""
+    """Invariant zeros on the stability boundary.
+
+    D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C.
+    """
     pinv = np.linalg.pinv(D)
     inner = A - B @ pinv @ C
     rest = C - D @ (pinv @ C)

@@ -51,7 +51,8 @@ class GeneralizedPlant:
     dt : float, s
         Sampling period; 0 means continuous time.
     n_w1 : int, optional
-        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default all.
+        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default
+        all.
     n_z1 : int, optional
         For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
     w_parts, z_parts : dict of str to int
@@ -67,8 +68,9 @@ class GeneralizedPlant:
     >>> import numpy as np
     >>> from kros.core import gain, h2_norm
     >>> from kros.synthesis import GeneralizedPlant
-    >>> D11, D12 = np.zeros((2, 2)), [[0.0], [1.0]]
-    >>> plant = GeneralizedPlant([[0.9]], [[1.0, 0.0]], [[1.0]], [[1.0], [0.0]], [[1.0]], D11, D12, [[0.0, 1.0]], [[0.0]], 1.0)
+    >>> D11, D12, D21 = np.zeros((2, 2)), [[0.0], [1.0]], [[0.0, 1.0]]
+    >>> B1, C1 = [[1.0, 0.0]], [[1.0], [0.0]]
+    >>> plant = GeneralizedPlant([[0.9]], B1, [[1.0]], C1, [[1.0]], D11, D12, D21, [[0.0]], 1.0)
     >>> bool(h2_norm(plant.close(gain([[-0.5]], 1.0))) < h2_norm(plant.open_loop()))
     True
     """
@@ -105,7 +107,8 @@ class GeneralizedPlant:
             if getattr(self, name).shape != shape:
                 found = {key: getattr(self, key).shape for key in _MATRICES}
                 raise DimensionError(
-                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix."
+                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the "
+                    "offending matrix."
                 )
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
             raise DimensionError(
@@ -146,7 +149,8 @@ class GeneralizedPlant:
         parts = {"w": self.w_parts, "z": self.z_parts}.get(signal, {})
         if name not in parts:
             raise DimensionError(
-                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of them."
+                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of "
+                "them."
             )
         names = list(parts)
         first = sum(parts[other] for other in names[: names.index(name)])
@@ -190,13 +194,15 @@ class GeneralizedPlant:
         _, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             raise DimensionError(
-                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x {K.n_inputs} at {K.dt} s; "
+                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x "
+                f"{K.n_inputs} at {K.dt} s; "
                 "match the sizes and resample one of them."
             )
         loop = np.eye(n_y) - self.D22 @ K.D
         if n_y and np.linalg.cond(loop) > 1e14:
             raise DimensionError(
-                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller."
+                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly "
+                "proper controller."
             )
         # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))

@@ -1,14 +1,16 @@
-r"""Order reduction: of a controller, with its loss in the certified cost, and of a generalized plant for the cost of matrix inequalities.
+r"""Order reduction of a controller, with its loss in the certified cost, and of a generalized plant.
 
-A controller is balanced *in its loop*. Its states are as important as ``R R'``, their covariance while the closed loop is driven, and
-``S S'``, the error that they cause through the loop, say together. These are the blocks of the closed loop's Gramians, so the weighting of the
-controller's error by the plant on both sides (Enns) and the balancing of the loop's own Gramians (Wortelboer) are the same thing here, and neither
-needs a stable controller. Every order is judged by the certificate itself.
+A controller is balanced *in its loop*. Its states are as important as ``R R'``, their covariance while the closed loop
+is driven, and ``S S'``, the error that they cause through the loop, say together. These are the blocks of the closed
+loop's Gramians, so the weighting of the controller's error by the plant on both sides (Enns) and the balancing of the
+loop's own Gramians (Wortelboer) are the same thing here, and neither needs a stable controller. Every order is judged
+by the certificate itself.
 
 References
 ----------
-D. F. Enns, "Model reduction with balanced realizations: an error bound and a frequency weighted generalization", 23rd CDC (1984) 127-132.
-P. Wortelboer, *Frequency-weighted balanced reduction of closed-loop mechanical servo-systems*, PhD thesis, Delft (1994).
+D. F. Enns, "Model reduction with balanced realizations: an error bound and a frequency weighted generalization", 23rd
+CDC (1984) 127-132. P. Wortelboer, *Frequency-weighted balanced reduction of closed-loop mechanical servo-systems*, PhD
+thesis, Delft (1994).
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ def reduce_controller(
     Parameters
     ----------
     problem : ObserverProblem or GeneralizedPlant
-        What the controller is for. The cost is the certified worst-case H2 norm; for a plant the H2 norm from its ``w1`` to its ``z1``.
+        What the controller is for. The cost is the certified worst-case H2 norm; for a plant the H2 norm from its
+        ``w1`` to its ``z1``.
     synthesis : Synthesis
         Its controller stabilises.
     order : int, optional
@@ -78,7 +81,8 @@ def reduce_controller(
     """
     if largest_loss_percent < 0 or (order is not None and order < 0):
         raise ConfigError(
-            f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be negative."
+            f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be "
+            "negative."
         )
     full = synthesis.controller
     before = _verified(problem, full, synthesis)
@@ -135,7 +139,10 @@ def _balanced(problem: ObserverProblem | GeneralizedPlant, K: StateSpace) -> tup
 
 
 def _bounded(reduced: Synthesis, full: Synthesis, before: Synthesis) -> Synthesis:
-    """State what the reduction cost; a lower bound of the same cost stays, since it does not depend on the controller."""
+    """State what the reduction cost.
+
+    A lower bound of the same cost stays, since it does not depend on the controller.
+    """
     same = full.worst_case_h2 is not None if reduced.worst_case_h2 is not None else full.method in ("h2", "mixed")
     lower, gap, notes = enclosed(_cost(reduced), full.lower_bound) if same else (None, None, ())
     orders = f"order {full.controller.n_states} reduced to {reduced.controller.n_states}"
@@ -144,7 +151,7 @@ def _bounded(reduced: Synthesis, full: Synthesis, before: Synthesis) -> Synthesi
 
 
 def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:
-    """Balanced truncation of a stable plant from (w, u) to (z, y), and the share of the discarded Hankel singular values."""
+    """Balanced truncation of a stable plant, and the sum of the discarded Hankel singular values over the largest."""
     B, C = np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2])
     roots = gramian_root(plant.A, B, plant.dt), gramian_root(plant.A.T, C.T, plant.dt)
     left, right, values = balancing(*roots, _NEGLIGIBLE)

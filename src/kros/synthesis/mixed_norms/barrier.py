@@ -1,16 +1,20 @@
-r"""Interior-point method for small dense matrix inequalities: ``min c'x + x'Qx/2`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
+r"""Interior-point method for small dense matrix inequalities.
 
-Conic solvers spend their time on one large sparse matrix for all cones. The problems of this package have few variables and small, dense
-matrices; there the Newton step of the logarithmic barrier
+It solves ``min c'x + x'Qx/2`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
+
+Conic solvers spend their time on one large sparse matrix for all cones. The problems of this package have few variables
+and small, dense matrices; there the Newton step of the logarithmic barrier
 
 .. math:: f(x) - \mu \sum_k \log\det F_k(x) - \mu \sum_i \log (r^2 - x_i^2)
 
-costs one dense factorisation. It does not depend on the units of x nor on congruences of F. With ``D_k = F_k^{-1/2} dF_k F_k^{-1/2}`` along the
-Newton step dx, the matrices ``mu F_k^{-1/2} (I - D_k) F_k^{-1/2}`` are feasible for the dual problem when ``D_k <= I``, so that
+costs one dense factorisation. It does not depend on the units of x nor on congruences of F. With ``D_k = F_k^{-1/2}
+dF_k F_k^{-1/2}`` along the Newton step dx, the matrices ``mu F_k^{-1/2} (I - D_k) F_k^{-1/2}`` are feasible for the
+dual problem when ``D_k <= I``, so that
 
     f(x + dx) - mu sum_k (tr I - tr D_k^2)
 
-is a lower bound of the optimum in the box ``|x_i| <= r``. The line search is exact: along a ray the barrier is a function of the eigenvalues of D_k.
+is a lower bound of the optimum in the box ``|x_i| <= r``. The line search is exact: along a ray the barrier is a
+function of the eigenvalues of D_k.
 
 References
 ----------
@@ -43,7 +47,8 @@ class Ending(str, Enum):
     TIME
         The time limit was reached; what is returned satisfies the inequalities, if there is anything.
     STALLED
-        Rounding stopped the progress; what is returned satisfies the inequalities, if there is anything. Scale the problem.
+        Rounding stopped the progress; what is returned satisfies the inequalities, if there is anything. Scale the
+        problem.
     """
 
     SOLVED = "solved"
@@ -70,7 +75,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Last point that satisfies all inequalities (None if there is none), its value, a lower bound of the optimum, and how it ended."""
+    """Last point that satisfies all inequalities, if any, its value, a lower bound of the optimum, and how it ended."""
 
     x: Array | None
     value: float
@@ -122,7 +127,10 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
 
 
 def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -np.inf) -> Outcome:
-    """Follow the central path from a point inside; with `stop_below`, end at a centred point whose value lies clearly below it."""
+    """Follow the central path from a point inside.
+
+    With `stop_below`, end at a centred point whose value lies clearly below it.
+    """
     scaled, size = _Scaled.of(programme.blocks, len(x)), programme.size
     mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
     for _ in range(_STEPS):
@@ -196,7 +204,7 @@ class _Programme:
 
 @dataclass(frozen=True, eq=False)
 class _Scaled:
-    """Coefficients of all matrices with the variables last, (d, d n) each, and memory for what every step makes of them: new memory costs more."""
+    """Coefficients of all matrices with the variables last, (d, d n) each, and memory for the results of a step."""
 
     bases: list[Array]
     left: list[Array]  # of their shapes: R M_i
@@ -215,7 +223,7 @@ class _Scaled:
         )
 
     def along(self, roots: Sequence[Array]) -> tuple[Array, Array]:
-        """Return ``sum_k tr D_ki`` and ``sum_k tr D_ki D_kj`` of ``D_ki = R_k M_ki R_k'``, for lower triangular roots R in the order of the matrices."""
+        """Return ``sum_k tr D_ki`` and ``sum_k tr D_ki D_kj`` of ``D_ki = R_k M_ki R_k'``, R triangular."""
         end, trace = 0, np.zeros(self.lower.shape[1])
         for root, basis, memory in zip(roots, self.bases, self.left, strict=True):
             left = np.matmul(root, basis, out=memory).reshape(*root.shape, -1)
@@ -239,7 +247,7 @@ def _solve(hessian: Array, gradient: Array) -> Array:
 
 
 def _line_search(slope: float, curvature: float, eigenvalues: Array) -> float:
-    """Minimiser over the step t of ``slope t + curvature t^2/2 - sum log(1 + t eigenvalue)``, by Newton's method, kept inside."""
+    """Minimise ``slope t + curvature t^2/2 - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
     lowest = float(eigenvalues.min(initial=0.0))
     limit = np.inf if lowest >= 0 else -1 / lowest
     low, high, t = 0.0, limit, min(1.0, 0.9 * limit)

@@ -1,17 +1,19 @@
 r"""Local improvement of a mixed controller of fixed order: ``min ||T11||_2`` subject to ``||T22||_inf < gamma``.
 
-Sequential quadratic programming on the controller's matrices ``Theta = [[D^c, C^c], [B^c, A^c]]``, a static gain for the plant that carries the
-controller's states along (D22 = 0):
+Sequential quadratic programming on the controller's matrices ``Theta = [[D^c, C^c], [B^c, A^c]]``, a static gain for
+the plant that carries the controller's states along (D22 = 0):
 
-    A_cl = A_0 + B_u Theta C_y,   B_cl = B_0 + B_u Theta D_y,   C_cl = C_0 + D_u Theta C_y,   D_cl = D_0 + D_u Theta D_y,
+    A_cl = A_0 + B_u Theta C_y,   B_cl = B_0 + B_u Theta D_y,
+    C_cl = C_0 + D_u Theta C_y,   D_cl = D_0 + D_u Theta D_y,
 
-so that ``dT = (C_cl Phi B_u + D_u) dTheta (C_y Phi B_cl + D_y)``, ``Phi = (zI - A_cl)^-1``. With the Gramians P and Q of T11 the derivative of
-``||T11||_2^2 = tr(C_cl P C_cl' + D_cl D_cl')`` is
+so that ``dT = (C_cl Phi B_u + D_u) dTheta (C_y Phi B_cl + D_y)``, ``Phi = (zI - A_cl)^-1``. With the Gramians P and Q
+of T11 the derivative of ``||T11||_2^2 = tr(C_cl P C_cl' + D_cl D_cl')`` is
 
     2 [B_u' (Q A_cl P C_y' + Q B_cl D_y') + D_u' (C_cl P C_y' + D_cl D_y')].
 
-The constraint is set at frequencies, where ``sigma_max(T22)`` has the gradient ``Re(u* dT v)`` with its singular vectors. The norm between the
-frequencies is then computed by level sets; where it exceeds gamma the peaks join the frequencies and the level is lowered.
+The constraint is set at frequencies, where ``sigma_max(T22)`` has the gradient ``Re(u* dT v)`` with its singular
+vectors. The norm between the frequencies is then computed by level sets; where it exceeds gamma the peaks join the
+frequencies and the level is lowered.
 """
 
 from __future__ import annotations
@@ -89,7 +91,7 @@ class _Loop:
 
 
 def improved(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_limit_s: float) -> StateSpace:
-    """Return a controller of the same order that is at least as good, for one that stabilises with ``||T22||_inf < gamma``."""
+    """Return a controller of the same order that is at least as good, for one with ``||T22||_inf < gamma``."""
     K, end = controller, time.perf_counter() + time_limit_s
     theta = np.block([[K.D, K.C], [K.B, K.A]])
     loop = _Loop(plant, K.n_states, gamma, end, _units(plant, K))

@@ -1,19 +1,21 @@
-r"""The linear matrix inequalities of mixed H2/H-infinity synthesis in discrete time, with one Lyapunov matrix for both channels.
+r"""Matrix inequalities of discrete mixed H2/H-infinity synthesis, with one Lyapunov matrix for both channels.
 
-With the Lyapunov matrix ``G`` partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and ``G^-1 = [[Y, *], [V', *]]``, the change of
-variables
+With the Lyapunov matrix ``G`` partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and ``G^-1 = [[Y,
+*], [V', *]]``, the change of variables
 
     C_n = D^c C2 X + C^c U,   B_n = Y B2 D^c + V B^c,   D_n = D^c,   I = Y X + V U,
     A_n = Y (A + B2 D^c C2) X + V B^c C2 X + Y B2 C^c U + V A^c U - I
 
-makes ``G~ = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
-between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and the rows are combined accordingly (a congruence):
+makes ``G~ = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I,
+and then the inequality between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and
+the rows are combined accordingly (a congruence):
 
     H2:    [[-W-W', W, B~1], [., G~, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~, 0], [., ., I]] > 0,   min tr Z
     Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
 
-A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local improvement, ended at the
-same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are divided by its root.
+A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local
+improvement, ended at the same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are
+divided by its root.
 
 References
 ----------
@@ -42,7 +44,7 @@ from .barrier import Block
 Array = npt.NDArray[Any]
 Values = dict[str, Array]
 
-# Least eigenvalue of the scaled Lyapunov matrices: keeps I - Y X away from singular, without which the controller cannot be recovered.
+# Least eigenvalue of the scaled Lyapunov matrices: the controller is recovered from I - Y X, which it keeps regular.
 _MARGIN = 1e-3
 _KNOWN = (
     1e-3  # error, in a state's standard deviations, for which coordinates are chosen where a state is known exactly
@@ -71,10 +73,11 @@ class Balanced:
 
 
 def balance(plant: GeneralizedPlant) -> Balanced:
-    """Balance a regular plant (D22 = 0) for the mixed inequalities, in the coordinates (error, estimate) of its H2-optimal observer.
+    """Balance a regular plant (D22 = 0) in the coordinates (error, estimate) of its H2-optimal observer.
 
-    An accurate sensor makes the error ``e = x - x_hat`` of the optimal estimate many decades smaller than the state, so nothing here subtracts one
-    covariance from another: those of e, of x_hat and between them are E, W and F, and ``X = E + F + F' + W`` is that of x. T makes ``X = E^-1 = diag(s)``.
+    An accurate sensor makes the error ``e = x - x_hat`` of the optimal estimate many decades smaller than the state, so
+    nothing here subtracts one covariance from another: those of e, of x_hat and between them are E, W and F, and ``X =
+    E + F + F' + W`` is that of x. T makes ``X = E^-1 = diag(s)``.
     """
     n = plant.sizes[0]
     rows, K = plant.rows(1), h2(plant.channel(plant.rows(1), slice(None))).controller

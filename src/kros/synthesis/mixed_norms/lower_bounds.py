@@ -1,12 +1,12 @@
-r"""Lower bounds that no controller of a mixed problem beats, from the family of all stabilising controllers (Youla and Kucera).
+r"""Lower bounds of mixed problems, from the family of all stabilising controllers (Youla and Kucera).
 
     x_hat+ = A x_hat + B2 u + L nu,   u = F x_hat + L0 nu + v,   nu = y - C2 x_hat,   v = Q nu
 
     T(Q) = T1 + T2 Q T3:   T2 from v to z with A + B2 F,   T3 from w to nu with A - L C2
 
-Around the *H2 optimum* of channel 1, with v and nu divided by the roots of ``R_b`` and ``S_y``, T2 is an isometry, T3 a co-isometry and T1 orthogonal
-to what Q adds, so that ``||T11(Q)||^2 = f*^2 + ||Q||^2`` exactly. The first N samples of the impulse response of T22 form a block Toeplitz matrix
-whose norm is at most ``||T22||_inf``. So
+Around the *H2 optimum* of channel 1, with v and nu divided by the roots of ``R_b`` and ``S_y``, T2 is an isometry, T3 a
+co-isometry and T1 orthogonal to what Q adds, so that ``||T11(Q)||^2 = f*^2 + ||Q||^2`` exactly. The first N samples of
+the impulse response of T22 form a block Toeplitz matrix whose norm is at most ``||T22||_inf``. So
 
 .. math:: f_*^2 + \min \Big\{ \sum_{k<N} \|q_k\|^2 : \|\mathrm{Toep}_N(T_{22}(q))\| \le \gamma \Big\}
 

@@ -1,12 +1,13 @@
 r"""The paper's mixed problem (37)-(39) for observers: matrix inequalities on its reduced, regularised plant.
 
-In that problem ``T11`` does not depend on the uncertainty and ``T22`` not on K: its exact optimum is "no correction". What makes the published
-gain useful is the common Lyapunov matrix, which adds the response to w2 to the cost. Hence nothing here is improved afterwards or searched over
-scalings: that would only remove the correction.
+In that problem ``T11`` does not depend on the uncertainty and ``T22`` not on K: its exact optimum is "no correction".
+What makes the published gain useful is the common Lyapunov matrix, which adds the response to w2 to the cost. Hence
+nothing here is improved afterwards or searched over scalings: that would only remove the correction.
 
-But the scaling of channel 2 is not arbitrary either. The same set is written by ``(W_L, W_R)`` and by ``(W_L / c, c W_R)``, and with one Lyapunov
-matrix for both channels an impulse of w1 must not leave more energy in z2 than gamma squared. The published problem has ``W_R = W_u = 1``, so
-channel 2 is scaled until the response from the inputs to z2, which K does not influence, has a gain of one.
+But the scaling of channel 2 is not arbitrary either. The same set is written by ``(W_L, W_R)`` and by ``(W_L / c, c
+W_R)``, and with one Lyapunov matrix for both channels an impulse of w1 must not leave more energy in z2 than gamma
+squared. The published problem has ``W_R = W_u = 1``, so channel 2 is scaled until the response from the inputs to z2,
+which K does not influence, has a gain of one.
 """
 
 from __future__ import annotations
@@ -26,7 +27,10 @@ from .optimal import by_inequalities, infeasible
 
 
 def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:
-    """Solve the reduced observer problem on noise that the inequalities resolve; certify the filter on the set, in physical units."""
+    """Solve the reduced observer problem on noise that the inequalities resolve.
+
+    Certify the filter on the set, in physical units.
+    """
     size = problem.require_sound()
     start = time.perf_counter()
     nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
@@ -49,7 +53,8 @@ def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_l
         solver="barrier",
         notes=(
             *best.notes,
-            "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful number. "
+            "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful "
+            "number. "
             "The spectral radius is that of the nominal loop and says nothing about robustness.",
         ),
     )

@@ -1,4 +1,4 @@
-r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22||_inf < gamma``, every number recomputed.
+r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22||_inf < gamma``.
 
     H2 optimum without the constraint --(constraint met)--> optimal
         |
@@ -11,8 +11,8 @@ r"""Mixed H2/H-infinity synthesis (7)-(8): ``min ||T11||_2`` subject to ``||T22|
         v
     local improvement --> verification --> lower bound and gap
 
-The inequalities with one Lyapunov matrix for both channels bound ``||T11||_2`` from above, often by far. Scaling the second channel
-(``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound. The unscaled
+The inequalities with one Lyapunov matrix for both channels bound ``||T11||_2`` from above, often by far. Scaling the
+second channel (``w2 -> a w2``, ``z2 -> z2 / a``) leaves the problem as it is and changes that bound. The unscaled
 inequalities are always among the candidates, so that nothing is ever worse than they are.
 """
 
@@ -55,28 +55,31 @@ def mixed(
     Parameters
     ----------
     plant : GeneralizedPlant or ObserverProblem
-        A discrete plant with its channel partition (`n_w1`, `n_z1`), with penalty and noise in channel 1; or an observer problem, whose
-        reduced and regularised plant is then used, and whose result is a filter in physical units with a certified ``worst_case_h2``.
+        A discrete plant with its channel partition (`n_w1`, `n_z1`), with penalty and noise in channel 1; or an
+        observer problem, whose reduced and regularised plant is then used, and whose result is a filter in physical
+        units with a certified ``worst_case_h2``.
     gamma : float
         Level of the H-infinity constraint.
     max_states : int
-        Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with the sixth power of
-        the states, and states of no consequence make them ill-conditioned). The controller is verified on the full plant.
+        Stable plants are reduced to this number by balanced truncation for the inequalities only (their cost grows with
+        the sixth power of the states, and states of no consequence make them ill-conditioned). The controller is
+        verified on the full plant.
     time_limit_s : float, s
         For the whole search; what was found by then is returned.
 
     Returns
     -------
     Synthesis
-        ``h2_norm`` of T11 and ``hinf_norm`` of T22 recomputed on the full plant; ``lower_bound`` holds for every controller of any order.
+        ``h2_norm`` of T11 and ``hinf_norm`` of T22 recomputed on the full plant; ``lower_bound`` holds for every
+        controller of any order.
 
     Raises
     ------
     ConfigError
         When an option is out of range.
     SynthesisError
-        When the plant is not regular, when gamma is shown to be out of reach (with the least that is not), or when no controller survives
-        verification (each reason is given).
+        When the plant is not regular, when gamma is shown to be out of reach (with the least that is not), or when no
+        controller survives verification (each reason is given).
 
     Examples
     --------
@@ -90,7 +93,8 @@ def mixed(
     """
     if gamma <= 0 or time_limit_s <= 0 or max_states < 1:
         raise ConfigError(
-            f"Mixed synthesis: gamma = {gamma}, time_limit_s = {time_limit_s}, max_states = {max_states} should all be positive."
+            f"Mixed synthesis: gamma = {gamma}, time_limit_s = {time_limit_s}, max_states = {max_states} should all "
+            "be positive."
         )
     if isinstance(plant, ObserverProblem):
         from .observer import for_observer
@@ -120,7 +124,8 @@ def _unconstrained(plant: GeneralizedPlant) -> Synthesis:
         raise SynthesisError("Mixed synthesis works in discrete time, found a continuous plant (dt = 0); sample it.")
     if not plant.sizes[0]:
         raise SynthesisError(
-            "Mixed synthesis needs a plant with states, found none; without dynamics the best gain is a small convex problem."
+            "Mixed synthesis needs a plant with states, found none; without dynamics the best gain is a small convex "
+            "problem."
         )
     require(plant.performance, "Mixed synthesis")
     free = h2(plant.performance)
@@ -151,7 +156,8 @@ def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float) ->
 def infeasible(gamma: float, least: float) -> SynthesisError:
     """Return the error for a level that no controller attains."""
     return SynthesisError(
-        f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise gamma, or make the weights of "
+        f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise "
+        "gamma, or make the weights of "
         "channel 2 smaller."
     )
 
@@ -183,7 +189,10 @@ def verify(plant: GeneralizedPlant, controller: StateSpace, gamma: float, note: 
 def by_inequalities(
     plant: GeneralizedPlant, gamma: float, scalings: Sequence[float], max_states: int, end: float
 ) -> list[Synthesis]:
-    """Controllers of a plant (D22 = 0) from the matrix inequalities, one for each scaling that works; a `SynthesisError` where none does."""
+    """Controllers of a plant (D22 = 0) from the matrix inequalities, one for each scaling that works.
+
+    A `SynthesisError` where none does.
+    """
     small, note = _reduced(plant, max_states)
     found, reasons = [], []
     for a in scalings:
@@ -197,7 +206,8 @@ def by_inequalities(
             reasons.append(str(error))
     if not found:
         raise SynthesisError(
-            f"Mixed synthesis: no controller survived; {'; '.join(dict.fromkeys(reasons))}. Raise gamma = {gamma:g}, max_states, noise or the "
+            f"Mixed synthesis: no controller survived; {'; '.join(dict.fromkeys(reasons))}. Raise gamma = {gamma:g}, "
+            "max_states, noise or the "
             "time limit."
         )
     return found
@@ -241,7 +251,8 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
     if small.sizes[0] == plant.sizes[0]:
         return plant, ()
     note = (
-        f"Inequalities on {small.sizes[0]} of {plant.sizes[0]} states (discarded Hankel singular values sum to {tail:.2g} of the largest); "
+        f"Inequalities on {small.sizes[0]} of {plant.sizes[0]} states (discarded Hankel singular values sum to "
+        f"{tail:.2g} of the largest); "
         "verified on all."
     )
     return replace(small, C2=small.C2 * noise, D21=plant.D21), (note,)

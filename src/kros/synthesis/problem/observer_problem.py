@@ -5,15 +5,18 @@ With uncertainty of any of the six forms, ``E = W_L Delta W_R`` on scaled signal
 
 .. math:: e = T_e W_L\,\Delta (I - N \Delta)^{-1} M w_1 + S R\,W_u w_1 \; - \; S\,(zI - A)^{-1} J K\, n
 
-with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e`` is ``S`` or ``S G``, and
-M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside the loop of :math:`\Delta`, so no choice of K can
-lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The diagram is in `plants`.
+with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e``
+is ``S`` or ``S G``, and M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside
+the loop of :math:`\Delta`, so no choice of K can lose robustness, and none can gain it: the set is well posed when
+``||N|| < 1``. The diagram is in `plants`.
 
-Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements over their noise.
+Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements
+over their noise.
 
 Symbols
 -------
-A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r, n : disturbance of the input, of the state, noise
+A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r, n : disturbance of the input, of the
+    state, noise
 """
 
 from __future__ import annotations
@@ -56,8 +59,8 @@ class ObserverProblem:
     C : ndarray, shape (q, n)
         Selects the measured outputs from the lifted state.
     W_L : StateSpace
-        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of inputs. Diagonal, scalar
-        and full weights are all sound, since Delta has no structure.
+        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of
+        inputs. Diagonal, scalar and full weights are all sound, since Delta has no structure.
     W_R : StateSpace
         Right weight; stable. As many inputs as E has columns, any number of outputs.
     input_scale : ndarray, shape (m,)
@@ -81,7 +84,8 @@ class ObserverProblem:
     injection : Injection or its name
         Where the correction enters.
     process_noise : ndarray, shape (n,), optional
-        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default none.
+        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default
+        none.
     form : Form or str
         Form of the uncertainty; default inverse input multiplicative, as in the paper.
 
@@ -202,19 +206,22 @@ class ObserverProblem:
         Raises
         ------
         SynthesisError
-            For entrywise weights, and a nominal that is none of the models' units or not the model that the set surrounds.
+            For entrywise weights, and a nominal that is none of the models' units or not the model that the set
+            surrounds.
         DimensionError
             When the noise does not fit the measured channels.
         """
         if uncertain.weight.structure is Structure.ENTRYWISE:
             raise SynthesisError(
-                "Observer problem: the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full "
+                "Observer problem: the weights are entrywise, made for a diagonal perturbation, and synthesis is for "
+                "a full "
                 "one; quantify with diagonal weights."
             )
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
             raise SynthesisError(
-                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as nominal."
+                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as "
+                "nominal."
             )
         problem = cls(
             nominal=models.systems([unit])[0],
@@ -237,7 +244,8 @@ class ObserverProblem:
         )
         if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
             raise SynthesisError(
-                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; quantify these very models."
+                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; "
+                "quantify these very models."
             )
         return problem
 
@@ -298,7 +306,7 @@ class ObserverProblem:
         return slice(0, m) if self.location.at_input else slice(m, m + n)
 
     def require_sound(self) -> float:
-        """Check that the set is well posed and the observer possible; return ``||N||``, zero for the forms without a loop.
+        """Check that the set is well posed and the observer possible; return ``||N||``, zero without a loop.
 
         Raises
         ------
@@ -316,20 +324,24 @@ class ObserverProblem:
         modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
         if modes:
             raise SynthesisError(
-                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure another state."
+                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure "
+                "another state."
             )
         for name in ("nominal", *_WEIGHTS):
             system = getattr(self, name)
             if isinstance(system, StateSpace) and not system.is_stable():
                 raise SynthesisError(
-                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must be below 1, "
+                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must "
+                    "be below 1, "
                     "use a stable model (identification guarantees it) and stable weights."
                 )
         size = 0.0 if self.N is None else hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
-                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for {as_form(self.form).value.replace('_', ' ')} "
-                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave outliers out."
+                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for "
+                f"{as_form(self.form).value.replace('_', ' ')} "
+                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave "
+                "outliers out."
             )
         return size
 
@@ -339,7 +351,10 @@ class ObserverProblem:
         return self.process_noise / self.output_scale
 
     def error_plant(self) -> GeneralizedPlant:
-        """Unweighted error system, scaled: w = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise."""
+        """Unweighted error system, scaled.
+
+        W = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise.
+        """
         A, B, C, _ = self.scaled
         n, m, q, eye = len(A), B.shape[1], len(C), np.eye
         whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), self.nominal.dt)

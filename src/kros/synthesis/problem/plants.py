@@ -10,10 +10,12 @@ For every form, with the perturbed plant in it (`uncertainty_location`) and the 
     at the state:  xi+ = A xi + v - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
                                                                                         y  = C e + n,   u = K y
 
-*Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the observer, both are driven
-by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other one remains only
-where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone. The interconnection has every block
-once, so with minimal weights the whole is minimal but for poles that cancel between blocks.
+*Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the
+observer, both are driven
+by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other
+one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone.
+The interconnection has every block once, so with minimal weights the whole is minimal but for poles that cancel between
+blocks.
 
 Symbols
 -------
@@ -42,7 +44,11 @@ _LEAST_NOISE, _LEAST_PENALTY = (
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there are any."""
+    """Whole problem.
+
+    W = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there
+    are any.
+    """
     A, B, C, _ = problem.scaled
     location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
@@ -83,7 +89,10 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise through shaping filters at the input and at the state: w = (nu_d, nu_r, n, v), states (xi, W_p, d, r)."""
+    """White noise through shaping filters at the input and at the state.
+
+    W = (nu_d, nu_r, n, v), states (xi, W_p, d, r).
+    """
     q, n = len(problem.C), problem.nominal.n_states
     return shape_inputs(problem.error_plant(), block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)]))
 
@@ -91,8 +100,8 @@ def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> Gene
 def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
 
-    Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, nor a penalty as small: both have a floor here, and a result is
-    certified for the true noise.
+    Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, nor a penalty as small: both have a
+    floor here, and a result is certified for the true noise.
     """
     whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
     whole = penalise(whole, max(problem.correction_penalty, _LEAST_PENALTY))

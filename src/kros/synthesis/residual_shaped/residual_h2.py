@@ -1,14 +1,15 @@
 r"""The residual-shaped observer: the Kalman predictor for disturbances with the spectrum that was measured.
 
-The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not depend on the observer and
-can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ = A_f zeta + B_f w`` of the population's mean spectrum,
+The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not
+depend on the observer and can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ =
+A_f zeta + B_f w`` of the population's mean spectrum,
 
     [ e    ]+   [ A   C_f ] [ e    ]   [ D_f ]       [ I ]
     [ zeta ]  = [ 0   A_f ] [ zeta ] + [ B_f ] w  -  [ 0 ] y^c,      nu = C e + v,
 
-the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through the state of the
-order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the mean spectrum it minimises the mean square error over
-the units.
+the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through
+the state of the order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the
+mean spectrum it minimises the mean square error over the units.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ _NEGLIGIBLE = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class ResidualProblem:
-    """What a residual-shaped observer must be good at: error dynamics, the residuals of a population, measurement noise.
+    """Problem of a residual-shaped observer: error dynamics, residuals of a population, measurement noise.
 
     Parameters
     ----------
@@ -49,7 +50,8 @@ class ResidualProblem:
     C : ndarray, shape (q, n)
         Selects the measured states.
     spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`residual_spectra` in `kros.observer.residual.one_step`), physical units.
+        Cross spectral density of every unit's one-step residual (`residual_spectra` in
+        `kros.observer.residual.one_step`), physical units.
     noise : ndarray, shape (q,)
         Standard deviation of the measurement noise.
     scale : ndarray, shape (n,)
@@ -66,7 +68,8 @@ class ResidualProblem:
     >>> import numpy as np
     >>> from kros.synthesis import ResidualProblem
     >>> white = np.full((1, 65, 1, 1), 0.01 + 0j)  # of one unit, from 0 Hz to Nyquist
-    >>> ResidualProblem(np.array([[0.9]]), np.array([[1.0]]), white, np.array([0.1]), np.array([1.0]), 0.01).spectra.shape
+    >>> A, C, noise, scale = np.array([[0.9]]), np.array([[1.0]]), np.array([0.1]), np.array([1.0])
+    >>> ResidualProblem(A, C, white, noise, scale, 0.01).spectra.shape
     (1, 65, 1, 1)
     """
 
@@ -107,21 +110,23 @@ def residual_h2(
     ----------
     problem : ResidualProblem
     bases : sequence of Basis
-        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
-        with a pole near one is a disturbance state, for loads.
+        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured
+        is kept. A lag with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
-        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
-        state of the filter.
+        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not
+        measured; 0 keeps every state of the filter.
     n_lifted : int, optional
-        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the states.
+        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the
+        states.
     max_order : int, optional
         Most states of the correction, whatever the tolerance.
 
     Returns
     -------
     Synthesis
-        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed; ``lower_bound`` that of
-        every correction, proven, so that `gap_percent` is what the reduction of the order costs.
+        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed;
+        ``lower_bound`` that of every correction, proven, so that `gap_percent` is what the reduction of the order
+        costs.
 
     Raises
     ------
@@ -144,7 +149,8 @@ def residual_h2(
     K = shaped.correction(full)
     if not np.isfinite(shaped.norm(full, K)):
         raise SynthesisError(
-            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
+            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and "
+            "what is measured."
         )
     K = shaped.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
     norm = shaped.norm(full, K)
@@ -237,7 +243,10 @@ class _Scaled:
         return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
-        """Root mean square of every state's scaled error, shape (n,); infinite where the error dynamics are unstable."""
+        """Root mean square of every state's scaled error, shape (n,).
+
+        Infinite where the error dynamics are unstable.
+        """
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
@@ -263,7 +272,7 @@ class _Scaled:
         return float(np.log(self.unit_errors(self.correction(self.filter())).mean(axis=0)[self.hidden]).sum())
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
-        """The correction filter of lowest order within the tolerance, or of the highest one allowed, by bisection over balanced truncations."""
+        """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""
         if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)

@@ -2,7 +2,8 @@
 
 Symbols
 -------
-X : stabilising solution of A' X A - X - (A' X B + S)(R + B' X B)^-1 (B' X A + S') + Q = 0 (discrete), or the continuous analogue
+X : stabilising solution of A' X A - X - (A' X B + S)(R + B' X B)^-1 (B' X A + S') + Q = 0 (discrete), or the continuous
+    analogue
 F : state feedback, u = F x;  F0 : feedforward of the disturbance, u = F x + F0 w (discrete full information)
 """
 
@@ -36,13 +37,15 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
         X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
     except (LinAlgError, ValueError) as error:
         raise SynthesisError(
-            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed ({error}); "
+            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed "
+            f"({error}); "
             "check stabilisability, detectability and scaling."
         ) from error
     X = (X + X.T) / 2
     if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
         raise SynthesisError(
-            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
+            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs "
+            "and outputs to similar size."
         )
     return X
 
@@ -53,7 +56,7 @@ def discrete_gain(A: Array, B: Array, R: Array, S: Array, X: Array) -> Array:
 
 
 def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> float:
-    """Relative size of the residual in the closed-loop (Joseph) form, which does not cancel; infinite when the loop is unstable."""
+    """Relative residual in the closed-loop (Joseph) form, which does not cancel; infinite for an unstable loop."""
     F = discrete_gain(A, B, R, S, X)
     closed = A + B @ F
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
@@ -65,7 +68,10 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
-    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, only additions of semidefinite matrices."""
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004).
+
+    Quadratic convergence, only additions of semidefinite matrices.
+    """
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS

@@ -1,8 +1,8 @@
 r"""H2-optimal output feedback by two Riccati equations, discrete (proper controllers, all feedthroughs) and continuous.
 
 Discrete time. With the full-information optimum ``u = F x + F0 w`` the cost of any other control is
-:math:`\|T\|_2^2 = \mathrm{const} + \|R_b^{1/2}(u - F x - F_0 w)\|_2^2`; the best causal control is therefore the conditional expectation of
-``F x + F0 w`` given the measurements up to and including now:
+:math:`\|T\|_2^2 = \mathrm{const} + \|R_b^{1/2}(u - F x - F_0 w)\|_2^2`; the best causal control is therefore the
+conditional expectation of ``F x + F0 w`` given the measurements up to and including now:
 
     x_hat+ = A x_hat + B2 u + L nu,    u = F x_hat + L0 nu,    nu = y - C2 x_hat
 
@@ -58,8 +58,8 @@ def h2(plant: GeneralizedPlant) -> Synthesis:
     Raises
     ------
     SynthesisError
-        When an assumption fails (each is named, with the remedy), a Riccati equation has no solution, or the result does not survive
-        verification.
+        When an assumption fails (each is named, with the remedy), a Riccati equation has no solution, or the result
+        does not survive verification.
 
     Examples
     --------

@@ -1,11 +1,12 @@
-r"""H-infinity synthesis: one search over levels, each of which gives a controller, a proof that it is out of reach, or both.
+r"""H-infinity synthesis: one search over levels, each with a controller, a proof that it is out of reach, or both.
 
-    plant --> frame --> level --> two Hamiltonian matrices --+--> central controller (`hinf_level`) --> closed loop, norm recomputed --> upper end
-                          ^                                  +--> signals without influence of a controller (`hinf_bound`) ----------> lower end
-                          +------------------------------------------- next level <-------------------------------------------------------+
+    plant --> frame --> level --> two Hamiltonian matrices --> central controller --> closed loop --> upper end
+                          ^                 |
+                          |                 +--> signals without influence of a controller ---------> lower end
+                          +-------------------------------- next level <------------------------------+
 
-What is attained is always a norm that was computed from a closed loop, what is out of reach is proven by signals on which no controller has an
-influence. A level for which the equations give no controller proves nothing.
+What is attained is always a norm that was computed from a closed loop, what is out of reach is proven by signals on
+which no controller has an influence. A level for which the equations give no controller proves nothing.
 
 Symbols
 -------
@@ -44,7 +45,8 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     Parameters
     ----------
     plant : GeneralizedPlant
-        Discrete, or continuous (``dt = 0``); ``D12`` of full column rank, ``D21`` of full row rank, D11 and D22 arbitrary.
+        Discrete, or continuous (``dt = 0``); ``D12`` of full column rank, ``D21`` of full row rank, D11 and D22
+        arbitrary.
     gamma : float, optional
         Ask for this level instead of the optimum. A level well above the optimum gives a calmer controller.
     tolerance : float
@@ -53,16 +55,17 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     Returns
     -------
     Synthesis
-        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level that was proven to be out of reach of every
-        controller, by a proof that tolerates rounding, and ``gap_percent`` the distance. The status is OPTIMAL when they agree within the tolerance,
-        otherwise CERTIFIED: a better controller may exist.
+        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level that was proven to be out
+        of reach of every controller, by a proof that tolerates rounding, and ``gap_percent`` the distance. The status
+        is OPTIMAL when they agree within the tolerance, otherwise CERTIFIED: a better controller may exist.
 
     Raises
     ------
     ConfigError
         When an option is out of range.
     SynthesisError
-        When an assumption fails (each is named, with the remedy), when `gamma` is out of reach, or when no controller survives verification.
+        When an assumption fails (each is named, with the remedy), when `gamma` is out of reach, or when no controller
+        survives verification.
 
     Examples
     --------
@@ -121,12 +124,18 @@ def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
 
 
 def _negligible(idle: _Loop) -> float:
-    """Return the norm below which an optimum is zero but for rounding; zero where the plant is unstable without control."""
+    """Return the norm below which an optimum is zero but for rounding.
+
+    Zero where the plant is unstable without control.
+    """
     return _NEGLIGIBLE * idle.norm if np.isfinite(idle.norm) else 0.0
 
 
 def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple[_Loop, float]:
-    """Return the best loop and the largest level that is proven to be out of reach; it ends where a wanted norm is attained."""
+    """Return the best loop and the largest level that is proven to be out of reach.
+
+    It ends where a wanted norm is attained.
+    """
     best = min(idle, _closed(frame.given, _h2_controller(frame.given)), key=lambda loop: loop.norm)
     lower = low = pointwise_bound(frame.scaled)
     level = best.norm * (1 - tolerance / 2) if np.isfinite(best.norm) else 2 * max(lower, 1e-3)
@@ -139,7 +148,7 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple
             or lower >= wanted > 0
         ):
             break
-        # Where the bound is tight the first of these ends the search, with a calmer controller than that of the optimum.
+        # Where the bound is tight this level ends the search, with a calmer controller than that of the optimum.
         close = min(lower * (1 + 0.9 * tolerance), (lower + wanted) / 2 if wanted else np.inf)
         level = close if np.isfinite(best.norm) else 4 * level
         if low >= level:
@@ -157,7 +166,7 @@ def _attempt(frame: Frame, level: float) -> tuple[_Loop, float]:
 
 
 def proven_bound(plant: GeneralizedPlant, level: float) -> float:
-    """Return a number that the H-infinity norm of no stable closed loop is below, tight for a regular plant and a level just above the optimum."""
+    """Return a norm that no stable loop is below, tight for a regular plant and a level just above the optimum."""
     best = pointwise_bound(scale(plant))
     if h2_violations(plant, proper=False):
         return best
@@ -172,7 +181,8 @@ def _out_of_reach(gamma: float, best: _Loop, lower: float) -> SynthesisError:
             f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach; {reached}. Raise gamma."
         )
     return SynthesisError(
-        f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot be; {reached}. Raise gamma, or "
+        f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot "
+        f"be; {reached}. Raise gamma, or "
         "scale states, inputs and outputs to similar size."
     )
 
@@ -181,11 +191,13 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, e
     """Recompute the rest; the gap follows from the norm and the bound."""
     if best.K is None:
         raise SynthesisError(
-            "H-infinity synthesis: no level was attained; scale states, inputs and outputs to similar size, or raise noise and penalty."
+            "H-infinity synthesis: no level was attained; scale states, inputs and outputs to similar size, or raise "
+            "noise and penalty."
         )
     if lower > best.norm * (1 + _ROUNDING):
         raise SynthesisError(
-            f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {best.norm:.9g} that is attained; please "
+            f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {best.norm:.9g} that "
+            "is attained; please "
             "report the plant."
         )
     lower = min(lower, best.norm)

@@ -1,6 +1,7 @@
 r"""Lower bounds of the H-infinity problem from signals on which no controller has an influence.
 
-*At one frequency* (Parrott's theorem): the signals ``(s I - A) x = B w, C_y x + D_y w = 0`` reach z whatever the controller does, so that
+*At one frequency* (Parrott's theorem): the signals ``(s I - A) x = B w, C_y x + D_y w = 0`` reach z whatever the
+controller does, so that
 ``||T|| >= |C x + D w| / |w|``, and alike for the transposed plant.
 
 *In time*::
@@ -13,8 +14,9 @@ With ``z_p`` the outputs of the past and ``g`` the adjoint's response to zeta (b
 .. math:: \|T\|^2 \ge \gamma^2 \quad\text{where}\quad
     \gamma^2 \|w_p\|^2 - \|z_p\|^2 + \|\zeta\|^2 - \|g\|^2 / \gamma^2 \le 2\, p_0^T x_0
 
-The signals come from the Hamiltonian matrices of a level, but they prove the bound whatever they come from: constraints and energies are evaluated
-in the coordinates of the plant as it was given, and errors of a level enter squared. No decision rests on an eigenvalue being on the boundary.
+The signals come from the Hamiltonian matrices of a level, but they prove the bound whatever they come from: constraints
+and energies are evaluated in the coordinates of the plant as it was given, and errors of a level enter squared. No
+decision rests on an eigenvalue being on the boundary.
 
 Symbols
 -------
@@ -87,7 +89,7 @@ class Side:
         system[:, :n, n:], system[:, n:, :n], system[:, n:, n:] = -self.B, self.C_y, self.D_y
         size = np.linalg.norm(system, axis=2, keepdims=True)
         _, values, Vh = np.linalg.svd(system / np.where(size > 0, size, 1.0))
-        # Constraints that only rounding tells from others are none: where K has no effect on z the kernel is larger than sizes say.
+        # Constraints that only rounding tells from others are none: without an effect of K on z the kernel is larger.
         free = np.ones((len(rad), n + m), bool)
         free[:, : values.shape[1]] = values <= 10 * (n + m) * _EPS * values[:, :1]
         kernel = adjoint(Vh) * free[:, None, :]
@@ -100,12 +102,15 @@ class Side:
 
 
 def direct_bound(p: GeneralizedPlant) -> float:
-    """Return the smallest norm of ``D11 + D12 K D21`` over all gains K (Parrott): that of every closed loop at infinity."""
+    """Return the smallest norm of ``D11 + D12 K D21`` over all gains K (Parrott).
+
+    That of every closed loop at infinity.
+    """
     return max(side.at_infinity() for side in Side.both(p))
 
 
 def pointwise_bound(p: GeneralizedPlant, rad: Array | None = None) -> float:
-    """Return the largest Parrott bound over frequencies, by default around all poles, and around the best of them, less its rounding."""
+    """Return the largest Parrott bound over frequencies, by default around all poles, less its rounding."""
     best = direct_bound(p)
     if not len(p.A) or (rad is not None and not len(rad)):
         return best * (1 - _MARGIN)
@@ -154,7 +159,10 @@ def _candidates(eigenvalues: Array, discrete: bool) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """A family of signals of one side: energies W and Z, and bounds `of_w`, `of_z` of their rounding errors, all as quadratic forms of c(0)."""
+    """A family of signals of one side.
+
+    Energies W and Z, and bounds `of_w`, `of_z` of their rounding errors, all as quadratic forms of c(0).
+    """
 
     V: Array
     W: Array
@@ -164,7 +172,10 @@ class Signals:
 
 
 def _family(side: Side, half: Half, states: Array, inputs: Array) -> Signals:
-    """Return the signals of a Hamiltonian matrix in the plant's coordinates and time; none where it has none, or they prove nothing."""
+    """Return the signals of a Hamiltonian matrix in the plant's coordinates and time.
+
+    None where it has none, or they prove nothing.
+    """
     none = Signals(np.zeros((len(side.A), 0)), *(np.zeros((0, 0)) for _ in range(4)))
     if half.P is None or half.M is None or half.Z is None:
         return none
@@ -176,7 +187,7 @@ def _family(side: Side, half: Half, states: Array, inputs: Array) -> Signals:
 
 
 def evaluated(side: Side, V: Array, M: Array, G: Array) -> Signals | None:
-    """Make the signals satisfy the constraints, and return their energies; None where that fails beyond rounding, or they do not decay."""
+    """Make the signals satisfy the constraints and return their energies; None where that fails."""
     r, q = V.shape[1], len(side.C_y)
     zero = np.zeros((q, r))
     if side.dt > 0:
@@ -201,7 +212,10 @@ def evaluated(side: Side, V: Array, M: Array, G: Array) -> Signals | None:
 
 
 def _energies(V: Array, M: Array, G: Array, out: Array, dt: float) -> Signals | None:
-    """Gramians with the bound of their errors: a residual R changes a Gramian by at most ``||R||`` times that of the identity."""
+    """Gramians with the bound of their errors.
+
+    A residual R changes a Gramian by at most ``||R||`` times that of the identity.
+    """
     eye = np.eye(len(M))
     try:
         with warnings.catch_warnings():

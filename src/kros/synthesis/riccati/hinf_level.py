@@ -1,9 +1,10 @@
-r"""One level of the H-infinity problem: the two Hamiltonian matrices, and the central controller that follows from them.
+r"""One level of the H-infinity problem: its two Hamiltonian matrices and the central controller.
 
-The level is solved in continuous time, for balanced states and a normalised plant, ``D12 = [0; I]``, ``D21 = [0, I]``, ``D22 = 0``. Discrete plants
-go through ``z = (1 + s) / (1 - s)``, which maps the unit circle to the imaginary axis and keeps all gains, so that nothing is approximated. A
-controller with ``||T|| < gamma`` exists exactly when the direct gain leaves room (Parrott), both Riccati equations have stabilising solutions, these
-are positive semidefinite, and ``rho(X Y) < gamma^2``.
+The level is solved in continuous time, for balanced states and a normalised plant, ``D12 = [0; I]``, ``D21 = [0, I]``,
+``D22 = 0``. Discrete plants go through ``z = (1 + s) / (1 - s)``, which maps the unit circle to the imaginary axis and
+keeps all gains, so that nothing is approximated. A controller with ``||T|| < gamma`` exists exactly when the direct
+gain leaves room (Parrott), both Riccati equations have stabilising solutions, these are positive semidefinite, and
+``rho(X Y) < gamma^2``.
 
 Symbols
 -------
@@ -14,8 +15,9 @@ E = I - Y X / gamma^2 : coupling; its inverse is Z of the source, and is never f
 
 References
 ----------
-K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, theorem 17.1 (page 442); K. Glover and J. C. Doyle, "State-space formulae for all
-stabilizing controllers that satisfy an H-infinity-norm bound", Systems & Control Letters 11 (1988) 167-172.
+K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, theorem 17.1 (page 442); K. Glover and J. C. Doyle,
+"State-space formulae for all stabilizing controllers that satisfy an H-infinity-norm bound", Systems & Control Letters
+11 (1988) 167-172.
 """
 
 from __future__ import annotations
@@ -36,14 +38,17 @@ from .equations import absorb_feedthrough, solve_riccati
 
 Array = npt.NDArray[Any]
 
-_AXIS = 1e-14  # distance of an eigenvalue from the axis, relative to the matrix, below which its side is decided by rounding
+_AXIS = 1e-14  # distance of an eigenvalue from the axis, relative to the matrix, that rounding decides
 _NEGATIVE, _ASYMMETRY = 1e-7, 1e-5  # of a Riccati solution, relative: beyond them there is none that is semidefinite
 _POLE = 1e12  # condition beyond which a pole is at z = -1, the point that the map sends to infinity
 
 
 @dataclass(frozen=True, eq=False)
 class Half:
-    """One Hamiltonian matrix: its eigenvalues and, where n of them are stable, the signals ``(state, costate, z)(t) = (U, P, Z) exp(M t) c``."""
+    """One Hamiltonian matrix.
+
+    Its eigenvalues and, where n of them are stable, the signals ``(state, costate, z)(t) = (U, P, Z) exp(M t) c``.
+    """
 
     eigenvalues: Array
     U: Array | None = None
@@ -57,7 +62,7 @@ class Half:
         n = len(A)
         gain = np.linalg.solve(R, np.hstack([D.T @ C, B.T]))
         closed, quadratic, cost = A - B @ gain[:, :n], B @ gain[:, n:], C.T @ C - C.T @ D @ gain[:, :n]
-        # A change of the units of the costate levels the blocks: rounding is then relative to both, and slow modes are not lost beside fast ones.
+        # Units of the costate level the blocks: rounding is relative to both, slow modes are not lost beside fast ones.
         sizes = [float(np.linalg.norm(x)) for x in (closed, quadratic, cost)]
         unit = np.sqrt(sizes[2] / sizes[1]) if sizes[1] * sizes[2] > (1e-12 * sizes[0]) ** 2 else 1.0
         H = np.block([[closed, -unit * (quadratic + quadratic.T) / 2], [-(cost + cost.T) / (2 * unit), -closed.T]])
@@ -70,7 +75,10 @@ class Half:
         return cls(eigenvalues, U, P, T[:n, :n], C @ U - D @ (gain[:, :n] @ U + gain[:, n:] @ P))
 
     def solution(self) -> Array | None:
-        """Return the stabilising Riccati solution ``P U^-1``; None when there is none that is semidefinite, or in doubt."""
+        """Return the stabilising Riccati solution ``P U^-1``.
+
+        None when there is none that is semidefinite, or in doubt.
+        """
         if self.U is None or self.P is None:
             return None
         if not len(self.U):
@@ -111,7 +119,8 @@ class Frame:
         if given.dt > 0:
             if n and np.linalg.cond(p.A + np.eye(n)) > _POLE:
                 raise SynthesisError(
-                    "H-infinity synthesis: the plant has a pole at z = -1, which no bilinear map takes to continuous time; move it "
+                    "H-infinity synthesis: the plant has a pole at z = -1, which no bilinear map takes to continuous "
+                    "time; move it "
                     "into the stable region."
                 )
             p = split(to_continuous(p.open_loop()), n_w, n_z)
@@ -133,7 +142,10 @@ class Frame:
         return cls(given, scaled, T, back, p.D22, normal, left, right, inputs, outputs)
 
     def halves(self, gamma: float) -> tuple[Half, Half]:
-        """Return the Hamiltonian matrices of control and filter at a level; a `LinAlgError` where the level is a direct gain."""
+        """Return the Hamiltonian matrices of control and filter at a level.
+
+        A `LinAlgError` where the level is a direct gain.
+        """
         p = self.normal
         B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
         row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
@@ -154,7 +166,7 @@ class Frame:
             K = _central(self.normal, gamma, X, Y, np.eye(len(X)) - coupling)
             K = StateSpace(K.A, K.B @ self.right, self.left @ K.C, self.left @ K.D @ self.right, 0.0)
             K = _to_discrete(K, self.given.dt) if self.given.dt > 0 else K
-            # In discrete time, because a controller may well have a pole at z = -1, where the continuous loop would not be solvable.
+            # In discrete time: for a controller with a pole at z = -1 the continuous loop would have no solution.
             return absorb_feedthrough(absorb_feedthrough(K, self.D22), self.given.D22)
         except (LinAlgError, ValueError, SynthesisError):
             return None
@@ -189,7 +201,7 @@ def _to_discrete(K: StateSpace, dt: float) -> StateSpace:
 
 
 def scale(plant: GeneralizedPlant) -> GeneralizedPlant:
-    """Return the plant for D22 = 0 with states scaled by powers of two, so that A is balanced and B is as large as C."""
+    """Return the plant for D22 = 0 with states scaled by powers of two: A balanced, B as large as C."""
     p = replace(plant, D22=np.zeros_like(plant.D22))
     size = balanced_size(p.A)
     p = transformed(p, np.diag(1 / size), np.diag(size))
@@ -204,7 +216,7 @@ def transformed(p: GeneralizedPlant, T: Array, back: Array) -> GeneralizedPlant:
 
 
 def _balancing(p: GeneralizedPlant) -> tuple[Array, Array]:
-    """Change of the states, and its inverse, that balances the H2 Riccati solutions; the identity where these cannot be computed."""
+    """Change of the states that balances the H2 Riccati solutions, and its inverse."""
     method = "H-infinity synthesis, balancing"
     try:
         X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, p.D12.T @ p.D12, p.C1.T @ p.D12, p.dt, method)
@@ -216,7 +228,10 @@ def _balancing(p: GeneralizedPlant) -> tuple[Array, Array]:
 
 
 def _root(M: Array, A: Array, source: Array) -> Array:
-    """Square root factor ``M = L L'`` with directions of no weight raised to a small one; the identity where M is only rounding."""
+    """Square root factor ``M = L L'`` with directions of no weight raised to a small one.
+
+    The identity where M is only rounding.
+    """
     values, vectors = np.linalg.eigh(M)
     largest = float(values.max(initial=0.0))
     if largest * max(float(np.linalg.norm(A)), 1.0) <= 1e-9 * float(np.linalg.norm(source)) ** 2:

@@ -2,7 +2,8 @@
 
 Symbols
 -------
-Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n, q)
+Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n,
+    q)
 """
 
 from __future__ import annotations
@@ -42,14 +43,16 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     Returns
     -------
     Synthesis
-        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's covariance.
+        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's
+        covariance.
 
     Raises
     ------
     DimensionError
         When sizes do not fit.
     SynthesisError
-        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is named).
+        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is
+        named).
 
     Examples
     --------
@@ -62,16 +65,19 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     n, q = A.shape[0], C.shape[0]
     if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
         raise DimensionError(
-            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, {R.shape}."
+            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, "
+            f"{R.shape}."
         )
     if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
         raise SynthesisError(
-            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs some noise."
+            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs "
+            "some noise."
         )
     lowest = np.linalg.eigvalsh((Q + Q.T) / 2)
     if lowest.min() < -1e-12 * max(lowest.max(), 1e-300):
         raise SynthesisError(
-            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be positive semidefinite."
+            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be "
+            "positive semidefinite."
         )
     require_detectable(A, C, "Kalman predictor")
     start = time.perf_counter()
@@ -81,7 +87,8 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
     if radius >= 1:
         raise SynthesisError(
-            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes on the unit circle."
+            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes "
+            "on the unit circle."
         )
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
@@ -109,5 +116,6 @@ def require_detectable(A: Array, C: Array, method: str) -> None:
     modes = unreachable_modes(A.T, C.T, 1.0)
     if modes:
         raise SynthesisError(
-            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
+            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible "
+            "in y; measure another state."
         )

@@ -3,9 +3,9 @@ r"""Certified worst-case H2 norm of an observer, for any correction filter, howe
 .. math::
     \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta
 
-``b_Delta`` bounds ``||T X M||_F`` over the matrix ball (`ball`), ``b_r`` the additive remainder, a ball around zero; it adds by the triangle
-inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
-frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
+``b_Delta`` bounds ``||T X M||_F`` over the matrix ball (`ball`), ``b_r`` the additive remainder, a ball around zero; it
+adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is
+any frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
     loop = problem.error_system(controller)
     if not loop.is_stable():
         raise SynthesisError(
-            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
+            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no "
+            "bound is finite."
         )
     dt = problem.nominal.dt
     squared, error = circle_mean(
@@ -57,7 +58,10 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:
-    """Return a controller in physical units with its certificate; ``h2_norm`` is that of measurement and process noise alone."""
+    """Return a controller in physical units with its certificate.
+
+    ``h2_norm`` is that of measurement and process noise alone.
+    """
     value, error = certify(problem, controller, rtol)
     loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
     return Synthesis(

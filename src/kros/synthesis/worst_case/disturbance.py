@@ -1,7 +1,8 @@
 r"""The worst case as a disturbance: its spectrum, and rational filters that shape white noise like it.
 
-The disturbance is ``W_L w2`` and acts at the input or at the state. Where W_L is diagonal one filter a channel stands for W_L and the spectrum
-of w2 together, which takes fewer states; a full W_L stays as it is behind one filter for every component of w2.
+The disturbance is ``W_L w2`` and acts at the input or at the state. Where W_L is diagonal one filter a channel stands
+for W_L and the spectrum of w2 together, which takes fewer states; a full W_L stays as it is behind one filter for every
+component of w2.
 
 Symbols
 -------
@@ -32,9 +33,10 @@ _FLOOR, _NOTHING = (
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Power of the shaped channels on the design grid, phi and psi, and the perturbations on the grid that it is made by, shape (f, b, a).
+    """Power of the shaped channels on the design grid, and the perturbations, shape (f, b, a), that it is made by.
 
-    Without perturbations it is the average over the set: its diagonal, or where channels are correlated a diagonal below it.
+    Without perturbations it is the average over the set: its diagonal, or where channels are correlated a diagonal
+    below it.
     """
 
     phi: Array
@@ -43,7 +45,10 @@ class Spectrum:
     correlated: bool = False
 
     def power(self, ball: Ball, index: Array) -> Array:
-        """Power of w2 at other frequencies, shape (k, b): the same contractions, those of the given points of the design grid, in another ball."""
+        """Power of w2 at other frequencies, shape (k, b).
+
+        The same contractions, those of the given points of the design grid, in another ball.
+        """
         if self.theta is not None:
             return ball.spectrum(self.theta[index])
         return below(ball.average()) if self.correlated else _diagonal(ball.average())
@@ -51,7 +56,7 @@ class Spectrum:
 
 @dataclass(frozen=True, eq=False)
 class Shaping:
-    """Rational factors of a spectrum, one a channel, and the system that they drive (W_L, or None where it is contained)."""
+    """Rational factors of a spectrum, one a channel, and the system behind them (W_L, or None where contained)."""
 
     filters: StateSpace
     behind: StateSpace | None
@@ -70,7 +75,7 @@ class Shaping:
 
 
 def is_diagonal(system: StateSpace) -> bool:
-    """Tell whether the system is square and its off-diagonal transfer functions vanish (Markov parameters up to twice the order)."""
+    """Tell whether the system is square and its off-diagonal transfer functions vanish (Markov parameters)."""
     if system.n_outputs != system.n_inputs:
         return False
     off = ~np.eye(system.n_outputs, dtype=bool)
@@ -85,7 +90,7 @@ def is_diagonal(system: StateSpace) -> bool:
 
 
 def symmetric(problem: ObserverProblem) -> bool:
-    """Tell whether the set keeps every change of signs, so that the diagonal of any element's spectrum is an average over the set."""
+    """Tell whether the diagonal of any element's spectrum is an average over the set."""
     location = problem.location
     if problem.N is None:
         return True

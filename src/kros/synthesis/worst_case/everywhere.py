@@ -1,14 +1,16 @@
 r"""Filters whose power lies below that of the uncertain set at every frequency, between those of any grid too.
 
-Let a distribution of perturbations be given for the middle ``z_0`` of an arc: the average over the ball, elements that are worst for an observer,
-or a mixture. Every one of them stays in the set when frequency changes, and with ``nu = ||N(z_0)||``
+Let a distribution of perturbations be given for the middle ``z_0`` of an arc: the average over the ball, elements that
+are worst for an observer, or a mixture. Every one of them stays in the set when frequency changes, and with ``nu =
+||N(z_0)||``
 
-.. math:: \|X(z) - X(z_0)\|_F \le \delta = \frac{1}{1 - \nu}\Big(\epsilon_M + \epsilon_N \frac{\|M\|_F + \epsilon_M}{1 - \nu - \epsilon_N}\Big),
+.. math:: \|X(z) - X(z_0)\|_F \le \delta
+          = \frac{1}{1 - \nu}\Big(\epsilon_M + \epsilon_N \frac{\|M\|_F + \epsilon_M}{1 - \nu - \epsilon_N}\Big),
           \qquad X = \Delta (I - N \Delta)^{-1} M,
 
-where ``epsilon`` are the distances on the arc from `arcs`. Root mean squares over the distribution obey the triangle inequality, so the power of
-every channel is at least ``(sqrt(phi_i(z_0)) - delta)^2`` on the arc, for a distribution that may differ from arc to arc. Each filter
-is scaled by the least ratio of the two.
+where ``epsilon`` are the distances on the arc from `arcs`. Root mean squares over the distribution obey the triangle
+inequality, so the power of every channel is at least ``(sqrt(phi_i(z_0)) - delta)^2`` on the arc, for a distribution
+that may differ from arc to arc. Each filter is scaled by the least ratio of the two.
 
 Symbols
 -------
@@ -105,7 +107,10 @@ class Everywhere:
 
 
 def _share_left(root: Array, distance: Array) -> Array:
-    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance: ``1 - distance / min_i root_i``."""
+    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance.
+
+    ``1 - distance / min_i root_i``.
+    """
     least = root.min(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(least > distance, 1 - distance / least, 0.0)[:, None]

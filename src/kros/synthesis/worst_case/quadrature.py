@@ -2,8 +2,9 @@ r"""Mean of a spectral density over the unit circle, when it spans many decades 
 
 .. math:: \frac{1}{2\pi}\int_{-\pi}^{\pi} f(\theta)\,d\theta = \frac{1}{\pi}\int_0^{\pi} f(\theta)\,d\theta
 
-for an even density. The interval is cut into panels, logarithmic in frequency and refined around given frequencies (the poles), with a linear
-panel at DC. Each panel carries the Gauss-Legendre rules of 7 and 10 points; panels where these disagree most are halved.
+for an even density. The interval is cut into panels, logarithmic in frequency and refined around given frequencies (the
+poles), with a linear panel at DC. Each panel carries the Gauss-Legendre rules of 7 and 10 points; panels where these
+disagree most are halved.
 """
 
 from __future__ import annotations
@@ -26,9 +27,10 @@ _ALL = np.concatenate([_NODES, _ROUGH_NODES])
 def circle_mean(
     density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000
 ) -> tuple[float, float]:
-    """Return the mean over the unit circle of an even, non-negative density of angles in (0, pi), and a bound of its error as estimated.
+    """Return the mean over the unit circle of an even, non-negative density, and an estimate of its error.
 
-    `density` takes angles, shape (k,), and returns values, shape (k,); `centers` are logarithms of the poles, which place the first panels.
+    `density` takes angles, shape (k,), and returns values, shape (k,); `centers` are logarithms of the poles, which
+    place the first panels.
     """
     edges = _edges(centers)
     left, right = edges[:-1], edges[1:]
@@ -36,7 +38,8 @@ def circle_mean(
     while errors.sum() > rtol * values.sum():
         if len(values) > max_panels:
             raise SynthesisError(
-                f"Integrating the spectral density: relative error {errors.sum() / values.sum():.2g} after {len(values)} panels, asked for {rtol:.2g}; "
+                f"Integrating the spectral density: relative error {errors.sum() / values.sum():.2g} after "
+                f"{len(values)} panels, asked for {rtol:.2g}; "
                 "a weight or the loop has poles extremely close to the unit circle."
             )
         split = errors > min(0.5 * errors.max(), rtol * values.sum() / len(values))

@@ -1,22 +1,26 @@
 r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati equation.
 
-K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a given spectrum is a
-Kalman predictor (state injection) or an H2 controller (input injection). The observer is designed for the average spectrum of the set and certified
-on the set itself; where it guarantees less than no correction, nothing is corrected.
+K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a
+given spectrum is a Kalman predictor (state injection) or an H2 controller (input injection). The observer is designed
+for the average spectrum of the set and certified on the set itself; where it guarantees less than no correction,
+nothing is corrected.
 
-*State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r`` the shaped disturbance of the
-state, the error is ``e = xi + r``, ``xi+ = A xi + B d - y^c``, ``y = C e + n``. The correction has full authority over the state, so the optimum keeps
-the predicted error at zero:
+*State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
+the shaped disturbance of the state, the error is ``e = xi + r``, ``xi+ = A xi + B d - y^c``, ``y = C e + n``. The
+correction has full authority over the state, so the optimum keeps the predicted error at zero:
 
-    y^c = B C_d x_d^ + (C_r A_r - A C_r) x_r^ + (L_xi + C_r L_r) y,        x_d^+ = A_d x_d^ + L_d y,    x_r^+ = A_r x_r^ + L_r y
+    y^c = B C_d x_d^ + (C_r A_r - A C_r) x_r^ + (L_xi + C_r L_r) y,
+    x_d^+ = A_d x_d^ + L_d y,    x_r^+ = A_r x_r^ + L_r y
 
-with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters only. A performance
-weight with states of its own makes past errors matter, which a predictor cannot mend: then, as for input injection, the H2 controller of the
-whole plant is taken.
+with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters
+only. A performance weight with states of its own makes past errors matter, which a predictor cannot mend: then, as for
+input injection, the H2 controller of the whole plant is taken.
 
-*Lower bound.* The same model, driven by filters that lie below the spectrum of the average over the set, or of its worst element, at all frequencies
-(`everywhere`), gives an error that no observer beats: state injection contains input injection (``K_state = B K_input``), and an observer's
-``W_p x_hat`` is one of the causal estimates of ``W_p x`` over which a predictor is the best. It is proven by `riccati.filter_bound`.
+*Lower bound.* The same model, driven by filters that lie below the spectrum of the average over the set, or of its
+worst element, at all frequencies
+(`everywhere`), gives an error that no observer beats: state injection contains input injection (``K_state = B
+K_input``), and an observer's ``W_p x_hat`` is one of the causal estimates of ``W_p x`` over which a predictor is the
+best. It is proven by `riccati.filter_bound`.
 """
 
 from __future__ import annotations
@@ -56,21 +60,23 @@ def worst_case_h2(
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
     fit : callable, optional
-        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter; default
-        `kros.uncertainty.fit_magnitude`.
+        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
+        default `kros.uncertainty.fit_magnitude`.
     bounded : bool
-        False: only the design, neither certified nor bounded from below, for those who design many and compare them on recordings.
+        False: only the design, neither certified nor bounded from below, for those who design many and compare them on
+        recordings.
 
     Returns
     -------
     Synthesis
-        ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and their gap; ``h2_norm``
-        is the norm of the error under measurement and process noise alone (the nominal machine).
+        ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and
+        their gap; ``h2_norm`` is the norm of the error under measurement and process noise alone (the nominal machine).
 
     Raises
     ------
     SynthesisError
-        When the set is not well posed, the pair undetectable, a model unstable, or the design does not survive verification.
+        When the set is not well posed, the pair undetectable, a model unstable, or the design does not survive
+        verification.
 
     Examples
     --------
@@ -100,7 +106,7 @@ def worst_case_h2(
     best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
     bounds = lower_bounds(channels, best.controller, fit, max_order)
     lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, max(bounds, default=None))
-    note = "The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2."
+    note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
     return replace(best, lower_bound=lower, gap_percent=gap, solve_s=elapsed, notes=(note, *notes))
 
 
@@ -108,7 +114,8 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
     radius = problem.error_system(controller).largest_pole()
     if radius >= 1:
         raise SynthesisError(
-            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of the weights."
+            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of "
+            "the weights."
         )
     return Synthesis(
         method="worst_case_h2",
@@ -138,7 +145,10 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
 
 
 def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order: int) -> list[float]:
-    """Worst-case H2 norms that no observer of either injection beats: of the average over the set, and of its worst element for one observer."""
+    """Worst-case H2 norms that no observer of either injection beats.
+
+    Of the average over the set, and of its worst element for one observer.
+    """
     apart = Channels(channels.problem, channels.freqs_hz, apart=True)
     proofs, even = Everywhere(apart), symmetric(channels.problem)
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]

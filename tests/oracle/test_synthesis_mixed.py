@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
+from kros.synthesis.mixed_norms.candidates import by_inequalities, scaled, verify
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities, balance
-from kros.synthesis.mixed_norms.optimal import by_inequalities, scaled, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.reduction import truncate
 from kros.synthesis.worst_case.certificate import certify

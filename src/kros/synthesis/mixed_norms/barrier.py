@@ -153,7 +153,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         here, proven = programme.value(x), np.isfinite(stop_below) and lower > stop_below
         if proven or here - lower <= rtol * max(abs(here), 1e-12) or (here < stop_below - 1e-7 and decrement < 1):
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
-        step = _line_search(slope @ direction / mu, direction @ programme.Q @ direction / mu, eigenvalues)
+        step = _line_search(slope @ direction / mu, float(direction @ programme.Q @ direction) / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
         if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
             break

@@ -23,7 +23,7 @@ from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
 from ..result import Status, Synthesis
 from ..worst_case.certificate import certified
-from .optimal import by_inequalities, infeasible
+from .candidates import by_inequalities, infeasible
 
 
 def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:

@@ -19,32 +19,27 @@ inequalities are always among the candidates, so that nothing is ever worse than
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.linalg import LinAlgError
 
-from ...core.errors import ConfigError, KrosError, SynthesisError
-from ...core.lti import StateSpace
-from ...core.norms import h2_norm, hinf_norm
+from ...core.errors import ConfigError, SynthesisError
+from ...core.norms import hinf_norm
 from ..assumptions import require, require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
-from ..reduction import truncate
-from ..result import Status, Synthesis
+from ..result import Synthesis
 from ..riccati.equations import absorb_feedthrough
 from ..riccati.h2 import h2
 from ..riccati.hinf import proven_bound
-from .barrier import Ending, minimise
+from .candidates import by_inequalities, infeasible, verify
 from .improvement import improved
-from .inequalities import MixedInequalities, balance
+from .inequalities import balance
 from .lower_bounds import mixed_lower_bound
+from .observer import for_observer
 
 _SCALINGS = (1.0, 4.0, 16.0)
 _IMPROVED = 2  # candidates that are improved
-_ACCURACY = 1e-4  # of the inequalities' optimum, relative
 
 
 def mixed(
@@ -97,8 +92,6 @@ def mixed(
             "be positive."
         )
     if isinstance(plant, ObserverProblem):
-        from .observer import for_observer
-
         return for_observer(plant, gamma, max_states, time_limit_s)
     start = time.perf_counter()
     free = _unconstrained(plant)
@@ -151,111 +144,6 @@ def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float) ->
     least = proven_bound(two, max(attained, 2 * gamma)) if two.D11.size else 0.0
     if least >= gamma:
         raise infeasible(gamma, least)
-
-
-def infeasible(gamma: float, least: float) -> SynthesisError:
-    """Return the error for a level that no controller attains."""
-    return SynthesisError(
-        f"Mixed synthesis: gamma = {gamma:g} is infeasible, no controller has ||T22|| below {least:.6g}; raise "
-        "gamma, or make the weights of "
-        "channel 2 smaller."
-    )
-
-
-def verify(plant: GeneralizedPlant, controller: StateSpace, gamma: float, note: str) -> Synthesis:
-    """Recompute everything on the plant; a `SynthesisError` says why the controller is rejected."""
-    if not all(np.isfinite(getattr(controller, name)).all() for name in "ABCD"):
-        raise SynthesisError(f"{note}: the controller is not finite")
-    radius = plant.close(controller).largest_pole()
-    if radius >= 1:
-        raise SynthesisError(f"{note}: closed loop unstable, spectral radius {radius:.6g}")
-    norm, peak = h2_norm(plant.performance.close(controller)), hinf_norm(plant.uncertainty.close(controller))
-    if peak >= gamma or not np.isfinite(norm):
-        raise SynthesisError(
-            f"{note}: ||T22|| = {peak:.6g} should be below {gamma:g}, and ||T11||_2 = {norm:.6g} finite"
-        )
-    return Synthesis(
-        method="mixed",
-        controller=controller,
-        status=Status.CERTIFIED,
-        h2_norm=norm,
-        hinf_norm=peak,
-        spectral_radius=radius,
-        solver="barrier",
-        notes=(f"{note}.",),
-    )
-
-
-def by_inequalities(
-    plant: GeneralizedPlant, gamma: float, scalings: Sequence[float], max_states: int, end: float
-) -> list[Synthesis]:
-    """Controllers of a plant (D22 = 0) from the matrix inequalities, one for each scaling that works.
-
-    A `SynthesisError` where none does.
-    """
-    small, note = _reduced(plant, max_states)
-    found, reasons = [], []
-    for a in scalings:
-        left = end - time.perf_counter()
-        try:
-            if left <= 0:
-                raise SynthesisError("the time limit was reached")
-            candidate = _candidate(plant, scaled(small, a), gamma, f"Found by inequalities with scaling {a:g}", left)
-            found.append(replace(candidate, notes=(*note, *candidate.notes)))
-        except (KrosError, LinAlgError, ValueError) as error:
-            reasons.append(str(error))
-    if not found:
-        raise SynthesisError(
-            f"Mixed synthesis: no controller survived; {'; '.join(dict.fromkeys(reasons))}. Raise gamma = {gamma:g}, "
-            "max_states, noise or the "
-            "time limit."
-        )
-    return found
-
-
-def _candidate(
-    plant: GeneralizedPlant, small: GeneralizedPlant, gamma: float, note: str, time_limit_s: float
-) -> Synthesis:
-    """Solve the inequalities of the small plant and verify the controller on the whole one."""
-    inequalities = MixedInequalities(balance(small), gamma)
-    solved = minimise(
-        inequalities.objective(), inequalities.blocks(), inequalities.start(), rtol=_ACCURACY, time_limit_s=time_limit_s
-    )
-    if solved.x is None or not np.isfinite(solved.value):
-        raise SynthesisError(f"{note}: {solved.ending.value}")
-    value = inequalities.balanced.size * np.sqrt(max(solved.value, 0.0))
-    note = f"{note} ({solved.ending.value}), their value {value:.6g}"
-    status = Status.CERTIFIED if solved.ending is Ending.SOLVED else Status.INACCURATE
-    return replace(verify(plant, inequalities.controller(solved.x), gamma, note), status=status)
-
-
-def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
-    """Scale channel 2: ``w2 -> a w2``, ``z2 -> z2 / a``."""
-    left, right = np.ones((plant.sizes[3], 1)), np.ones(plant.sizes[1])
-    left[plant.rows(2)], right[plant.columns(2)] = 1 / a, a
-    matrices: dict[str, Any] = {
-        "B1": plant.B1 * right,
-        "D21": plant.D21 * right,
-        "C1": plant.C1 * left,
-        "D12": plant.D12 * left,
-    }
-    return replace(plant, **matrices, D11=plant.D11 * left * right)
-
-
-def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, tuple[str, ...]]:
-    """Plant for the inequalities, and what was done to it; measurements count in units of their noise."""
-    noise = np.linalg.norm(plant.D21[:, plant.columns(1)], axis=1)[:, None]
-    if plant.open_loop().largest_pole() >= 1:
-        return plant, ()
-    small, tail = truncate(replace(plant, C2=plant.C2 / noise, D21=plant.D21 / noise), max_states)
-    if small.sizes[0] == plant.sizes[0]:
-        return plant, ()
-    note = (
-        f"Inequalities on {small.sizes[0]} of {plant.sizes[0]} states (discarded Hankel singular values sum to "
-        f"{tail:.2g} of the largest); "
-        "verified on all."
-    )
-    return replace(small, C2=small.C2 * noise, D21=plant.D21), (note,)
 
 
 def _improved(plant: GeneralizedPlant, found: list[Synthesis], gamma: float, end: float) -> list[Synthesis]:

@@ -172,7 +172,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = to_continuous(system) if system.dt > 0 else system
     at, lower = _largest(system, first_frequencies(continuous.poles()))
-    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda found: found[1])
+    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
@@ -194,8 +194,8 @@ def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower:
     continuous = balanced(continuous)
     known = first_frequencies(continuous.poles())
     for _ in range(_MAX_ITERATIONS):
-        found, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
-        before, (at, lower) = lower, (found, best) if best > lower else (at, lower)
+        peak, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
+        before, (at, lower) = lower, (peak, best) if best > lower else (at, lower)
         if best <= before * (1 + error):
             return precise_gain(system, _in_hz(system, at))
     raise KrosError(

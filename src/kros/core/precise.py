@@ -28,10 +28,10 @@ def precise_h2_norm(system: StateSpace) -> float:
     before, digits = None, DIGITS
     while digits <= MOST_DIGITS:
         with mpmath.workdps(digits):
-            found = _h2_norm(mpmath, system)
-        if before is not None and (found == before or abs(found - before) <= 1e-9 * abs(found)):
-            return found
-        before, digits = found, 2 * digits
+            norm = _h2_norm(mpmath, system)
+        if before is not None and (norm == before or abs(norm - before) <= 1e-9 * abs(norm)):
+            return norm
+        before, digits = norm, 2 * digits
     raise KrosError(
         f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit."
     )

@@ -49,13 +49,13 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
-    found = []
+    beyond = []
     for mode in outside:
         pencil = np.hstack([A - mode * np.eye(len(A)), B])
         values = np.linalg.svd(pencil, compute_uv=False)
         if values[-1] <= 1e-9 * max(values[0], 1e-300):
-            found.append(complex(mode))
-    return found
+            beyond.append(complex(mode))
+    return beyond
 
 
 def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[Assumption, str]:
@@ -96,6 +96,16 @@ def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
     failed = [f"{a.value} ({found}): {_REMEDY[a]}" for a, found in h2_violations(plant, proper).items()]
     if failed:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")
+
+
+def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
+    """Raise a `SynthesisError` naming the first mode on or beyond the stability boundary that C does not see."""
+    modes = unreachable_modes(A.T, C.T, dt)
+    if modes:
+        raise SynthesisError(
+            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; "
+            "measure another state."
+        )
 
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:

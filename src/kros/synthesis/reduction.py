@@ -122,9 +122,9 @@ def _verified(problem: ObserverProblem | GeneralizedPlant, K: StateSpace, synthe
     )
 
 
-def _cost(found: Synthesis) -> float:
+def _cost(synthesis: Synthesis) -> float:
     """Certified worst-case H2 norm, or the H2 norm of channel 1."""
-    return float(found.worst_case_h2 or found.h2_norm or 0.0)
+    return float(synthesis.worst_case_h2 or synthesis.h2_norm or 0.0)
 
 
 def _balanced(problem: ObserverProblem | GeneralizedPlant, K: StateSpace) -> tuple[Array, Array]:

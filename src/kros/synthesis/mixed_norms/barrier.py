@@ -241,9 +241,9 @@ def _solve(hessian: Array, gradient: Array) -> Array:
     scaled = hessian * scale[:, None] * scale + 1e-14 * np.eye(len(hessian))
     right = gradient * scale
     # LU: where cores are shared, the threads of a Cholesky factorisation of this size wait for each other.
-    found = np.linalg.solve(scaled, right)
-    found += np.linalg.solve(scaled, right - scaled @ found)
-    return found * scale
+    direction = np.linalg.solve(scaled, right)
+    direction += np.linalg.solve(scaled, right - scaled @ direction)
+    return direction * scale
 
 
 def _line_search(slope: float, curvature: float, eigenvalues: Array) -> float:

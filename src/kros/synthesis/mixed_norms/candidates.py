@@ -63,23 +63,23 @@ def by_inequalities(
     A `SynthesisError` where none does.
     """
     small, note = _reduced(plant, max_states)
-    found, reasons = [], []
+    results, reasons = [], []
     for a in scalings:
         left = end - time.perf_counter()
         try:
             if left <= 0:
                 raise SynthesisError("the time limit was reached")
             candidate = _candidate(plant, scaled(small, a), gamma, f"Found by inequalities with scaling {a:g}", left)
-            found.append(replace(candidate, notes=(*note, *candidate.notes)))
+            results.append(replace(candidate, notes=(*note, *candidate.notes)))
         except (KrosError, LinAlgError, ValueError) as error:
             reasons.append(str(error))
-    if not found:
+    if not results:
         raise SynthesisError(
             f"Mixed synthesis: no controller survived; {'; '.join(dict.fromkeys(reasons))}. Raise gamma = {gamma:g}, "
             "max_states, noise or the "
             "time limit."
         )
-    return found
+    return results
 
 
 def _candidate(

@@ -136,7 +136,7 @@ class MixedInequalities:
 
     def values(self, x: Array) -> Values:
         """Matrices from scalar variables, shape (..., n); the leading axes stay."""
-        found, position = {}, 0
+        matrices, position = {}, 0
         for name, (rows, columns, symmetric) in self.shapes.items():
             part = x[..., position : position + _count(rows, columns, symmetric)]
             position += part.shape[-1]
@@ -147,8 +147,8 @@ class MixedInequalities:
                 matrix[..., upper[1], upper[0]] = part
             else:
                 matrix = part.reshape(*x.shape[:-1], rows, columns)
-            found[name] = matrix
-        return found
+            matrices[name] = matrix
+        return matrices
 
     def start(self) -> Array:
         """Variables of no correction, with the Lyapunov matrices that are expected."""
@@ -182,7 +182,7 @@ class MixedInequalities:
             [[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]]
         )
         Wt = W.swapaxes(-1, -2)
-        found = [G - _MARGIN * np.eye(2 * n)]
+        blocks = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
             B, C, D = self._channel(channel, v, scale)
             if channel == 2 and not (B.shape[-1] and C.shape[-2]):
@@ -190,14 +190,14 @@ class MixedInequalities:
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
             zero = np.zeros((2 * n, B.shape[-1]))
             if channel == 1:
-                found.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
-                found.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
+                blocks.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
+                blocks.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
             else:
                 level = self.gamma**2 * np.eye(C.shape[-2])
-                found.append(
+                blocks.append(
                     _blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
                 )
-        return found
+        return blocks
 
     def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:
         """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""

@@ -44,17 +44,19 @@ def for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_l
     peak = hinf_norm(plant.channel(plant.rows(2), plant.columns(1)).close(nothing))
     best = by_inequalities(plant, gamma, (peak or 1.0,), max_states, start + time_limit_s)[0]
     elapsed = time.perf_counter() - start
+    result = certified(problem, problem.to_physical(best.controller), "mixed")
+    notes = [
+        "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful number. "
+        "The spectral radius is that of the nominal loop and says nothing about robustness."
+    ]
+    if (result.worst_case_h2 or 0.0) >= (idle.worst_case_h2 or 0.0):
+        notes.append(f"No better than no correction, whose certified worst case is {idle.worst_case_h2:.6g}.")
     return replace(
-        certified(problem, problem.to_physical(best.controller), "mixed"),
+        result,
         status=best.status,
         h2_norm=best.h2_norm,
         hinf_norm=best.hinf_norm,
         solve_s=elapsed,
         solver="barrier",
-        notes=(
-            *best.notes,
-            "T11 contains the measurement noise only and T22 does not depend on K; worst_case_h2 is the meaningful "
-            "number. "
-            "The spectral radius is that of the nominal loop and says nothing about robustness.",
-        ),
+        notes=(*best.notes, *notes),
     )

@@ -100,9 +100,9 @@ def mixed(
         return _stated(free, free.lower_bound or 0.0, start, note)
     require_reachable(plant, gamma, free.hinf_norm or 0.0)
     bare, end = replace(plant, D22=np.zeros_like(plant.D22)), start + time_limit_s
-    found = by_inequalities(bare, gamma, _SCALINGS, max_states, end)
-    found += _improved(bare, found, gamma, end)
-    best = min(found, key=_cost)
+    candidates = by_inequalities(bare, gamma, _SCALINGS, max_states, end)
+    candidates += _improved(bare, candidates, gamma, end)
+    best = min(candidates, key=_cost)
     lower = free.lower_bound or 0.0
     if _cost(best) > 1.01 * lower and time.perf_counter() < end:
         lower = max(lower, mixed_lower_bound(bare, gamma, _cost(best), min(end - time.perf_counter(), 3.0)))
@@ -146,10 +146,10 @@ def require_reachable(plant: GeneralizedPlant, gamma: float, attained: float) ->
         raise infeasible(gamma, least)
 
 
-def _improved(plant: GeneralizedPlant, found: list[Synthesis], gamma: float, end: float) -> list[Synthesis]:
+def _improved(plant: GeneralizedPlant, candidates: list[Synthesis], gamma: float, end: float) -> list[Synthesis]:
     """Best candidates after local improvement in balanced coordinates."""
     balanced, better = balance(plant), []
-    for candidate in sorted(found, key=_cost)[:_IMPROVED]:
+    for candidate in sorted(candidates, key=_cost)[:_IMPROVED]:
         left = end - time.perf_counter()
         if left <= 0:
             break

@@ -34,7 +34,7 @@ from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
 from ...uncertainty.forms import Form, as_form
 from ...uncertainty.weights.cover import Structure
-from ..assumptions import unreachable_modes
+from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant, partitioned
 from ..result import Injection
 from .interconnect import interconnect
@@ -321,12 +321,7 @@ class ObserverProblem:
             raise SynthesisError(
                 "Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it."
             )
-        modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
-        if modes:
-            raise SynthesisError(
-                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure "
-                "another state."
-            )
+        require_detectable(self.nominal.A, self.C, self.nominal.dt, "Observer synthesis")
         for name in ("nominal", *_WEIGHTS):
             system = getattr(self, name)
             if isinstance(system, StateSpace) and not system.is_stable():

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
-from ..assumptions import unreachable_modes
+from ..assumptions import require_detectable
 from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
@@ -79,7 +79,7 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
             f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be "
             "positive semidefinite."
         )
-    require_detectable(A, C, "Kalman predictor")
+    require_detectable(A, C, dt, "Kalman predictor")
     start = time.perf_counter()
     L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
     elapsed = time.perf_counter() - start
@@ -109,13 +109,3 @@ def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> 
     """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
     P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
     return -discrete_gain(A.T, C.T, R, S, P).T, P
-
-
-def require_detectable(A: Array, C: Array, method: str) -> None:
-    """Raise a `SynthesisError` naming the first mode on or outside the unit circle that C does not see."""
-    modes = unreachable_modes(A.T, C.T, 1.0)
-    if modes:
-        raise SynthesisError(
-            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible "
-            "in y; measure another state."
-        )

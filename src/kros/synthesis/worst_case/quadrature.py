@@ -61,8 +61,8 @@ def _edges(centers: Array) -> Array:
     around = (angle[:, None] + width[:, None] * widths).ravel()
     around = around[(around > low) & (around < np.pi)]
     edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(3 * np.log10(np.pi / low))), around]))
-    kept = np.concatenate([[True], np.diff(np.log(edges)) > 1e-9])
-    return np.concatenate([[0.0], edges[kept]])
+    apart = np.concatenate([[True], np.diff(np.log(edges)) > 1e-9])
+    return np.concatenate([[0.0], edges[apart]])
 
 
 def _panels(density: Callable[[Array], Array], left: Array, right: Array) -> tuple[Array, Array]:

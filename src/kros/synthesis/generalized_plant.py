@@ -8,7 +8,7 @@ K : controller with matrices A^c, B^c, C^c, D^c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
+from .problem.interconnect import interconnect
 
 Array = npt.NDArray[Any]
 
@@ -94,13 +95,8 @@ class GeneralizedPlant:
         for name in _MATRICES:
             object.__setattr__(self, name, np.atleast_2d(real_array(f"Generalized plant: {name}", getattr(self, name))))
         object.__setattr__(self, "dt", sampling_period("Generalized plant", self.dt))
-        n, n_w, n_u, n_z, n_y = (
-            self.A.shape[-1],
-            self.B1.shape[-1],
-            self.B2.shape[-1],
-            self.C1.shape[0],
-            self.C2.shape[0],
-        )
+        n, (n_z, n_y) = self.A.shape[-1], (len(self.C1), len(self.C2))
+        n_w, n_u = self.B1.shape[-1], self.B2.shape[-1]
         expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
         expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
         for name, shape in expected.items():
@@ -162,6 +158,33 @@ class GeneralizedPlant:
         B1, D21 = self.B1[:, columns], self.D21[:, columns]
         return GeneralizedPlant(self.A, B1, self.B2, C1, self.C2, D11, D12, D21, self.D22, self.dt)
 
+    def transformed(
+        self,
+        *,
+        x: tuple[Array, Array] | None = None,
+        z: Array | None = None,
+        w: Array | None = None,
+        y: Array | None = None,
+        u: Array | None = None,
+    ) -> GeneralizedPlant:
+        """Return the plant in the states ``T x`` for ``x = (T, T^-1)``, outputs multiplied by z, y, inputs by w, u."""
+        n, n_w, n_u, n_z, n_y = self.sizes
+        T, back = x or (np.eye(n), np.eye(n))
+        z, w = np.eye(n_z) if z is None else z, np.eye(n_w) if w is None else w
+        y, u = np.eye(n_y) if y is None else y, np.eye(n_u) if u is None else u
+        return replace(
+            self,
+            A=T @ self.A @ back,
+            B1=T @ self.B1 @ w,
+            B2=T @ self.B2 @ u,
+            C1=z @ self.C1 @ back,
+            C2=y @ self.C2 @ back,
+            D11=z @ self.D11 @ w,
+            D12=z @ self.D12 @ u,
+            D21=y @ self.D21 @ w,
+            D22=y @ self.D22 @ u,
+        )
+
     @property
     def performance(self) -> GeneralizedPlant:
         """The plant of channel 1 alone, from w1 to z1."""
@@ -204,15 +227,11 @@ class GeneralizedPlant:
                 "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly "
                 "proper controller."
             )
-        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
-        solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
-        y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
-        u_x = K.D @ y_x + np.hstack([np.zeros((n_u, self.A.shape[0])), K.C])
-        u_w = K.D @ y_w
-        A = np.vstack([np.hstack([self.A, np.zeros((self.A.shape[0], K.n_states))]) + self.B2 @ u_x, K.B @ y_x])
-        A[self.A.shape[0] :, self.A.shape[0] :] += K.A
-        C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
-        return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
+        n_w, n_z = self.sizes[1], self.sizes[3]
+        from_w, from_u = np.split(np.eye(n_w + n_u), [n_w], axis=1)
+        to_z, to_y = np.split(np.eye(n_z + n_y), [n_z])
+        wires = {"plant": {"w": from_w, "K": from_u}, "K": {"plant": to_y}}
+        return interconnect({"plant": self.open_loop(), "K": K}, wires, {"w": n_w}, {"z": {"plant": to_z}})
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:

@@ -156,11 +156,4 @@ def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, 
     roots = gramian_root(plant.A, B, plant.dt), gramian_root(plant.A.T, C.T, plant.dt)
     left, right, values = balancing(*roots, _NEGLIGIBLE)
     k = min(n_states, len(values))
-    left, right = left[:k], right[:, :k]
-    matrices: dict[str, Any] = {
-        "B1": left @ plant.B1,
-        "B2": left @ plant.B2,
-        "C1": plant.C1 @ right,
-        "C2": plant.C2 @ right,
-    }
-    return replace(plant, A=left @ plant.A @ right, **matrices), float(values[k:].sum() / values[0])
+    return plant.transformed(x=(left[:k], right[:, :k])), float(values[k:].sum() / values[0])

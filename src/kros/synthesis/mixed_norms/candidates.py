@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -100,23 +99,17 @@ def _candidate(
 
 def scaled(plant: GeneralizedPlant, a: float) -> GeneralizedPlant:
     """Scale channel 2: ``w2 -> a w2``, ``z2 -> z2 / a``."""
-    left, right = np.ones((plant.sizes[3], 1)), np.ones(plant.sizes[1])
+    left, right = np.ones(plant.sizes[3]), np.ones(plant.sizes[1])
     left[plant.rows(2)], right[plant.columns(2)] = 1 / a, a
-    matrices: dict[str, Any] = {
-        "B1": plant.B1 * right,
-        "D21": plant.D21 * right,
-        "C1": plant.C1 * left,
-        "D12": plant.D12 * left,
-    }
-    return replace(plant, **matrices, D11=plant.D11 * left * right)
+    return plant.transformed(z=np.diag(left), w=np.diag(right))
 
 
 def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant, tuple[str, ...]]:
     """Plant for the inequalities, and what was done to it; measurements count in units of their noise."""
-    noise = np.linalg.norm(plant.D21[:, plant.columns(1)], axis=1)[:, None]
+    noise = np.linalg.norm(plant.D21[:, plant.columns(1)], axis=1)
     if plant.open_loop().largest_pole() >= 1:
         return plant, ()
-    small, tail = truncate(replace(plant, C2=plant.C2 / noise, D21=plant.D21 / noise), max_states)
+    small, tail = truncate(plant.transformed(y=np.diag(1 / noise)), max_states)
     if small.sizes[0] == plant.sizes[0]:
         return plant, ()
     note = (
@@ -124,4 +117,4 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
         f"{tail:.2g} of the largest); "
         "verified on all."
     )
-    return replace(small, C2=small.C2 * noise, D21=plant.D21), (note,)
+    return small.transformed(y=np.diag(noise)), (note,)

@@ -28,7 +28,7 @@ X, Y, A_n, B_n, C_n, D_n, Z : the variables
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -89,21 +89,11 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > 1e-28 * np.diag(X), 0.0, np.diag(X)))
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
     size = h2_norm(plant.channel(rows, slice(None)).close(K))
-    scale = np.ones((plant.sizes[3], 1))
+    scale = np.ones(plant.sizes[3])
     scale[rows] = 1 / max(size, 1e-300)
     measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
     controls = size / np.linalg.norm(plant.D12[rows], axis=0)
-    balanced = replace(
-        plant,
-        A=T @ plant.A @ back,
-        B1=T @ plant.B1,
-        B2=T @ plant.B2 * controls,
-        C1=(plant.C1 * scale) @ back,
-        C2=plant.C2 @ back / measurements[:, None],
-        D11=plant.D11 * scale,
-        D12=plant.D12 * scale * controls,
-        D21=plant.D21 / measurements[:, None],
-    )
+    balanced = plant.transformed(x=(T, back), z=np.diag(scale), y=np.diag(1 / measurements), u=np.diag(controls))
     return Balanced(balanced, size, s, controls, measurements)
 
 

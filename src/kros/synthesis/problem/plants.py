@@ -31,7 +31,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, partitioned
+from ..generalized_plant import GeneralizedPlant, partitioned, split
 from .interconnect import interconnect
 from .observer_problem import ObserverProblem
 
@@ -111,25 +111,14 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     columns = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
     rows = np.concatenate([whole.part("z", name) for name in ("z1", "penalty", "z2")])
     w1, z2 = len(columns) - whole.w_parts["w2"], len(rows) - whole.z_parts["z2"]
-    scaled = replace(whole, B1=whole.B1 * size, D11=whole.D11 * size, D21=whole.D21 * size)
-    return replace(scaled.channel(rows, columns), n_w1=w1, n_z1=z2)
+    return replace(whole.transformed(w=np.diag(size)).channel(rows, columns), n_w1=w1, n_z1=z2)
 
 
 def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
     """Put a filter in front of the disturbances: w = weight * nu."""
-    n, k = plant.A.shape[0], weight.n_states
-    return replace(
-        plant,
-        A=np.block([[plant.A, plant.B1 @ weight.C], [np.zeros((k, n)), weight.A]]),
-        B1=np.vstack([plant.B1 @ weight.D, weight.B]),
-        B2=np.vstack([plant.B2, np.zeros((k, plant.B2.shape[1]))]),
-        C1=np.hstack([plant.C1, plant.D11 @ weight.C]),
-        C2=np.hstack([plant.C2, plant.D21 @ weight.C]),
-        D11=plant.D11 @ weight.D,
-        D21=plant.D21 @ weight.D,
-        w_parts={},
-        n_w1=None,
-    )
+    _, _, n_u, n_z, _ = plant.sizes
+    shaped = plant.open_loop() @ block_diagonal([weight, gain(np.eye(n_u), plant.dt)])
+    return split(shaped, weight.n_inputs, n_z, n_z1=plant.n_z1, z_parts=plant.z_parts)
 
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:

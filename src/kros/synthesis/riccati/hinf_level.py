@@ -115,7 +115,7 @@ class Frame:
         n, n_w, n_u, n_z, n_y = given.sizes
         scaled = scale(given)
         T, back = _balancing(scaled)
-        p = transformed(scaled, T, back)
+        p = scaled.transformed(x=(T, back))
         if given.dt > 0:
             if n and np.linalg.cond(p.A + np.eye(n)) > _POLE:
                 raise SynthesisError(
@@ -129,12 +129,7 @@ class Frame:
         V, t, Wh = np.linalg.svd(p.D21)
         inputs, right = np.roll(Wh, -n_y, axis=0).T, V.T / t[:, None]
         normal = replace(
-            p,
-            B1=p.B1 @ inputs,
-            B2=p.B2 @ left,
-            C1=outputs @ p.C1,
-            C2=right @ p.C2,
-            D11=outputs @ p.D11 @ inputs,
+            p.transformed(z=outputs, w=inputs, y=right, u=left),
             D12=np.eye(n_z)[:, n_z - n_u :],
             D21=np.eye(n_w)[n_w - n_y :],
             D22=np.zeros((n_y, n_u)),
@@ -204,15 +199,10 @@ def scale(plant: GeneralizedPlant) -> GeneralizedPlant:
     """Return the plant for D22 = 0 with states scaled by powers of two: A balanced, B as large as C."""
     p = replace(plant, D22=np.zeros_like(plant.D22))
     size = balanced_size(p.A)
-    p = transformed(p, np.diag(1 / size), np.diag(size))
+    p = p.transformed(x=(np.diag(1 / size), np.diag(size)))
     inputs, outputs = np.linalg.norm(np.hstack([p.B1, p.B2])), np.linalg.norm(np.vstack([p.C1, p.C2]))
     unit = float(np.exp2(np.round(np.log2(outputs / inputs) / 2))) if inputs > 0 and outputs > 0 else 1.0
-    return transformed(p, unit * np.eye(len(p.A)), np.eye(len(p.A)) / unit)
-
-
-def transformed(p: GeneralizedPlant, T: Array, back: Array) -> GeneralizedPlant:
-    """Return the plant in the states ``T x``."""
-    return replace(p, A=T @ p.A @ back, B1=T @ p.B1, B2=T @ p.B2, C1=p.C1 @ back, C2=p.C2 @ back)
+    return p.transformed(x=(unit * np.eye(len(size)), np.eye(len(size)) / unit))
 
 
 def _balancing(p: GeneralizedPlant) -> tuple[Array, Array]:

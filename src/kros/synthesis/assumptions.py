@@ -103,8 +103,8 @@ def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
     modes = unreachable_modes(A.T, C.T, dt)
     if modes:
         raise SynthesisError(
-            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; "
-            "measure another state."
+            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible "
+            "in y; measure another state."
         )
 
 

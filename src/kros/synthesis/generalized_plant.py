@@ -16,7 +16,6 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
-from .problem.interconnect import interconnect
 
 Array = npt.NDArray[Any]
 
@@ -227,11 +226,15 @@ class GeneralizedPlant:
                 "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly "
                 "proper controller."
             )
-        n_w, n_z = self.sizes[1], self.sizes[3]
-        from_w, from_u = np.split(np.eye(n_w + n_u), [n_w], axis=1)
-        to_z, to_y = np.split(np.eye(n_z + n_y), [n_z])
-        wires = {"plant": {"w": from_w, "K": from_u}, "K": {"plant": to_y}}
-        return interconnect({"plant": self.open_loop(), "K": K}, wires, {"w": n_w}, {"z": {"plant": to_z}})
+        # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
+        solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
+        y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
+        u_x = K.D @ y_x + np.hstack([np.zeros((n_u, self.A.shape[0])), K.C])
+        u_w = K.D @ y_w
+        A = np.vstack([np.hstack([self.A, np.zeros((self.A.shape[0], K.n_states))]) + self.B2 @ u_x, K.B @ y_x])
+        A[self.A.shape[0] :, self.A.shape[0] :] += K.A
+        C = np.hstack([self.C1, np.zeros((self.C1.shape[0], K.n_states))]) + self.D12 @ u_x
+        return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
 
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:

@@ -152,7 +152,8 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple
         close = min(lower * (1 + 0.9 * tolerance), (lower + wanted) / 2 if wanted else np.inf)
         level = close if np.isfinite(best.norm) else 4 * level
         if low >= level:
-            level = float(np.sqrt(low * best.norm)) if best.norm > 2 * low else (low + best.norm) / 2
+            bottom = max(low, _NEGLIGIBLE * best.norm)
+            level = float(np.sqrt(bottom * best.norm)) if best.norm > 2 * bottom else (bottom + best.norm) / 2
     return best, lower
 
 

@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import LinAlgError, block_diag
+from scipy.linalg import LinAlgError, block_diag, null_space, schur
 
 from ...core.linalg import adjoint
 from ...core.norms import first_frequencies, gramian
@@ -48,6 +48,14 @@ Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
 _RANK = 1e-9  # of direct gains and of kernels, relative: signals smaller than this prove nothing
+_CUTS = (
+    1e-12,
+    1e-9,
+    1e-6,
+    1e-3,
+)  # directions of the state below this share of the largest are left out; the others prove a bound
+_REACHED = 1e-10  # new directions below this share are not reached
+_SINGULAR = 1e-12  # of constraints, relative: an input that states of the signals can replace
 _NEAR = 1e-2  # distance from the boundary, relative, of eigenvalues whose frequencies are tried
 _MARGIN = 1e-9  # constraints hold to rounding, not exactly
 
@@ -101,6 +109,26 @@ class Side:
         return np.asarray(bounds * (1 - 100 * (n + m) * _EPS * np.maximum(inverse.max(axis=1), 1.0)))
 
 
+def _reachable(side: Side) -> Array:
+    """Orthonormal basis of the states without the stable modes that no signal reaches, which would grow backwards."""
+    n, F, N = len(side.A), np.zeros((side.B.shape[1], len(side.A))), np.eye(side.B.shape[1])
+    if side.D_y.size:  # w = F x + N v keeps the constraint, for a full-rank D_y
+        U, s, Vh = np.linalg.svd(side.D_y)
+        r = int(np.sum(s > 1e-12 * s.max(initial=0.0)))
+        F, N = -Vh[:r].T @ ((U[:, :r].T @ side.C_y) / s[:r, None]), Vh[r:].T
+    A, new = side.A + side.B @ F, side.B @ N
+    basis, new = np.zeros((n, 0)), new / max(float(np.linalg.norm(new)), 1e-300)
+    while new.size and basis.shape[1] < n:
+        U, s, _ = np.linalg.svd(new - basis @ (basis.T @ new), full_matrices=False)
+        new = np.linalg.qr(U[:, s > _REACHED] - basis @ (basis.T @ U[:, s > _REACHED]))[0]
+        basis, new = np.hstack([basis, new]), A @ new / max(float(np.linalg.norm(A)), 1e-300)
+    left = null_space(basis.T) if basis.shape[1] else np.eye(n)
+    if not left.shape[1]:
+        return np.eye(n)
+    _, L, k = schur((left.T @ A @ left).T, output="real", sort="iuc" if side.dt > 0 else "lhp")
+    return np.asarray(null_space((left @ L[:, :k]).T) if k else np.eye(n))
+
+
 def direct_bound(p: GeneralizedPlant) -> float:
     """Return the smallest norm of ``D11 + D12 K D21`` over all gains K (Parrott).
 
@@ -139,12 +167,12 @@ def level_bound(frame: Frame, halves: tuple[Half, Half]) -> float:
     """Return the largest norm that the signals of a level's Hamiltonian matrices prove to be out of reach."""
     values = np.concatenate([half.eigenvalues for half in halves])
     best = pointwise_bound(frame.scaled, _candidates(values, frame.given.dt > 0))
+    if not len(frame.scaled.A):
+        return best
     future, past = Side.both(frame.scaled)
-    families = (
-        _family(future, halves[0], frame.T.T, frame.outputs.T),
-        _family(past, halves[1], frame.back, frame.inputs),
-    )
-    return max(best, coupled(*families) * (1 - _MARGIN)) if len(frame.scaled.A) else best
+    after = _families(future, halves[0], frame.T.T, frame.outputs.T)
+    before = _families(past, halves[1], frame.back, frame.inputs)
+    return max([best, *(coupled(a, b) * (1 - _MARGIN) for a in after for b in before)])
 
 
 def _candidates(eigenvalues: Array, discrete: bool) -> Array:
@@ -171,19 +199,23 @@ class Signals:
     of_z: Array
 
 
-def _family(side: Side, half: Half, states: Array, inputs: Array) -> Signals:
-    """Return the signals of a Hamiltonian matrix in the plant's coordinates and time.
-
-    None where it has none, or they prove nothing.
-    """
-    none = Signals(np.zeros((len(side.A), 0)), *(np.zeros((0, 0)) for _ in range(4)))
+def _families(side: Side, half: Half, states: Array, inputs: Array) -> list[Signals]:
+    """Return the signals of a Hamiltonian matrix in the plant's coordinates and time, for several cuts of the states, and none."""
+    families = [Signals(np.zeros((len(side.A), 0)), *(np.zeros((0, 0)) for _ in range(4)))]
     if half.P is None or half.M is None or half.Z is None:
-        return none
+        return families
     M, G = half.M, inputs @ half.Z
     if side.dt > 0:
         inverse = np.linalg.inv(np.eye(len(M)) - M)
         M, G = (np.eye(len(M)) + M) @ inverse, np.sqrt(2) * G @ inverse
-    return evaluated(side, states @ half.P, M, G) or none
+    basis = _reachable(side)
+    U, s, Wt = np.linalg.svd(basis @ (basis.T @ states @ half.P))
+    for r in {int(np.sum(s > cut * s[0])) for cut in _CUTS if s[0] > 0}:
+        # Signals that reach no state are none, so what is left of the state moves by itself.
+        back = Wt[:r].T / s[:r]
+        signals = evaluated(side, U[:, :r], s[:r, None] * Wt[:r] @ M @ back, G @ back)
+        families += [] if signals is None else [signals]
+    return families
 
 
 def evaluated(side: Side, V: Array, M: Array, G: Array) -> Signals | None:
@@ -198,7 +230,7 @@ def evaluated(side: Side, V: Array, M: Array, G: Array) -> Signals | None:
     rows = np.linalg.norm(np.block([[side.A, side.B], [side.C_y, side.D_y]]), axis=1)[:, None]
     size = np.where(rows > 0, rows, 1.0)
     for _ in range(2):
-        both = both + np.linalg.lstsq(J / size, (target - J @ both) / size, rcond=None)[0]
+        both = both + np.linalg.lstsq(J / size, (target - J @ both) / size, rcond=_SINGULAR)[0]
     if not np.isfinite(both).all():
         return None
     M, G = both[:r], both[r:]
@@ -208,7 +240,14 @@ def evaluated(side: Side, V: Array, M: Array, G: Array) -> Signals | None:
     if np.any(np.abs(target - J @ both) > 100 * _EPS * len(J) * (rows * columns + moved)):
         return None
     out = side.C @ V @ M + side.D @ G if side.dt > 0 else side.C @ V + side.D @ G
-    return _energies(V, M, G, out, side.dt)
+    first = _energies(V, M, G, out, side.dt)
+    if first is None:
+        return None
+    # Again in units in which the signals have energies of about one, so that errors are small beside all of them.
+    values, vectors = np.linalg.eigh(first.W)
+    root = np.sqrt(np.maximum(values, 1e-14 * values[-1]))
+    unit, back = vectors / root, (vectors * root).T
+    return _energies(V @ unit, back @ M @ unit, G @ unit, out @ unit, side.dt)
 
 
 def _energies(V: Array, M: Array, G: Array, out: Array, dt: float) -> Signals | None:
@@ -249,6 +288,8 @@ def coupled(future: Signals, past: Signals) -> float:
     W = block_diag(past.W + past.of_w, future.W + future.of_w)
     Z = block_diag(past.Z - past.of_z, future.Z - future.of_z)
     root = block_diag(_unit_energy(W[:r, :r]), _unit_energy(W[r:, r:]))
+    if not root.shape[1]:
+        return 0.0
     best = 0.0
     for _ in range(30):
         # The signals that are worst at the level that is proven prove a higher one (a Rayleigh quotient).

@@ -200,7 +200,7 @@ class Signals:
 
 
 def _families(side: Side, half: Half, states: Array, inputs: Array) -> list[Signals]:
-    """Return the signals of a Hamiltonian matrix in the plant's coordinates and time, for several cuts of the states, and none."""
+    """Return no signals, and those of a Hamiltonian matrix in the plant's coordinates, for several cuts of the states."""
     families = [Signals(np.zeros((len(side.A), 0)), *(np.zeros((0, 0)) for _ in range(4)))]
     if half.P is None or half.M is None or half.Z is None:
         return families

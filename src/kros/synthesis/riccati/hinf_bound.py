@@ -200,7 +200,7 @@ class Signals:
 
 
 def _families(side: Side, half: Half, states: Array, inputs: Array) -> list[Signals]:
-    """Return no signals, and those of a Hamiltonian matrix in the plant's coordinates, for several cuts of the states."""
+    """Return no signals, and those of a Hamiltonian matrix in the plant's coordinates, for several cuts."""
     families = [Signals(np.zeros((len(side.A), 0)), *(np.zeros((0, 0)) for _ in range(4)))]
     if half.P is None or half.M is None or half.Z is None:
         return families
@@ -211,10 +211,11 @@ def _families(side: Side, half: Half, states: Array, inputs: Array) -> list[Sign
     basis = _reachable(side)
     U, s, Wt = np.linalg.svd(basis @ (basis.T @ states @ half.P))
     for r in {int(np.sum(s > cut * s[0])) for cut in _CUTS if s[0] > 0}:
-        # Signals that reach no state are none, so what is left of the state moves by itself.
-        back = Wt[:r].T / s[:r]
-        signals = evaluated(side, U[:, :r], s[:r, None] * Wt[:r] @ M @ back, G @ back)
-        families += [] if signals is None else [signals]
+        # Signals that reach no state are none, so what is left of them moves by itself.
+        for unit in (s[:r], s[:1]):  # signals of states of one size, and as the matrix has them
+            back = Wt[:r].T / unit
+            signals = evaluated(side, U[:, :r] * (s[:r] / unit), (unit[:, None] * Wt[:r]) @ M @ back, G @ back)
+            families += [] if signals is None else [signals]
     return families
 
 

@@ -141,7 +141,10 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple
     level = best.norm * (1 - tolerance / 2) if np.isfinite(best.norm) else 2 * max(lower, 1e-3)
     for _ in range(_STEPS):
         trial, proven = _attempt(frame, level)
-        best, lower = min(best, trial, key=lambda loop: loop.norm), max(lower, proven)
+        lower = max(lower, proven)
+        # A norm below what is proven to be out of reach is that of a loop whose rounding is larger than the tolerance.
+        if lower <= trial.norm * (1 + _ROUNDING):
+            best = min(best, trial, key=lambda loop: loop.norm)
         low = max(low, lower, level if level < (1 - tolerance) * best.norm and level * (1 + 1e-6) < trial.norm else 0.0)
         if (
             best.norm <= max(wanted or lower * (1 + tolerance), low * (1 + tolerance / 4), _negligible(idle))

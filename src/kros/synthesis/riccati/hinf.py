@@ -34,7 +34,7 @@ from .hinf_level import Frame, scale
 _STEPS = 60
 _ROUNDING = 1e-5
 _NEGLIGIBLE = 1e-9  # share of the norm without control below which the optimum is zero
-_BOUNDARY = 1e-10  # distance from the stability boundary, relative, that rounding decides
+_BOUNDARY = 1e-9  # distance from the stability boundary, relative, that rounding decides
 
 
 def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: float = 1e-5) -> Synthesis:

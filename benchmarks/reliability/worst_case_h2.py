@@ -249,9 +249,7 @@ def run(count: int, seed: int) -> list[Tally]:
         problem = random_problem(rng)
         start = time.perf_counter()
         try:
-            found = worst_case_h2(
-                problem, max_order=ORDERS[k % len(ORDERS)], tolerance_db=3.0, refinements=0, causal=False
-            )
+            found = worst_case_h2(problem, max_order=ORDERS[k % len(ORDERS)], tolerance_db=3.0)
         except SynthesisError:
             upper.add("refused with a reason", time.perf_counter() - start)
             density.add("refused with a reason")

@@ -71,7 +71,7 @@ def test_claims_are_recomputed(method, injection):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_one_lower_bound_serves_every_method(method):
-    bound = worst_case_h2(problem(Injection.STATE), refinements=2).lower_bound
+    bound = worst_case_h2(problem(Injection.STATE)).lower_bound
     for injection in Injection.INPUT, Injection.STATE:
         assert METHODS[method](problem(injection)).worst_case_h2 >= bound
 

@@ -130,46 +130,6 @@ def test_lifted_rows_are_not_corrected():
     assert not found.controller.D[2:].any()
 
 
-def test_worst_unit_against_a_search_over_mixtures():
-    quick = np.array([[[0.2, 0.0], [0.0, 0.3]], [[0.0, 0.0], [0.0, 0.0]]])
-    units = [autoregression(), autoregression(quick, 3 * ROOT)]
-    spectra = np.array([spectrum(u) for u in units])
-
-    def hidden(K):
-        """Variance of the unmeasured state's error on both units."""
-        return np.array([achieved_hidden(K, u) for u in units])
-
-    def achieved_hidden(K, unit):
-        grid = np.linspace(0, 0.5 / DT, FREQS)
-        n = len(A)
-        loop = np.block([[A - K.D @ C, -K.C], [K.B @ C, K.A]])
-        z = np.exp(2j * np.pi * grid * DT)
-        drive = np.vstack([np.hstack([np.eye(n), -K.D * NOISE]), np.hstack([np.zeros((K.n_states, n)), K.B * NOISE])])
-        T = np.array([np.linalg.solve(zi * np.eye(len(loop)) - loop, drive)[1] for zi in z])
-        density = np.einsum("fa,fab,fb->f", T[:, :n], spectrum(unit), T[:, :n].conj()).real + np.abs(T[:, n]) ** 2
-        return np.trapezoid(density, grid) / grid[-1]
-
-    def observer(weights, **options):
-        return residual_h2(
-            ResidualProblem(A, C, np.tensordot(weights, spectra, 1)[None], NOISE, SCALE, DT),
-            [Basis(8)],
-            tolerance_percent=0,
-            **options,
-        ).controller
-
-    found = hidden(
-        residual_h2(
-            ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0, worst_unit=True
-        ).controller
-    )
-    mean = hidden(
-        residual_h2(ResidualProblem(A, C, spectra, NOISE, SCALE, DT), [Basis(8)], tolerance_percent=0).controller
-    )
-    best = min(hidden(observer([t, 1 - t])).max() for t in np.linspace(0, 1, 21))
-    assert found.max() <= mean.max()
-    assert found.max() <= 1.03 * best
-
-
 def test_shaping_filter_reproduces_covariances():
     truth = autoregression()
     found = shaping_filter(spectrum(truth), Basis(3), DT)

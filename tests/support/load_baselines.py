@@ -23,7 +23,7 @@ from kros.motor_drive.calibrate import LOAD
 from kros.motor_drive.signals import low_passed
 from kros.observer import Observer
 from kros.synthesis.result import Injection
-from kros.synthesis.riccati.constant_gain import kalman
+from kros.synthesis.riccati.kalman import kalman
 
 Array = npt.NDArray[np.float64]
 

@@ -1,7 +1,8 @@
 """Errors of kros.
 
-Every message says what was asked, what was found (unit, episode, channel, value) and what to do next.
-The command line maps `DataError`, `ConfigError` and `DimensionError` to exit code 2 while nothing has been computed, and everything else to 1.
+Every message says what was asked, what was found (unit, episode, channel, value) and what to do next. The command line
+maps `DataError`, `ConfigError` and `DimensionError` to exit code 2 while nothing has been computed, and everything else
+to 1.
 """
 
 
@@ -30,7 +31,8 @@ class DataError(KrosError, ValueError):
     ...     kros.from_arrays({"a": [np.ones((5, 2))]}, states=["x"], inputs=["u"], sample_period_s=0.01)
     ... except kros.core.DataError as error:
     ...     print(error)
-    from_arrays: measured should name the states that a running observer will be given, found [] for the states ['x']; name one of them at least.
+    from_arrays: measured should name the states that a running observer will be given, found [] for the states ['x'];
+    name one of them at least.
     """
 
 
@@ -44,7 +46,8 @@ class DimensionError(KrosError, ValueError):
     ...     StateSpace([[0.5]], [[1.0], [1.0]], [[1.0]], [[0.0]], 0.01)
     ... except DimensionError as error:
     ...     print(error)
-    State space: B should end in shape (1, 1), found {'A': (1, 1), 'B': (2, 1), 'C': (1, 1), 'D': (1, 1)}; transpose or pad the offending matrix.
+    State space: B should end in shape (1, 1), found {'A': (1, 1), 'B': (2, 1), 'C': (1, 1), 'D': (1, 1)}; transpose or
+    pad the offending matrix.
     """
 
 

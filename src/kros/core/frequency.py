@@ -22,7 +22,8 @@ def nyquist_hz(sample_period_s: float) -> float:
     """Return half the sampling frequency, Hz."""
     if not sample_period_s > 0:
         raise ConfigError(
-            f"Nyquist frequency: the sampling period should be positive, found {sample_period_s} s; only discrete systems have one."
+            f"Nyquist frequency: the sampling period should be positive, found {sample_period_s} s; only discrete "
+            "systems have one."
         )
     return 0.5 / sample_period_s
 
@@ -30,10 +31,11 @@ def nyquist_hz(sample_period_s: float) -> float:
 def log_grid(
     sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None
 ) -> Array:
-    """Return logarithmically spaced frequencies that end at Nyquist, the Nyquist frequency included, shape (n_freqs,), Hz."""
+    """Return logarithmically spaced frequencies up to the Nyquist frequency, shape (n_freqs,), Hz."""
     if n_freqs < 2 or not decades > 0:
         raise ConfigError(
-            f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over {decades}."
+            f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over "
+            f"{decades}."
         )
     top = nyquist_hz(sample_period_s)
     low = top * 10.0**-decades
@@ -54,15 +56,18 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
     top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
     if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
         raise ConfigError(
-            f"Frequency grid: needs a list of finite frequencies in Hz, found shape {freqs.shape} with {np.isnan(freqs).sum()} NaN."
+            f"Frequency grid: needs a list of finite frequencies in Hz, found shape {freqs.shape} with "
+            f"{np.isnan(freqs).sum()} NaN."
         )
     if np.any(np.diff(freqs) <= 0) or freqs[0] < 0 or (sample_period_s is None and freqs[-1] == 0):
         raise ConfigError(
-            f"Frequency grid: frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz; sort them and drop doubles."
+            f"Frequency grid: frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz; "
+            "sort them and drop doubles."
         )
     if freqs[-1] > top * (1 + 1e-12):
         raise ConfigError(
-            f"Frequency grid: {freqs[-1]} Hz is above the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s; end the grid there."
+            f"Frequency grid: {freqs[-1]} Hz is above the Nyquist frequency {top} Hz of the sampling period "
+            f"{sample_period_s} s; end the grid there."
         )
     return freqs
 

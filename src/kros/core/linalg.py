@@ -16,7 +16,7 @@ def adjoint(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
 
 
 def radius_text(value: float) -> str:
-    """Return a spectral radius, or the size of a pole, with as many digits as tell it from one, for example ``1 - 2.5e-08``."""
+    """Return a spectral radius as text, with enough digits to differ from one, for example ``1 - 2.5e-08``."""
     distance = 1 - value
     if distance == 0 or not 0 < abs(distance) < 1e-4:
         return f"{value:.6g}"
@@ -29,7 +29,7 @@ def qr_triangle(matrix: Array) -> Array:
 
 
 def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return the least squares X of ``regressors X = values``, of all the smallest one with every regressor in units of its own size."""
+    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its size."""
     largest = np.abs(regressors).max(axis=0, initial=0.0)
     largest[largest == 0] = 1.0
     size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
@@ -44,7 +44,21 @@ def balanced_size(A: Array) -> Array:
     return np.asarray(matrix_balance(A, permute=False, separate=True)[1][0]) if A.size else np.ones(len(A))
 
 
+def balancing(
+    R: npt.NDArray[Any], S: npt.NDArray[Any], negligible: float = 0.0
+) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
+    """Balance the Gramians ``R R'`` and ``S S'``: left, right, ``left @ right = I``, and the Hankel singular values.
+
+    The balanced state is ``left x``; Gramians are never formed, so states that matter little keep their digits. Values
+    below a share of the largest are left out.
+    """
+    U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
+    k = int(np.sum(values > negligible * values.max(initial=0.0)))
+    root = np.sqrt(values[:k])
+    return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
+
+
 def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first: units of measure change nothing."""
+    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first."""
     size = balanced_size(A)
     return np.asarray(np.linalg.lstsq(A * size / size[:, None], values / size[:, None], rcond=rcond)[0] * size[:, None])

@@ -44,7 +44,8 @@ def sampling_period(name: str, dt: Any) -> float:
         period = -1.0
     if not 0 <= period < np.inf:
         raise DimensionError(
-            f"{name}: the sampling period should be a number of seconds, not negative, 0 for continuous time; found {dt!r}."
+            f"{name}: the sampling period should be a number of seconds, not negative, 0 for continuous time; found "
+            f"{dt!r}."
         )
     return period
 
@@ -90,7 +91,8 @@ class StateSpace:
             if getattr(self, name).shape[-2:] != shape:
                 found = {key: getattr(self, key).shape for key in "ABCD"}
                 raise DimensionError(
-                    f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending matrix."
+                    f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending "
+                    "matrix."
                 )
 
     @classmethod
@@ -108,7 +110,8 @@ class StateSpace:
             return cls(system.A, system.B, system.C, system.D, 0.0 if system.dt is None else system.dt)
         except AttributeError as error:
             raise DimensionError(
-                f"State space: needs a system with A, B, C, D and dt, found {type(system).__name__} ({error}); convert it first."
+                f"State space: needs a system with A, B, C, D and dt, found {type(system).__name__} ({error}); "
+                "convert it first."
             ) from error
 
     @property
@@ -147,6 +150,11 @@ class StateSpace:
         """Return the largest pole magnitude, shape (...); zero without states."""
         return np.abs(self.poles()).max(axis=-1, initial=0.0)
 
+    def largest_pole(self) -> float:
+        """Return the spectral radius, or the largest real part of a pole in continuous time, of one system."""
+        poles = self.poles()
+        return float(np.abs(poles).max(initial=0.0) if self.dt > 0 else poles.real.max(initial=-np.inf))
+
     def is_stable(self) -> Array:
         """Tell whether every pole is inside the unit circle (or the left half-plane)."""
         poles = self.poles()
@@ -178,7 +186,8 @@ class StateSpace:
         """Series connection `self * other`: the input passes through `other` first."""
         if self.n_inputs != other.n_outputs or self.dt != other.dt:
             raise DimensionError(
-                f"Series connection: {self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at {other.dt} s; match sizes and sampling periods."
+                f"Series connection: {self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at "
+                f"{other.dt} s; match sizes and sampling periods."
             )
         zero = np.zeros((other.n_states, self.n_states))
         return StateSpace(
@@ -236,7 +245,8 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
 
     if not systems or len({s.dt for s in systems}) > 1:
         raise DimensionError(
-            f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample first."
+            f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample "
+            "first."
         )
 
     def stack(blocks: list[Array]) -> Array:

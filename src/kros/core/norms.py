@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError, KrosError
-from .linalg import balanced_size
+from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
 from .precise import precise_gain, precise_h2_norm
 
@@ -39,7 +39,8 @@ def as_state_space(system: Any) -> StateSpace:
     system = StateSpace.of(system)
     if system.batch_shape:
         raise DimensionError(
-            f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it, for example system[0]."
+            f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it, for example "
+            "system[0]."
         )
     if not all(np.isfinite(getattr(system, name)).all() for name in "ABCD"):
         raise KrosError(
@@ -49,7 +50,7 @@ def as_state_space(system: Any) -> StateSpace:
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Controllability Gramian of a stable pair, ``P = A P A^T + B B^T`` by doubling, in continuous time ``A P + P A^T + B B^T = 0``."""
+    """Gramian of a stable pair, ``P = A P A^T + B B^T`` by doubling; ``A P + P A^T + B B^T = 0`` for ``dt = 0``."""
     Q = B @ B.T
     if dt == 0:
         from scipy.linalg import solve_continuous_lyapunov
@@ -63,6 +64,25 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
             break
         power = power @ power
     return (P + P.T) / 2
+
+
+def gramian_root(A: Array, B: Array, dt: float) -> Array:
+    """Return R with ``R R'`` the controllability Gramian of a stable pair, shape (n, at most n) in discrete time.
+
+    Discrete time. ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor: ``R_2k`` is the triangle of ``[R_k,
+    A^k R_k]``. Poles near one cost a few more doublings and no accuracy.
+    """
+    if dt == 0:
+        values, vectors = np.linalg.eigh(gramian(A, B, dt))
+        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+    power, R = A, qr_triangle(B.T).T
+    for _ in range(_MAX_ITERATIONS):
+        step = power @ R
+        R = qr_triangle(np.hstack([R, step]).T).T
+        if np.abs(step).max(initial=0.0) <= 1e-9 * np.abs(R).max(initial=0.0):
+            break
+        power = power @ power
+    return R
 
 
 def h2_norm(system: Any) -> float:
@@ -118,17 +138,19 @@ def balanced(system: StateSpace) -> StateSpace:
 def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     r"""H-infinity norm (3)-(4): largest gain over all frequencies.
 
-    The level :math:`\gamma` is attained exactly where the Hamiltonian matrix of the bounded-real lemma has eigenvalues on the imaginary
-    axis. Starting from a lower bound (DC, Nyquist, the frequencies of all poles, a logarithmic grid), the gain is evaluated at and between
-    those eigenvalues until no frequency exceeds :math:`(1 + \mathrm{tol})` times the bound. A resonance too narrow for any grid is found.
-    Discrete systems go through the bilinear map, which keeps the norm.
+    The level :math:`\gamma` is attained exactly where the Hamiltonian matrix of the bounded-real lemma has eigenvalues
+    on the imaginary axis. Starting from a lower bound (DC, Nyquist, the frequencies of all poles, a logarithmic grid),
+    the gain is evaluated at and between those eigenvalues until no frequency exceeds :math:`(1 + \mathrm{tol})` times
+    the bound. A resonance too narrow for any grid is found. Discrete systems go through the bilinear map, which keeps
+    the norm.
 
     Parameters
     ----------
     system : StateSpace
         Or any object with `A, B, C, D, dt`.
     tol : float
-        Relative width of the bracket; the value returned is attained, and the norm is at most ``(1 + tol)`` times larger.
+        Relative width of the bracket; the value returned is attained, and the norm is at most ``(1 + tol)`` times
+        larger.
 
     Returns
     -------
@@ -149,8 +171,8 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = to_continuous(system) if system.dt > 0 else system
-    at, lower = _largest(system, _first_frequencies(continuous))
-    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda found: found[1])
+    at, lower = _largest(system, first_frequencies(continuous.poles()))
+    at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
@@ -162,26 +184,31 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
             return max(best, lower)
         lower = best
     raise KrosError(
-        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; ask for a larger tol than {tol}."
+        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; ask for a larger "
+        f"tol than {tol}."
     )
 
 
 def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower: float, error: float) -> float:
-    """Search the peak between the frequencies that level sets and poles name, in balanced coordinates, and return its gain in multiple precision."""
+    """Search the peak between the frequencies of level sets and poles; its gain is computed in multiple precision."""
     continuous = balanced(continuous)
-    known = _first_frequencies(continuous)
+    known = first_frequencies(continuous.poles())
     for _ in range(_MAX_ITERATIONS):
-        found, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
-        before, (at, lower) = lower, (found, best) if best > lower else (at, lower)
+        peak, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
+        before, (at, lower) = lower, (peak, best) if best > lower else (at, lower)
         if best <= before * (1 + error):
             return precise_gain(system, _in_hz(system, at))
     raise KrosError(
-        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and time."
+        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and "
+        "time."
     )
 
 
 def to_continuous(system: StateSpace) -> StateSpace:
-    """Map a discrete system to continuous time by ``z = (1 + s) / (1 - s)``; gains over all frequencies are the same."""
+    """Map a discrete system to continuous time by ``z = (1 + s) / (1 - s)``.
+
+    Gains over all frequencies are the same.
+    """
     eye = np.eye(system.n_states)
     solved = np.linalg.solve(system.A + eye, np.hstack([system.A - eye, system.B]))
     n = system.n_states
@@ -199,7 +226,10 @@ def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
 
 
 def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain; around the largest one of those given it is searched for."""
+    """Return the mapped frequency of the largest gain and that gain.
+
+    Around the largest one of those given it is searched for.
+    """
     nu = np.unique(nu)
     gains = _gains(system, nu)
     best = int(np.argmax(gains))
@@ -225,7 +255,10 @@ def _gains(system: StateSpace, nu: Array) -> Array:
 
 
 def _rounding(system: StateSpace, nu: float) -> float:
-    """Bound of what rounding changes in the gain at one frequency, to first order: ``eps || |C R| (|z| I + |A|) |R B| ||``, R the resolvent."""
+    """Bound of what rounding changes in the gain at one frequency, to first order.
+
+    ``eps || |C R| (|z| I + |A|) |R B| ||``, R the resolvent.
+    """
     if np.isinf(nu) and system.dt == 0:
         return 0.0
     z = np.exp(2j * np.pi * _in_hz(system, nu) * system.dt) if system.dt > 0 else 1j * nu
@@ -238,13 +271,16 @@ def _rounding(system: StateSpace, nu: float) -> float:
     return float(_EPSILON * np.linalg.norm(inside, 2))
 
 
-def _first_frequencies(system: StateSpace) -> Array:
-    """Frequencies for the first lower bound: DC, all poles, a logarithmic grid around them."""
-    poles = system.poles()
+def first_frequencies(poles: Array) -> Array:
+    """Frequencies for the first lower bound, rad/s.
+
+    DC, all poles of a continuous system, a logarithmic grid around them.
+    """
     sizes = np.abs(poles)
+    low, high = max(sizes.min(), 1e-300), max(sizes.max(), 1e-300)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))
-    grid = np.geomspace(max(sizes.min(), 1e-300) / 10, sizes.max() * 10, 100)
+    grid = np.geomspace(low / 10, 10 * high, 100)
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 

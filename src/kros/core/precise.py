@@ -13,28 +13,32 @@ DIGITS, MOST_DIGITS, MOST_STATES = 40, 160, 60
 
 
 def precise_h2_norm(system: StateSpace) -> float:
-    """H2 norm by eigenvectors of A; infinity where a pole is not stable. Digits are doubled until two results agree to 1e-9."""
+    """H2 norm by eigenvectors of A.
+
+    Infinity where a pole is not stable. Digits are doubled until two results agree to 1e-9.
+    """
     import mpmath
 
     if system.n_states > MOST_STATES:
         raise KrosError(
-            f"H2 norm: double precision cannot tell it, and more than {MOST_STATES} states, {system.n_states}, take too long in multiple precision; "
+            f"H2 norm: double precision cannot tell it, and more than {MOST_STATES} states, {system.n_states}, take "
+            "too long in multiple precision; "
             "reduce the system, or scale its states alike."
         )
     before, digits = None, DIGITS
     while digits <= MOST_DIGITS:
         with mpmath.workdps(digits):
-            found = _h2_norm(mpmath, system)
-        if before is not None and (found == before or abs(found - before) <= 1e-9 * abs(found)):
-            return found
-        before, digits = found, 2 * digits
+            norm = _h2_norm(mpmath, system)
+        if before is not None and (norm == before or abs(norm - before) <= 1e-9 * abs(norm)):
+            return norm
+        before, digits = norm, 2 * digits
     raise KrosError(
         f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit."
     )
 
 
 def _h2_norm(mp: Any, system: StateSpace) -> float:
-    """``tr(C P C^T + D D^T)`` with ``P = V X V^H`` and ``X_ij = M_ij / (1 - l_i conj(l_j))``, or ``-M_ij / (l_i + conj(l_j))``."""
+    """``tr(C P C^T + D D^T)``, ``P = V X V^H``, ``X_ij = M_ij / (1 - l_i l_j*)`` or ``-M_ij / (l_i + l_j*)``."""
     n, discrete = system.n_states, system.dt > 0
     A, B, C = (mp.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C))
     poles, V = mp.eig(A)

@@ -1,7 +1,7 @@
 """Products and largest singular values of many small matrices, on long vectors.
 
-NumPy multiplies stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every entry is a long vector
-over units and frequencies: a product of small matrices is a few dozen vector operations.
+NumPy multiplies stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every
+entry is a long vector over units and frequencies: a product of small matrices is a few dozen vector operations.
 """
 
 from __future__ import annotations

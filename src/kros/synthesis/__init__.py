@@ -2,7 +2,8 @@
 
     UncertainModel --> ObserverProblem --> h2 | hinf | mixed | worst_case_h2 | kalman --> Synthesis
 
-Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError` that says why.
+Nothing leaves this layer unverified: norms and stability are recomputed by `kros.core`, failure is a `SynthesisError`
+that says why.
 
 Examples
 --------
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.optimal import mixed
     from .problem.observer_problem import ObserverProblem
-    from .reduction.truncation import reduce_controller
+    from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
-    from .riccati.constant_gain import kalman
-    from .riccati.h2_optimal import h2
-    from .riccati.hinf_optimal import hinf
+    from .riccati.h2 import h2
+    from .riccati.hinf import hinf
+    from .riccati.kalman import kalman
     from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
 
@@ -39,11 +40,11 @@ _HOME = {
     "Synthesis": "result",
     "UnitCheck": "worst_case.unit_check",
     "check_units": "worst_case.unit_check",
-    "h2": "riccati.h2_optimal",
-    "hinf": "riccati.hinf_optimal",
-    "kalman": "riccati.constant_gain",
+    "h2": "riccati.h2",
+    "hinf": "riccati.hinf",
+    "kalman": "riccati.kalman",
     "mixed": "mixed_norms.optimal",
-    "reduce_controller": "reduction.truncation",
+    "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",
 }

@@ -1,11 +1,11 @@
 """The assumptions of H2 and H-infinity synthesis, each with its label and what to do when it fails.
 
-The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 14.5 (continuous time) and 21.7 (discrete time).
+The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 14.5 (continuous time) and 21.7
+(discrete time).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
@@ -22,23 +22,7 @@ _RANK = 1e-10
 
 
 class Assumption(str, Enum):
-    """What the Riccati solution needs.
-
-    STABILISABLE
-        A1a: (A, B2) stabilisable; otherwise an unstable weight or mode is beyond the controller's reach. Make weights stable.
-    DETECTABLE
-        A1b: (C2, A) detectable; otherwise an unstable mode is invisible in y. Measure more, or make weights stable.
-    CONTROL_PENALTY
-        A2a: D12 has full column rank; every control must cost something. Add a small correction penalty to z.
-    MEASUREMENT_NOISE
-        A2b: D21 has full row rank; every measurement must carry noise. Add measurement noise to w.
-    NO_ZERO_CONTROL
-        A3: (A, B2, C1, D12) has no invariant zero on the unit circle (imaginary axis). Make weights stable and penalise more outputs.
-    NO_ZERO_MEASUREMENT
-        A4: (A, B1, C2, D21) has no invariant zero on the unit circle (imaginary axis). Make weights stable and add process noise.
-    PROPER
-        D11 = 0 in continuous time; otherwise the H2 norm is infinite. Use a strictly proper weight on w or on z.
-    """
+    """What the Riccati solution needs."""
 
     STABILISABLE = "A1a: (A, B2) stabilisable"
     DETECTABLE = "A1b: (C2, A) detectable"
@@ -60,77 +44,72 @@ _REMEDY = {
 }
 
 
-@dataclass(frozen=True)
-class Violation:
-    """An assumption that fails, and what was found."""
-
-    assumption: Assumption
-    found: str
-
-    def __str__(self) -> str:
-        return f"{self.assumption.value} ({self.found}): {_REMEDY[self.assumption]}"
-
-
 def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
-    """Return the eigenvalues of A on or beyond the stability boundary that B does not reach (Hautus test, in balanced units of the states)."""
+    """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
-    found = []
+    beyond = []
     for mode in outside:
         pencil = np.hstack([A - mode * np.eye(len(A)), B])
         values = np.linalg.svd(pencil, compute_uv=False)
         if values[-1] <= 1e-9 * max(values[0], 1e-300):
-            found.append(complex(mode))
-    return found
+            beyond.append(complex(mode))
+    return beyond
 
 
-def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> list[Violation]:
-    """Check every assumption of H2 synthesis and return those that fail."""
-    found = [
-        Violation(Assumption.STABILISABLE, f"mode {mode:.6g}")
-        for mode in unreachable_modes(plant.A, plant.B2, plant.dt)[:1]
-    ]
-    found += [
-        Violation(Assumption.DETECTABLE, f"mode {mode:.6g}")
-        for mode in unreachable_modes(plant.A.T, plant.C2.T, plant.dt)[:1]
-    ]
-    n, _, n_u, _, n_y = plant.sizes
-    rank12, rank21 = _rank(plant.D12), _rank(plant.D21)
-    if rank12 < n_u:
-        found.append(Violation(Assumption.CONTROL_PENALTY, f"rank {rank12}, {n_u} controls"))
-    if rank21 < n_y:
-        found.append(Violation(Assumption.MEASUREMENT_NOISE, f"rank {rank21}, {n_y} measurements"))
-    if proper and plant.dt == 0 and np.any(plant.D11):
-        found.append(Violation(Assumption.PROPER, f"largest entry {np.abs(plant.D11).max():.3g}"))
-    if not found and n:
-        zeros = _boundary_zeros(plant.A, plant.B2, plant.C1, plant.D12, plant.dt)[:1]
-        found += [Violation(Assumption.NO_ZERO_CONTROL, f"zero {zero:.6g}") for zero in zeros]
-        zeros = _boundary_zeros(plant.A.T, plant.C2.T, plant.B1.T, plant.D21.T, plant.dt)[:1]
-        found += [Violation(Assumption.NO_ZERO_MEASUREMENT, f"zero {zero:.6g}") for zero in zeros]
-    return found
+def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[Assumption, str]:
+    """Check every assumption of H2 synthesis and return those that fail, with what was found."""
+    p, (n, _, n_u, _, n_y) = plant, plant.sizes
+    failed = {}
+    if modes := unreachable_modes(p.A, p.B2, p.dt):
+        failed[Assumption.STABILISABLE] = f"mode {modes[0]:.6g}"
+    if modes := unreachable_modes(p.A.T, p.C2.T, p.dt):
+        failed[Assumption.DETECTABLE] = f"mode {modes[0]:.6g}"
+    if _rank(p.D12) < n_u:
+        failed[Assumption.CONTROL_PENALTY] = f"rank {_rank(p.D12)}, {n_u} controls"
+    if _rank(p.D21) < n_y:
+        failed[Assumption.MEASUREMENT_NOISE] = f"rank {_rank(p.D21)}, {n_y} measurements"
+    if proper and p.dt == 0 and np.any(p.D11):
+        failed[Assumption.PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
+    if failed or not n:
+        return failed
+    if zeros := _boundary_zeros(p.A, p.B2, p.C1, p.D12, p.dt):
+        failed[Assumption.NO_ZERO_CONTROL] = f"zero {zeros[0]:.6g}"
+    if zeros := _boundary_zeros(p.A.T, p.C2.T, p.B1.T, p.D21.T, p.dt):
+        failed[Assumption.NO_ZERO_MEASUREMENT] = f"zero {zeros[0]:.6g}"
+    return failed
 
 
 def require_plant(plant: object, method: str) -> None:
     """Raise a `DimensionError` when it is no generalized plant."""
     if not isinstance(plant, GeneralizedPlant):
         raise DimensionError(
-            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found {type(plant).__name__}; build one first."
+            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found "
+            f"{type(plant).__name__}; build one first."
         )
 
 
 def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
-    """Raise a `SynthesisError` that names every violated assumption, or a `DimensionError` when it is no generalized plant."""
+    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
     require_plant(plant, method)
-    found = h2_violations(plant, proper)
-    if found:
+    failed = [f"{a.value} ({found}): {_REMEDY[a]}" for a, found in h2_violations(plant, proper).items()]
+    if failed:
+        raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")
+
+
+def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
+    """Raise a `SynthesisError` naming the first mode on or beyond the stability boundary that C does not see."""
+    modes = unreachable_modes(A.T, C.T, dt)
+    if modes:
         raise SynthesisError(
-            f"{method} needs a regular generalized plant; violated: " + "; ".join(map(str, found)) + "."
+            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible "
+            "in y; measure another state."
         )
 
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
-    """States in units that balance A, and inputs in units that make B as large as A: the test must not depend on anyone's units."""
+    """Balance A and make B as large as A, so that a test does not depend on units."""
     if not A.size:
         return A, B
     size = balanced_size(A)
@@ -145,7 +124,10 @@ def _rank(matrix: Array) -> int:
 
 
 def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
-    """Invariant zeros on the stability boundary; D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C."""
+    """Invariant zeros on the stability boundary.
+
+    D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C.
+    """
     pinv = np.linalg.pinv(D)
     inner = A - B @ pinv @ C
     rest = C - D @ (pinv @ C)

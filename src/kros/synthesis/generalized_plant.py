@@ -8,7 +8,7 @@ K : controller with matrices A^c, B^c, C^c, D^c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,8 @@ class GeneralizedPlant:
     dt : float, s
         Sampling period; 0 means continuous time.
     n_w1 : int, optional
-        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default all.
+        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default
+        all.
     n_z1 : int, optional
         For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
     w_parts, z_parts : dict of str to int
@@ -67,8 +68,9 @@ class GeneralizedPlant:
     >>> import numpy as np
     >>> from kros.core import gain, h2_norm
     >>> from kros.synthesis import GeneralizedPlant
-    >>> D11, D12 = np.zeros((2, 2)), [[0.0], [1.0]]
-    >>> plant = GeneralizedPlant([[0.9]], [[1.0, 0.0]], [[1.0]], [[1.0], [0.0]], [[1.0]], D11, D12, [[0.0, 1.0]], [[0.0]], 1.0)
+    >>> D11, D12, D21 = np.zeros((2, 2)), [[0.0], [1.0]], [[0.0, 1.0]]
+    >>> B1, C1 = [[1.0, 0.0]], [[1.0], [0.0]]
+    >>> plant = GeneralizedPlant([[0.9]], B1, [[1.0]], C1, [[1.0]], D11, D12, D21, [[0.0]], 1.0)
     >>> bool(h2_norm(plant.close(gain([[-0.5]], 1.0))) < h2_norm(plant.open_loop()))
     True
     """
@@ -92,20 +94,16 @@ class GeneralizedPlant:
         for name in _MATRICES:
             object.__setattr__(self, name, np.atleast_2d(real_array(f"Generalized plant: {name}", getattr(self, name))))
         object.__setattr__(self, "dt", sampling_period("Generalized plant", self.dt))
-        n, n_w, n_u, n_z, n_y = (
-            self.A.shape[-1],
-            self.B1.shape[-1],
-            self.B2.shape[-1],
-            self.C1.shape[0],
-            self.C2.shape[0],
-        )
+        n, (n_z, n_y) = self.A.shape[-1], (len(self.C1), len(self.C2))
+        n_w, n_u = self.B1.shape[-1], self.B2.shape[-1]
         expected = {"A": (n, n), "B1": (n, n_w), "B2": (n, n_u), "C1": (n_z, n), "C2": (n_y, n)}
         expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
                 found = {key: getattr(self, key).shape for key in _MATRICES}
                 raise DimensionError(
-                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the offending matrix."
+                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the "
+                    "offending matrix."
                 )
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
             raise DimensionError(
@@ -146,27 +144,55 @@ class GeneralizedPlant:
         parts = {"w": self.w_parts, "z": self.z_parts}.get(signal, {})
         if name not in parts:
             raise DimensionError(
-                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of them."
+                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of "
+                "them."
             )
         names = list(parts)
         first = sum(parts[other] for other in names[: names.index(name)])
         return np.arange(first, first + parts[name])
 
-    def channel(self, rows: slice, columns: slice) -> GeneralizedPlant:
+    def channel(self, rows: slice | Array, columns: slice | Array) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
-        D11 = self.D11[rows][:, columns]
-        return GeneralizedPlant(
-            self.A,
-            self.B1[:, columns],
-            self.B2,
-            self.C1[rows],
-            self.C2,
-            D11,
-            self.D12[rows],
-            self.D21[:, columns],
-            self.D22,
-            self.dt,
+        C1, D12, D11 = self.C1[rows], self.D12[rows], self.D11[rows][:, columns]
+        B1, D21 = self.B1[:, columns], self.D21[:, columns]
+        return GeneralizedPlant(self.A, B1, self.B2, C1, self.C2, D11, D12, D21, self.D22, self.dt)
+
+    def transformed(
+        self,
+        *,
+        x: tuple[Array, Array] | None = None,
+        z: Array | None = None,
+        w: Array | None = None,
+        y: Array | None = None,
+        u: Array | None = None,
+    ) -> GeneralizedPlant:
+        """Return the plant in the states ``T x`` for ``x = (T, T^-1)``, outputs multiplied by z, y, inputs by w, u."""
+        n, n_w, n_u, n_z, n_y = self.sizes
+        T, back = x or (np.eye(n), np.eye(n))
+        z, w = np.eye(n_z) if z is None else z, np.eye(n_w) if w is None else w
+        y, u = np.eye(n_y) if y is None else y, np.eye(n_u) if u is None else u
+        return replace(
+            self,
+            A=T @ self.A @ back,
+            B1=T @ self.B1 @ w,
+            B2=T @ self.B2 @ u,
+            C1=z @ self.C1 @ back,
+            C2=y @ self.C2 @ back,
+            D11=z @ self.D11 @ w,
+            D12=z @ self.D12 @ u,
+            D21=y @ self.D21 @ w,
+            D22=y @ self.D22 @ u,
         )
+
+    @property
+    def performance(self) -> GeneralizedPlant:
+        """The plant of channel 1 alone, from w1 to z1."""
+        return self.channel(self.rows(1), self.columns(1))
+
+    @property
+    def uncertainty(self) -> GeneralizedPlant:
+        """The plant of channel 2 alone, from w2 to z2."""
+        return self.channel(self.rows(2), self.columns(2))
 
     def open_loop(self) -> StateSpace:
         """Return the plant as one system from (w, u) to (z, y)."""
@@ -190,13 +216,15 @@ class GeneralizedPlant:
         _, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
             raise DimensionError(
-                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x {K.n_inputs} at {K.dt} s; "
+                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x "
+                f"{K.n_inputs} at {K.dt} s; "
                 "match the sizes and resample one of them."
             )
         loop = np.eye(n_y) - self.D22 @ K.D
         if n_y and np.linalg.cond(loop) > 1e14:
             raise DimensionError(
-                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly proper controller."
+                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly "
+                "proper controller."
             )
         # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
@@ -211,19 +239,9 @@ class GeneralizedPlant:
 
 def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:
     """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` as in `GeneralizedPlant`."""
-    B, C, D = system.B, system.C, system.D
-    matrices = (
-        system.A,
-        B[:, :n_w],
-        B[:, n_w:],
-        C[:n_z],
-        C[n_z:],
-        D[:n_z, :n_w],
-        D[:n_z, n_w:],
-        D[n_z:, :n_w],
-        D[n_z:, n_w:],
-    )
-    return GeneralizedPlant(*matrices, system.dt, **parts)
+    (B1, B2), (C1, C2) = np.split(system.B, [n_w], axis=1), np.split(system.C, [n_z])
+    (D11, D12), (D21, D22) = (np.split(D, [n_w], axis=1) for D in np.split(system.D, [n_z]))
+    return GeneralizedPlant(system.A, B1, B2, C1, C2, D11, D12, D21, D22, system.dt, **parts)
 
 
 def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:

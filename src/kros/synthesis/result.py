@@ -122,7 +122,8 @@ class Synthesis:
             object.__setattr__(self, name, member(kind, getattr(self, name), f"Synthesis {self.method}: the {name}"))
         if self.gap_percent is not None and not self.gap_percent >= 0:
             raise SynthesisError(
-                f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %); "
+                f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained "
+                f"({self.gap_percent:.6g} %); "
                 "no result claims that. Please report the problem that led here."
             )
 
@@ -158,7 +159,8 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
             None,
             None,
             (
-                f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please report this problem.",
+                f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please "
+                "report this problem.",
             ),
         )
     lower = min(lower, value)

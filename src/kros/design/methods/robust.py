@@ -32,7 +32,7 @@ def design_worst_case_h2(task: DesignTask) -> DesignResult:
         model = DisturbanceModel(wanted)
         assumed = model.of(problem)
         return task.designed(worst_case_h2(assumed, max_order=task.max_order), assumed, **model.facts())
-    rough = partial(worst_case_h2, tolerance_db=3.0, refinements=0, fit=cached(fit_magnitude))
+    rough = partial(worst_case_h2, tolerance_db=3.0, fit=cached(fit_magnitude))
     model = best_model(task, problem, partial(rough, bounded=False, max_order=1))
     assumed = model.of(problem)
     _, synthesis = best_design(

@@ -1,1 +1,4 @@
-"""Mixed H2/H-infinity synthesis: inequalities, the solvers that they are given to, and the Youla program as a yardstick."""
+"""Mixed H2/H-infinity synthesis.
+
+Inequalities, the solvers that they are given to, and the Youla program as a yardstick.
+"""

@@ -1,18 +1,24 @@
 r"""Local improvement of a mixed controller of fixed order: ``min ||T11||_2`` subject to ``||T22||_inf < gamma``.
 
-Sequential quadratic programming on the controller's matrices. The norm of T11 has an analytic gradient (two Gramians); the constraint is set at
-frequencies, where ``sigma_max(T22)`` has the gradient ``Re(u* C_cl(z) dTheta B_cl(z) v)``. The norm between the frequencies is then computed by
-level sets; where it exceeds gamma the peak joins the frequencies and the level is lowered.
+Sequential quadratic programming on the controller's matrices ``Theta = [[D^c, C^c], [B^c, A^c]]``, a static gain for
+the plant that carries the controller's states along (D22 = 0):
 
-Symbols
--------
-Theta = [[D^c, C^c], [B^c, A^c]] : the controller;  u, v : singular vectors of T22 at its largest singular value
+    A_cl = A_0 + B_u Theta C_y,   B_cl = B_0 + B_u Theta D_y,
+    C_cl = C_0 + D_u Theta C_y,   D_cl = D_0 + D_u Theta D_y,
+
+so that ``dT = (C_cl Phi B_u + D_u) dTheta (C_y Phi B_cl + D_y)``, ``Phi = (zI - A_cl)^-1``. With the Gramians P and Q
+of T11 the derivative of ``||T11||_2^2 = tr(C_cl P C_cl' + D_cl D_cl')`` is
+
+    2 [B_u' (Q A_cl P C_y' + Q B_cl D_y') + D_u' (C_cl P C_y' + D_cl D_y')].
+
+The constraint is set at frequencies, where ``sigma_max(T22)`` has the gradient ``Re(u* dT v)`` with its singular
+vectors. The norm between the frequencies is then computed by level sets; where it exceeds gamma the peaks join the
+frequencies and the level is lowered.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,48 +26,61 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace
-from ...core.norms import h2_norm, hinf_norm
+from ...core.norms import first_frequencies, gramian, h2_norm, hinf_norm
 from ..generalized_plant import GeneralizedPlant
-from ..reduction.affine_loop import AffineLoop
-from .channels import part
 
 Array = npt.NDArray[Any]
 
-_GRID, _ROUNDS, _ITERATIONS = 60, 8, 60
-_BACK_OFF = 1e-4
-_UNSTABLE = 1e3
+_ROUNDS, _ITERATIONS = 8, 60
+_BACK_OFF = 1e-4  # of the level, relative, for peaks between the frequencies
+_UNSTABLE = 1e3  # logarithm of the squared norm of a loop that is not stable
 
 
 @dataclass(frozen=True, eq=False)
-class _Problem:
-    """The loop, the units of its entries, and the clock."""
+class _Loop:
+    """Closed loop of a plant with a controller of `order` states, as a function of x = Theta / units."""
 
-    loop: AffineLoop
-    units: Array
+    plant: GeneralizedPlant
+    order: int
     gamma: float
     end: float
+    units: Array
 
-    def theta(self, x: Array) -> Array:
-        return x.reshape(self.units.shape) * self.units
+    @property
+    def sides(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        """B_u and D_u, what Theta drives, and C_y and D_y, what it sees."""
+        p, k = self.plant, self.order
+        n, n_w, n_u, n_z, n_y = p.sizes
+        eye = np.eye(k)
+        B_u = np.block([[p.B2, np.zeros((n, k))], [np.zeros((k, n_u)), eye]])
+        C_y = np.block([[p.C2, np.zeros((n_y, k))], [np.zeros((k, n)), eye]])
+        return (B_u, np.hstack([p.D12, np.zeros((n_z, k))])), (C_y, np.vstack([p.D21, np.zeros((k, n_w))]))
+
+    def controller(self, x: Array) -> StateSpace:
+        """Return the controller."""
+        theta, (_, _, n_u, _, n_y) = x.reshape(self.units.shape) * self.units, self.plant.sizes
+        return StateSpace(theta[n_u:, n_y:], theta[n_u:, :n_y], theta[:n_u, n_y:], theta[:n_u, :n_y], self.plant.dt)
 
     def cost(self, x: Array) -> tuple[float, Array]:
-        """Logarithm of the squared H2 norm and its gradient."""
+        """Logarithm of the squared H2 norm of T11 and its gradient."""
         if time.perf_counter() > self.end:
             raise TimeoutError
-        p = self.loop.plant
-        value, gradient = self.loop.h2_squared(self.theta(x), p.rows(1), p.columns(1))
-        if not 0 < value < np.inf:
+        loop, ((B_u, D_u), (C_y, D_y)), p = self.plant.close(self.controller(x)), self.sides, self.plant
+        if not loop.is_stable():
             return _UNSTABLE, np.zeros_like(x)
-        return float(np.log(value)), (gradient * self.units).ravel() / value
+        rows, columns = p.rows(1), p.columns(1)
+        B, C, D, D_u, D_y = loop.B[:, columns], loop.C[rows], loop.D[rows, columns], D_u[rows], D_y[:, columns]
+        P, Q = gramian(loop.A, B, loop.dt), gramian(loop.A.T, C.T, loop.dt)
+        gradient = B_u.T @ Q @ (loop.A @ P @ C_y.T + B @ D_y.T) + D_u.T @ (C @ P @ C_y.T + D @ D_y.T)
+        value = max(float(np.trace(C @ P @ C.T) + np.sum(D**2)), 1e-300)
+        return float(np.log(value)), 2 * (gradient * self.units).ravel() / value
 
     def gains(self, x: Array, freqs_hz: Array) -> tuple[Array, Array]:
         """Logarithm of ``sigma_max(T22) / gamma`` at the frequencies, and its derivatives, shape (f, x)."""
-        p, loop = self.loop.plant, self.loop.close(self.theta(x))
+        loop, ((B_u, D_u), (C_y, D_y)), p = self.plant.close(self.controller(x)), self.sides, self.plant
         rows, columns = p.rows(2), p.columns(2)
-        (B_u, D_u), (C_y, D_y) = self.loop.into, self.loop.out_of
-        n = loop.n_states
         z = np.exp(2j * np.pi * freqs_hz * loop.dt)
-        resolvent = np.linalg.inv(z[:, None, None] * np.eye(n) - loop.A)
+        resolvent = np.linalg.inv(z[:, None, None] * np.eye(loop.n_states) - loop.A)
         B, C = loop.B[:, columns], loop.C[rows]
         U, s, Vh = np.linalg.svd(C @ resolvent @ B + loop.D[rows, columns], full_matrices=False)
         left = np.einsum("fi,fij->fj", U[:, :, 0].conj(), C @ resolvent @ B_u + D_u[rows])
@@ -72,42 +91,51 @@ class _Problem:
 
 
 def improved(plant: GeneralizedPlant, controller: StateSpace, gamma: float, time_limit_s: float) -> StateSpace:
-    """Return a controller of the same order that is at least as good, for one that stabilises with ``||T22||_inf < gamma``."""
-    loop = AffineLoop(plant, controller.n_states)
-    start = loop.theta(controller)
-    units = loop.typical(start)
-    problem = _Problem(loop, units, gamma, time.perf_counter() + time_limit_s)
-    x, best, best_norm = (start / units).ravel(), controller, _norms(plant, controller)[0]
-    freqs_hz, level = _frequencies(loop.close(start)), 1 - _BACK_OFF
+    """Return a controller of the same order that is at least as good, for one with ``||T22||_inf < gamma``."""
+    K, end = controller, time.perf_counter() + time_limit_s
+    theta = np.block([[K.D, K.C], [K.B, K.A]])
+    loop = _Loop(plant, K.n_states, gamma, end, _units(plant, K))
+    x, best, least = (theta / loop.units).ravel(), K, h2_norm(plant.performance.close(K))
+    freqs_hz, level = _frequencies(plant.close(K)), 1 - _BACK_OFF
     for _ in range(_ROUNDS):
         try:
-            x_new = _programme(problem, x, freqs_hz, level)
+            x_new = _programme(loop, x, freqs_hz, level)
         except (TimeoutError, np.linalg.LinAlgError, ValueError):
             break
-        candidate = loop.controller(problem.theta(x_new))
-        norm, peak = _norms(plant, candidate)
-        if not np.isfinite(peak):
-            break
+        candidate = loop.controller(x_new)
+        norm, peak = h2_norm(plant.performance.close(candidate)), hinf_norm(plant.uncertainty.close(candidate))
         if peak < gamma:
-            if norm < best_norm:
-                gained = 1 - norm / best_norm
-                best, best_norm, x = candidate, norm, x_new
-                if gained < 1e-4:
-                    break
-                continue
-            break
-        dense = _frequencies(loop.close(problem.theta(x_new)), 600)
-        excess, _ = problem.gains(x_new, dense)
-        peaks = np.flatnonzero(
-            (excess >= np.maximum(np.roll(excess, 1), np.roll(excess, -1))) & (excess > np.log(level) - 0.05)
-        )
+            gained = 1 - norm / least
+            if gained > 0:
+                best, least, x = candidate, norm, x_new
+            if gained < 1e-4:
+                break
+            continue
+        if not np.isfinite(peak):  # nor is there a peak that could join the frequencies
+            level *= 1 - 100 * _BACK_OFF
+            continue
+        dense = _frequencies(plant.close(candidate), 6)
+        excess, _ = loop.gains(x_new, dense)
+        peaks = (excess >= np.maximum(np.roll(excess, 1), np.roll(excess, -1))) & (excess > np.log(level) - 0.05)
         freqs_hz = np.union1d(freqs_hz, dense[peaks])
         level = min(level, level * gamma / peak * (1 - _BACK_OFF)) if peak < 1.05 * gamma else level
         x = x_new if peak < 1.5 * gamma else x
     return best
 
 
-def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float) -> Array:
+def _units(plant: GeneralizedPlant, controller: StateSpace) -> Array:
+    """Size of every entry of Theta that changes the norm by about as much as any other, shape of Theta."""
+    empty = np.zeros((0, 0))
+    closed = plant.close(controller)
+    (B_u, D_u), (C_y, D_y) = _Loop(plant, controller.n_states, 1.0, 0.0, empty).sides
+    P, Q = gramian(closed.A, closed.B, closed.dt), gramian(closed.A.T, closed.C.T, closed.dt)
+    seen = np.einsum("ij,jk,ik->i", C_y, P, C_y) + np.sum(D_y**2, axis=1)
+    driven = np.einsum("ji,jk,ki->i", B_u, Q, B_u) + np.sum(D_u**2, axis=0)
+    product = np.outer(driven, seen)
+    return np.asarray(1 / np.sqrt(np.maximum(product, 1e-24 * product.max(initial=0.0) + 1e-300)))
+
+
+def _programme(loop: _Loop, x: Array, freqs_hz: Array, level: float) -> Array:
     """Run sequential quadratic programming with the constraint at some frequencies."""
     from scipy.optimize import minimize
 
@@ -117,34 +145,19 @@ def _programme(problem: _Problem, x: Array, freqs_hz: Array, level: float) -> Ar
         key = point.tobytes()
         if key not in remembered:
             remembered.clear()
-            remembered[key] = problem.gains(point, freqs_hz)
+            remembered[key] = loop.gains(point, freqs_hz)
         return remembered[key]
 
     room: dict[str, Any] = {"type": "ineq", "fun": lambda v: np.log(level) - gains(v)[0], "jac": lambda v: -gains(v)[1]}
-    cost: Callable[[Array], tuple[float, Array]] = problem.cost
-    p = problem.loop.plant
-    rooms = [room] if p.D11[p.rows(2), p.columns(2)].size else []
-    found = minimize(
-        cost, x, jac=True, method="SLSQP", constraints=rooms, options={"maxiter": _ITERATIONS, "ftol": 1e-7}
-    )
-    return np.asarray(found.x)
+    rooms = [room] if loop.plant.uncertainty.D11.size else []
+    options = {"maxiter": _ITERATIONS, "ftol": 1e-7}
+    return np.asarray(minimize(loop.cost, x, jac=True, method="SLSQP", constraints=rooms, options=options).x)
 
 
-def _norms(plant: GeneralizedPlant, controller: StateSpace) -> tuple[float, float]:
-    """Norms of T11 and T22."""
-    closed = plant.close(controller)
-    return h2_norm(part(plant, closed, 1)), hinf_norm(part(plant, closed, 2))
-
-
-def _frequencies(closed: StateSpace, count: int = _GRID) -> Array:
-    """Frequencies in Hz: of the poles, and logarithmically between far below the slowest and the highest."""
+def _frequencies(closed: StateSpace, factor: int = 1) -> Array:
+    """Frequencies in Hz of a discrete loop: of the poles, around them, and evenly spaced."""
     poles = closed.poles().astype(complex)
-    poles = np.log(poles[np.abs(poles) > 1e-9]) / closed.dt
-    sizes = np.abs(poles)[np.abs(poles) > 0] / (2 * np.pi)
     top = 0.5 / closed.dt
-    bottom = min(sizes.min(initial=top) / 10, top / 100)
-    resonances = np.abs(poles.imag) / (2 * np.pi)
-    grid = np.geomspace(bottom, top, count)
-    return np.unique(
-        np.concatenate([[0.0], grid, np.linspace(0, top, count // 2), resonances[resonances < top], sizes[sizes < top]])
-    )
+    sizes = first_frequencies(np.log(poles[np.abs(poles) > 1e-9]) / closed.dt) / (2 * np.pi)
+    grid = np.geomspace(max(sizes[1], 1e-6 * top), top, 40 * factor)
+    return np.unique(np.concatenate([grid, np.linspace(0, top, 30 * factor), sizes[sizes < top]]))

@@ -1,19 +1,21 @@
-r"""The linear matrix inequalities of mixed H2/H-infinity synthesis in discrete time, with one Lyapunov matrix for both channels.
+r"""Matrix inequalities of discrete mixed H2/H-infinity synthesis, with one Lyapunov matrix for both channels.
 
-With the Lyapunov matrix ``G`` partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and ``G^-1 = [[Y, *], [V', *]]``, the change of
-variables
+With the Lyapunov matrix ``G`` partitioned as the plant and the controller, ``G = [[X, *], [U, *]]`` and ``G^-1 = [[Y,
+*], [V', *]]``, the change of variables
 
     C_n = D^c C2 X + C^c U,   B_n = Y B2 D^c + V B^c,   D_n = D^c,   I = Y X + V U,
     A_n = Y (A + B2 D^c C2) X + V B^c C2 X + Y B2 C^c U + V A^c U - I
 
-makes ``G~ = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I, and then the inequality
-between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and the rows are combined accordingly (a congruence):
+makes ``G~ = [[X, I], [I, Y]]`` and the closed-loop matrices A~, B~, C~, D~ affine. Sampled plants have A close to I,
+and then the inequality between G~ and A~ is a small difference of large matrices. So the unknown is ``W = A~ - G~`` and
+the rows are combined accordingly (a congruence):
 
     H2:    [[-W-W', W, B~1], [., G~, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~, 0], [., ., I]] > 0,   min tr Z
     Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
 
-A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local improvement, ended at the
-same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are divided by its root.
+A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local
+improvement, ended at the same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are
+divided by its root.
 
 References
 ----------
@@ -32,15 +34,67 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import balancing
 from ...core.lti import StateSpace
-from .balance import Balanced
+from ...core.norms import gramian, h2_norm
+from ..generalized_plant import GeneralizedPlant
+from ..riccati.h2 import h2
 from .barrier import Block
 
 Array = npt.NDArray[Any]
 Values = dict[str, Array]
 
-# Least eigenvalue of the scaled Lyapunov matrices: keeps I - Y X away from singular, without which the controller cannot be recovered.
+# Least eigenvalue of the scaled Lyapunov matrices: the controller is recovered from I - Y X, which it keeps regular.
 _MARGIN = 1e-3
+_KNOWN = (
+    1e-3  # error, in a state's standard deviations, for which coordinates are chosen where a state is known exactly
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Balanced:
+    """A plant in balanced coordinates, z1 divided by `size`, with the diagonal `spread` of X and Y to expect."""
+
+    plant: GeneralizedPlant
+    size: float
+    spread: Array
+    controls: Array
+    measurements: Array
+
+    def inside(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the balanced plant for one of the original."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B * m, K.C / c, K.D * m / c, K.dt)
+
+    def controller(self, K: StateSpace) -> StateSpace:
+        """Return the controller of the original plant."""
+        c, m = self.controls[:, None], self.measurements
+        return StateSpace(K.A, K.B / m, c * K.C, c * K.D / m, K.dt)
+
+
+def balance(plant: GeneralizedPlant) -> Balanced:
+    """Balance a regular plant (D22 = 0) in the coordinates (error, estimate) of its H2-optimal observer.
+
+    An accurate sensor makes the error ``e = x - x_hat`` of the optimal estimate many decades smaller than the state, so
+    nothing here subtracts one covariance from another: those of e, of x_hat and between them are E, W and F, and ``X =
+    E + F + F' + W`` is that of x. T makes ``X = E^-1 = diag(s)``.
+    """
+    n = plant.sizes[0]
+    rows, K = plant.rows(1), h2(plant.channel(plant.rows(1), slice(None))).controller
+    L = K.B - plant.B2 @ K.D  # predictor gain: e+ = (A - L C2) e + ...
+    A = np.block([[plant.A - L @ plant.C2, np.zeros((n, n))], [K.B @ plant.C2, K.A + K.B @ plant.C2]])
+    P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
+    E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
+    X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
+    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > 1e-28 * np.diag(X), 0.0, np.diag(X)))
+    T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
+    size = h2_norm(plant.channel(rows, slice(None)).close(K))
+    scale = np.ones(plant.sizes[3])
+    scale[rows] = 1 / max(size, 1e-300)
+    measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
+    controls = size / np.linalg.norm(plant.D12[rows], axis=0)
+    balanced = plant.transformed(x=(T, back), z=np.diag(scale), y=np.diag(1 / measurements), u=np.diag(controls))
+    return Balanced(balanced, size, s, controls, measurements)
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +126,7 @@ class MixedInequalities:
 
     def values(self, x: Array) -> Values:
         """Matrices from scalar variables, shape (..., n); the leading axes stay."""
-        found, position = {}, 0
+        matrices, position = {}, 0
         for name, (rows, columns, symmetric) in self.shapes.items():
             part = x[..., position : position + _count(rows, columns, symmetric)]
             position += part.shape[-1]
@@ -83,8 +137,8 @@ class MixedInequalities:
                 matrix[..., upper[1], upper[0]] = part
             else:
                 matrix = part.reshape(*x.shape[:-1], rows, columns)
-            found[name] = matrix
-        return found
+            matrices[name] = matrix
+        return matrices
 
     def start(self) -> Array:
         """Variables of no correction, with the Lyapunov matrices that are expected."""
@@ -118,7 +172,7 @@ class MixedInequalities:
             [[less @ v["X"] + p.B2 @ v["Cn"], less + p.B2 @ v["Dn"] @ p.C2], [v["An"], v["Y"] @ less + v["Bn"] @ p.C2]]
         )
         Wt = W.swapaxes(-1, -2)
-        found = [G - _MARGIN * np.eye(2 * n)]
+        blocks = [G - _MARGIN * np.eye(2 * n)]
         for channel in (1, 2):
             B, C, D = self._channel(channel, v, scale)
             if channel == 2 and not (B.shape[-1] and C.shape[-2]):
@@ -126,14 +180,14 @@ class MixedInequalities:
             Bt, Ct, Dt, one = (m.swapaxes(-1, -2) for m in (B, C, D, np.eye(B.shape[-1])))
             zero = np.zeros((2 * n, B.shape[-1]))
             if channel == 1:
-                found.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
-                found.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
+                blocks.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
+                blocks.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
             else:
                 level = self.gamma**2 * np.eye(C.shape[-2])
-                found.append(
+                blocks.append(
                     _blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
                 )
-        return found
+        return blocks
 
     def _channel(self, channel: int, v: Values, scale: Array) -> tuple[Array, Array, Array]:
         """B~, C~, D~ of one channel, scaled; disturbances without effect on it are left out."""

@@ -5,21 +5,24 @@ With uncertainty of any of the six forms, ``E = W_L Delta W_R`` on scaled signal
 
 .. math:: e = T_e W_L\,\Delta (I - N \Delta)^{-1} M w_1 + S R\,W_u w_1 \; - \; S\,(zI - A)^{-1} J K\, n
 
-with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e`` is ``S`` or ``S G``, and
-M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside the loop of :math:`\Delta`, so no choice of K can
-lose robustness, and none can gain it: the set is well posed when ``||N|| < 1``. The diagram is in `plants`.
+with :math:`S = (I + (zI - A)^{-1} J K C)^{-1}` and ``J = B`` (input injection) or ``J = I`` (state injection). ``T_e``
+is ``S`` or ``S G``, and M and N, which do not contain K, depend on the form, see `uncertainty_location`. K is outside
+the loop of :math:`\Delta`, so no choice of K can lose robustness, and none can gain it: the set is well posed when
+``||N|| < 1``. The diagram is in `plants`.
 
-Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements over their noise.
+Everything numerical happens in scaled coordinates: states over `output_scale`, inputs over `input_scale`, measurements
+over their noise.
 
 Symbols
 -------
-A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r, n : disturbance of the input, of the state, noise
+A, B, C : nominal model, state = full lifted state;  J : injection matrix;  d, r, n : disturbance of the input, of the
+    state, noise
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +34,7 @@ from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
 from ...uncertainty.forms import Form, as_form
 from ...uncertainty.weights.cover import Structure
-from ..assumptions import unreachable_modes
+from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant, partitioned
 from ..result import Injection
 from .interconnect import interconnect
@@ -56,8 +59,8 @@ class ObserverProblem:
     C : ndarray, shape (q, n)
         Selects the measured outputs from the lifted state.
     W_L : StateSpace
-        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of inputs. Diagonal, scalar
-        and full weights are all sound, since Delta has no structure.
+        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of
+        inputs. Diagonal, scalar and full weights are all sound, since Delta has no structure.
     W_R : StateSpace
         Right weight; stable. As many inputs as E has columns, any number of outputs.
     input_scale : ndarray, shape (m,)
@@ -81,7 +84,8 @@ class ObserverProblem:
     injection : Injection or its name
         Where the correction enters.
     process_noise : ndarray, shape (n,), optional
-        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default none.
+        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default
+        none.
     form : Form or str
         Form of the uncertainty; default inverse input multiplicative, as in the paper.
 
@@ -94,8 +98,8 @@ class ObserverProblem:
     --------
     >>> from kros.core import StateSpace, gain
     >>> from kros.synthesis import ObserverProblem
-    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
-    >>> problem = ObserverProblem(lag, [[1.0]], W_L=gain([[0.1]], 0.01), W_R=gain([[1.0]], 0.01), input_scale=[1.0], output_scale=[1.0], noise=[0.1])
+    >>> lag, W_L, W_R = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), gain([[0.1]], 0.01), gain([[1.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], W_L, W_R, input_scale=[1.0], output_scale=[1.0], noise=[0.1])
     >>> problem.form.value, problem.injection.value
     ('inverse_input_multiplicative', 'state')
     """
@@ -118,58 +122,64 @@ class ObserverProblem:
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "form", as_form(self.form))
-        object.__setattr__(self, "injection", member(Injection, self.injection, "Observer problem: the injection"))
-        for name in ("nominal", "W_L", "W_R", "W_u", "remainder_left", "remainder_right"):
-            if getattr(self, name) is not None:
-                object.__setattr__(self, name, StateSpace.of(getattr(self, name)))
-        object.__setattr__(self, "C", np.atleast_2d(np.asarray(self.C, dtype=float)))
+        put = partial(object.__setattr__, self)
+        put("form", as_form(self.form))
+        put("injection", member(Injection, self.injection, "Observer problem: the injection"))
+        put("nominal", StateSpace.of(self.nominal))
+        put("C", np.atleast_2d(np.asarray(self.C, dtype=float)))
         n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
-        if self.C.shape[1] != n:
-            raise DimensionError(
-                f"Observer problem: C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity."
-            )
-        if self.n_original is not None and not 1 <= self.n_original <= n:
-            raise DimensionError(f"Observer problem: n_original = {self.n_original} should lie between 1 and {n}.")
+        self._require(
+            self.C.shape[1] == n,
+            f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity",
+        )
+        kept = n if self.n_original is None else self.n_original
+        self._require(1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
         for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            if value.shape != (size,) or not np.all(np.isfinite(value) & (value > 0)):
-                raise DimensionError(
-                    f"Observer problem: {name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)."
-                )
-            object.__setattr__(self, name, value)
+            valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value > 0)))
+            self._require(
+                valid,
+                f"{name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)",
+            )
+            put(name, value)
         level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
-        if level.shape != (n,) or not np.all(np.isfinite(level) & (level >= 0)):
-            raise DimensionError(
-                f"Observer problem: process_noise should be {n} numbers of at least zero, found {level}."
-            )
-        object.__setattr__(self, "process_noise", level)
-        if self.W_p is None:
-            kept = n if self.n_original is None else self.n_original
-            object.__setattr__(self, "W_p", np.diag(1 / self.output_scale)[:kept])
-        if not isinstance(self.W_p, StateSpace):
-            object.__setattr__(self, "W_p", np.atleast_2d(np.asarray(self.W_p, dtype=float)))
-        if self.correction_penalty <= 0:
-            raise DimensionError(
-                f"Observer problem: correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default."
-            )
-        if self.injection is Injection.NONE:
-            raise DimensionError(
-                "Observer problem: injection should be Injection.INPUT or Injection.STATE, found NONE."
-            )
-        if (self.remainder_left is None) != (self.remainder_right is None):
-            raise DimensionError(
-                "Observer problem: remainder_left and remainder_right come together, found only one of them."
-            )
+        valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
+        self._require(valid, f"process_noise should be {n} numbers of at least zero, found {level}")
+        put("process_noise", level)
+        W_p = np.diag(1 / self.output_scale)[:kept] if self.W_p is None else self.W_p
+        put("W_p", gain(W_p, self.nominal.dt) if isinstance(W_p, np.ndarray | list) else W_p)
+        self._require(
+            self.correction_penalty > 0,
+            f"correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default",
+        )
+        self._require(
+            self.injection is not Injection.NONE, "injection should be Injection.INPUT or Injection.STATE, found NONE"
+        )
+        together = (self.remainder_left is None) == (self.remainder_right is None)
+        self._require(together, "remainder_left and remainder_right come together, found only one of them")
         rows, columns = self.location.sizes(n, m)
-        sizes: dict[str, tuple[int | None, int | None]] = {
-            "W_L": (rows, None),
-            "W_R": (None, columns),
-            "W_u": (m, m),
-            "W_p": (None, n),
-        }
-        for name, size in (sizes | {"remainder_left": (n, None), "remainder_right": (None, m)}).items():
-            self._check_weight(name, *size)
+        left_right = {"remainder_left": (n, None), "remainder_right": (None, m)}
+        for name, size in (
+            {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)} | left_right
+        ).items():
+            if getattr(self, name) is not None:
+                put(name, StateSpace.of(getattr(self, name)))
+                self._check_weight(name, *size)
+
+    def _require(self, condition: bool, message: str) -> None:
+        if not condition:
+            raise DimensionError(f"Observer problem: {message}.")
+
+    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
+        weight, dt = getattr(self, name), self.nominal.dt
+        size = weight.n_outputs, weight.n_inputs
+        fits = size == (rows or size[0], columns or size[1]) and not weight.batch_shape
+        wanted = f"{name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty"
+        self._require(fits, f"{wanted}, found {size[0]} x {size[1]}{weight.batch_shape or ''}")
+        self._require(
+            weight.dt == dt,
+            f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s; fit it at the model's period",
+        )
 
     @classmethod
     def from_uncertain(
@@ -196,19 +206,22 @@ class ObserverProblem:
         Raises
         ------
         SynthesisError
-            For entrywise weights, and a nominal that is none of the models' units or not the model that the set surrounds.
+            For entrywise weights, and a nominal that is none of the models' units or not the model that the set
+            surrounds.
         DimensionError
             When the noise does not fit the measured channels.
         """
         if uncertain.weight.structure is Structure.ENTRYWISE:
             raise SynthesisError(
-                "Observer problem: the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full "
+                "Observer problem: the weights are entrywise, made for a diagonal perturbation, and synthesis is for "
+                "a full "
                 "one; quantify with diagonal weights."
             )
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
             raise SynthesisError(
-                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as nominal."
+                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as "
+                "nominal."
             )
         problem = cls(
             nominal=models.systems([unit])[0],
@@ -231,24 +244,10 @@ class ObserverProblem:
         )
         if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
             raise SynthesisError(
-                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; quantify these very models."
+                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; "
+                "quantify these very models."
             )
         return problem
-
-    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
-        weight = getattr(self, name)
-        if weight is None:
-            return
-        found = weight.shape if isinstance(weight, np.ndarray) else (weight.n_outputs, weight.n_inputs)
-        if found != (rows or found[0], columns or found[1]) or getattr(weight, "batch_shape", ()):
-            raise DimensionError(
-                f"Observer problem: {name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty, "
-                f"found {found[0]} x {found[1]}{getattr(weight, 'batch_shape', None) or ''}."
-            )
-        if isinstance(weight, StateSpace) and weight.dt != self.nominal.dt:
-            raise DimensionError(
-                f"Observer problem: {name} is sampled at {weight.dt} s, the nominal model at {self.nominal.dt} s; fit it at the model's period."
-            )
 
     @property
     def location(self) -> UncertaintyLocation:
@@ -263,22 +262,15 @@ class ObserverProblem:
     @cached_property
     def performance(self) -> StateSpace:
         """W_p on scaled states."""
-        W_p, x = self.W_p, self.output_scale
-        if isinstance(W_p, StateSpace):
-            return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
-        assert W_p is not None
-        return gain(W_p * x, self.nominal.dt)
+        W_p, x = StateSpace.of(self.W_p), self.output_scale
+        return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
 
     @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
         """A, B, C and the direct part of W_p in scaled coordinates; the measurement noise has unit covariance."""
         x, u = self.output_scale, self.input_scale
-        return (
-            self.nominal.A * x / x[:, None],
-            self.nominal.B * u / x[:, None],
-            self.C * x / self.noise[:, None],
-            self.performance.D,
-        )
+        A, B = self.nominal.A * x / x[:, None], self.nominal.B * u / x[:, None]
+        return A, B, self.C * x / self.noise[:, None], self.performance.D
 
     @cached_property
     def scaled_model(self) -> StateSpace:
@@ -314,7 +306,7 @@ class ObserverProblem:
         return slice(0, m) if self.location.at_input else slice(m, m + n)
 
     def require_sound(self) -> float:
-        """Check that the set is well posed and the observer possible; return ``||N||``, zero for the forms without a loop.
+        """Check that the set is well posed and the observer possible; return ``||N||``, zero without a loop.
 
         Raises
         ------
@@ -329,23 +321,22 @@ class ObserverProblem:
             raise SynthesisError(
                 "Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it."
             )
-        modes = unreachable_modes(self.nominal.A.T, self.C.T, self.nominal.dt)
-        if modes:
-            raise SynthesisError(
-                f"Observer synthesis: (A, C) is not detectable, mode {modes[0]:.6g} is invisible in y; measure another state."
-            )
+        require_detectable(self.nominal.A, self.C, self.nominal.dt, "Observer synthesis")
         for name in ("nominal", *_WEIGHTS):
             system = getattr(self, name)
             if isinstance(system, StateSpace) and not system.is_stable():
                 raise SynthesisError(
-                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must be below 1, "
+                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must "
+                    "be below 1, "
                     "use a stable model (identification guarantees it) and stable weights."
                 )
         size = 0.0 if self.N is None else hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
-                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for {as_form(self.form).value.replace('_', ' ')} "
-                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave outliers out."
+                f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for "
+                f"{as_form(self.form).value.replace('_', ' ')} "
+                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave "
+                "outliers out."
             )
         return size
 
@@ -355,7 +346,10 @@ class ObserverProblem:
         return self.process_noise / self.output_scale
 
     def error_plant(self) -> GeneralizedPlant:
-        """Unweighted error system, scaled: w = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise."""
+        """Unweighted error system, scaled.
+
+        W = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise.
+        """
         A, B, C, _ = self.scaled
         n, m, q, eye = len(A), B.shape[1], len(C), np.eye
         whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), self.nominal.dt)
@@ -372,18 +366,18 @@ class ObserverProblem:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
         return self.error_plant().close(self.to_scaled(controller))
 
-    def _scales(self) -> tuple[Array, Array]:
+    @property
+    def _scales(self) -> tuple[StateSpace, StateSpace]:
+        """Sizes of the correction and of the measurements, as gains."""
         correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale
-        return correction, self.noise
+        return gain(np.diag(correction), self.nominal.dt), gain(np.diag(self.noise), self.nominal.dt)
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        out, noise = self._scales()
-        K = controller
-        return StateSpace(K.A, K.B * noise, K.C / out[:, None], K.D * noise / out[:, None], K.dt)
+        correction, noise = self._scales
+        return gain(np.linalg.inv(correction.D), noise.dt) @ controller @ noise
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        out, noise = self._scales()
-        K = controller
-        return StateSpace(K.A, K.B / noise, K.C * out[:, None], K.D / noise * out[:, None], K.dt)
+        correction, noise = self._scales
+        return correction @ controller @ gain(np.linalg.inv(noise.D), noise.dt)

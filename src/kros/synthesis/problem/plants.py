@@ -10,10 +10,12 @@ For every form, with the perturbed plant in it (`uncertainty_location`) and the 
     at the state:  xi+ = A xi + v - J u,               e = xi + W_L w2 + W_rL w3        z1 = W_p e
                                                                                         y  = C e + n,   u = K y
 
-*Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the observer, both are driven
-by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other one remains only
-where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone. The interconnection has every block
-once, so with minimal weights the whole is minimal but for poles that cancel between blocks.
+*Why this is minimal.* With ``x = G s + ...`` the state of the perturbed plant and ``x_hat+ = A x_hat + B s + J u`` the
+observer, both are driven
+by the same ``s``, so the difference ``xi`` is not: of the two copies of the nominal model one drops out, and the other
+one remains only where the perturbation sees the state, through ``x``. Likewise W_u remains for what Delta sees alone.
+The interconnection has every block once, so with minimal weights the whole is minimal but for poles that cancel between
+blocks.
 
 Symbols
 -------
@@ -29,15 +31,24 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, partitioned
+from ..generalized_plant import GeneralizedPlant, partitioned, split
 from .interconnect import interconnect
 from .observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
 
+_LEAST_NOISE, _LEAST_PENALTY = (
+    1e-3,
+    3e-2,
+)  # in matrix inequalities: share of the measured channel's range, weight of the scaled correction
+
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there are any."""
+    """Whole problem.
+
+    W = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there
+    are any.
+    """
     A, B, C, _ = problem.scaled
     location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
@@ -78,72 +89,45 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise through shaping filters at the input and at the state, penalty on the correction: w = (nu_d, nu_r, n, v)."""
+    """White noise through shaping filters at the input and at the state.
+
+    W = (nu_d, nu_r, n, v), states (xi, W_p, d, r).
+    """
     q, n = len(problem.C), problem.nominal.n_states
-    filters = block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)])
-    return penalise(shape_inputs(problem.error_plant(), filters), problem.correction_penalty)
+    return shape_inputs(problem.error_plant(), block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)]))
 
 
-def mixed_plant(problem: ObserverProblem, noise_floor: float = 1e-3, penalty_floor: float = 3e-2) -> GeneralizedPlant:
-    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2)."""
+def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
+    """Reduced, regularised form of (37)-(39) for every form: w = (w1, n, w2), z = (W_p e, penalty, z2).
+
+    Matrix inequalities do not resolve an encoder's noise of 1e-7 of the range, nor a penalty as small: both have a
+    floor here, and a result is certified for the true noise.
+    """
     whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
-    sigma = np.maximum(1.0, noise_floor * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
-    penalty = max(problem.correction_penalty, penalty_floor)
-    w = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
-    z1, z2 = whole.part("z", "z1"), whole.part("z", "z2")
-    size = np.ones(whole.B1.shape[1])
-    size[whole.part("w", "n")] = sigma
-    B1, D11, D21 = (matrix[:, w] * size[w] for matrix in (whole.B1, whole.D11, whole.D21))
-    n, _, n_u, _, _ = whole.sizes
-
-    def rows(matrix: Array, middle: Array) -> Array:
-        return np.vstack([matrix[z1], middle, matrix[z2]])
-
-    return GeneralizedPlant(
-        whole.A,
-        B1,
-        whole.B2,
-        rows(whole.C1, np.zeros((n_u, n))),
-        whole.C2,
-        rows(D11, np.zeros((n_u, len(w)))),
-        rows(whole.D12, penalty * np.eye(n_u)),
-        D21,
-        whole.D22,
-        whole.dt,
-        n_w1=whole.w_parts["w1"] + whole.w_parts["n"],
-        n_z1=len(z1) + n_u,
-    )
+    whole = penalise(whole, max(problem.correction_penalty, _LEAST_PENALTY))
+    noise = np.maximum(1.0, _LEAST_NOISE * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
+    size = np.ones(whole.sizes[1])
+    size[whole.part("w", "n")] = noise
+    columns = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
+    rows = np.concatenate([whole.part("z", name) for name in ("z1", "penalty", "z2")])
+    w1, z2 = len(columns) - whole.w_parts["w2"], len(rows) - whole.z_parts["z2"]
+    return replace(whole.transformed(w=np.diag(size)).channel(rows, columns), n_w1=w1, n_z1=z2)
 
 
 def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
     """Put a filter in front of the disturbances: w = weight * nu."""
-    n, k = plant.A.shape[0], weight.n_states
-    return GeneralizedPlant(
-        np.block([[plant.A, plant.B1 @ weight.C], [np.zeros((k, n)), weight.A]]),
-        np.vstack([plant.B1 @ weight.D, weight.B]),
-        np.vstack([plant.B2, np.zeros((k, plant.B2.shape[1]))]),
-        np.hstack([plant.C1, plant.D11 @ weight.C]),
-        np.hstack([plant.C2, plant.D21 @ weight.C]),
-        plant.D11 @ weight.D,
-        plant.D12,
-        plant.D21 @ weight.D,
-        plant.D22,
-        plant.dt,
-    )
+    _, _, n_u, n_z, _ = plant.sizes
+    shaped = plant.open_loop() @ block_diagonal([weight, gain(np.eye(n_u), plant.dt)])
+    return split(shaped, weight.n_inputs, n_z, n_z1=plant.n_z1, z_parts=plant.z_parts)
 
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:
-    """Append the weighted control to the performance outputs."""
+    """Append the weighted control to the performance outputs, as the part "penalty" where these have names."""
     n, n_w, n_u, _, _ = plant.sizes
-    return GeneralizedPlant(
-        plant.A,
-        plant.B1,
-        plant.B2,
-        np.vstack([plant.C1, np.zeros((n_u, n))]),
-        plant.C2,
-        np.vstack([plant.D11, np.zeros((n_u, n_w))]),
-        np.vstack([plant.D12, penalty * np.eye(n_u)]),
-        plant.D21,
-        plant.D22,
-        plant.dt,
+    return replace(
+        plant,
+        C1=np.vstack([plant.C1, np.zeros((n_u, n))]),
+        D11=np.vstack([plant.D11, np.zeros((n_u, n_w))]),
+        D12=np.vstack([plant.D12, penalty * np.eye(n_u)]),
+        z_parts=plant.z_parts | {"penalty": n_u} if plant.z_parts else {},
     )

@@ -1,4 +1,4 @@
-r"""Where the perturbation sits: what it sees, where it acts, and whether it sees its own effect. Six forms are six answers.
+r"""Where the perturbation acts, what it sees, and whether it sees its own effect: six forms.
 
 With ``E = W_L Delta W_R`` on scaled signals, ``G`` the nominal model from input to state and ``w2 = Delta z2``,
 
@@ -21,8 +21,8 @@ inverse input multiplicative   input      input     yes      S G    W_R W_u     
 inverse output multiplicative  state      state     yes      S      W_R G W_u        W_R W_L      ``||N|| < 1``
 =============================  =========  ========  =======  =====  ===============  ===========  =====================
 
-In all of them the error is ``e = T_e W_L X M w1`` with ``X = Delta (I - N Delta)^-1``, and the observer is in ``T_e`` alone: K is outside the
-loop of Delta.
+In all of them the error is ``e = T_e W_L X M w1`` with ``X = Delta (I - N Delta)^-1``, and the observer is in ``T_e``
+alone: K is outside the loop of Delta.
 
 Symbols
 -------

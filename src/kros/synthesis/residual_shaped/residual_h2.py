@@ -1,15 +1,15 @@
 r"""The residual-shaped observer: the Kalman predictor for disturbances with the spectrum that was measured.
 
-The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not depend on the observer and
-can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ = A_f zeta + B_f w`` of the population's mean spectrum,
+The error of an observer on any unit is driven by the one-step residual omega of the nominal model, which does not
+depend on the observer and can be measured on every unit. With a shaping filter ``omega = C_f zeta + D_f w``, ``zeta+ =
+A_f zeta + B_f w`` of the population's mean spectrum,
 
     [ e    ]+   [ A   C_f ] [ e    ]   [ D_f ]       [ I ]
     [ zeta ]  = [ 0   A_f ] [ zeta ] + [ B_f ] w  -  [ 0 ] y^c,      nu = C e + v,
 
-the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through the state of the
-order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the mean spectrum it minimises the mean square error over
-the units. The worst unit's error is minimised by a mixture of the units' spectra: for fixed weights the best observer minimises the weighted mean, which is
-concave in the weights, and its gradient is the units' errors.
+the error of least variance is left by the Kalman predictor's gains ``L = [L_e; L_zeta]``, which is a correction through
+the state of the order of the filter: ``zeta_hat+ = A_f zeta_hat + L_zeta nu``, ``y^c = C_f zeta_hat + L_e nu``. For the
+mean spectrum it minimises the mean square error over the units.
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError, SynthesisError
-from ...core.lti import StateSpace, dense_response
-from ...core.norms import gramian, h2_norm
+from ...core.linalg import balancing
+from ...core.lti import StateSpace, dense_response, gain
+from ...core.norms import gramian, gramian_root, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.constant_gain import kalman
 from ..riccati.filter_bound import predictor_bound
+from ..riccati.kalman import kalman
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
+
+# Of shaping filters that are tried, in samples: delays alone, and lags for disturbances that last up to 300 samples.
 BASES = (Basis(8), Basis(4, (0.8, 0.95, 0.98)), Basis(8, (0.95, 0.98)), Basis(8, (0.9, 0.97, 0.99, 0.997)))
-_ROUNDS = 30
-_CLOSE = 1.02
 _NEGLIGIBLE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualProblem:
-    """What a residual-shaped observer must be good at: error dynamics, the residuals of a population, measurement noise.
+    """Problem of a residual-shaped observer: error dynamics, residuals of a population, measurement noise.
 
     Parameters
     ----------
@@ -49,7 +50,8 @@ class ResidualProblem:
     C : ndarray, shape (q, n)
         Selects the measured states.
     spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`residual_spectra` in `kros.observer.residual.one_step`), physical units.
+        Cross spectral density of every unit's one-step residual (`residual_spectra` in
+        `kros.observer.residual.one_step`), physical units.
     noise : ndarray, shape (q,)
         Standard deviation of the measurement noise.
     scale : ndarray, shape (n,)
@@ -66,7 +68,8 @@ class ResidualProblem:
     >>> import numpy as np
     >>> from kros.synthesis import ResidualProblem
     >>> white = np.full((1, 65, 1, 1), 0.01 + 0j)  # of one unit, from 0 Hz to Nyquist
-    >>> ResidualProblem(np.array([[0.9]]), np.array([[1.0]]), white, np.array([0.1]), np.array([1.0]), 0.01).spectra.shape
+    >>> A, C, noise, scale = np.array([[0.9]]), np.array([[1.0]]), np.array([0.1]), np.array([1.0])
+    >>> ResidualProblem(A, C, white, noise, scale, 0.01).spectra.shape
     (1, 65, 1, 1)
     """
 
@@ -98,7 +101,6 @@ def residual_h2(
     problem: ResidualProblem,
     bases: Sequence[Basis] = BASES,
     tolerance_percent: float = 1.0,
-    worst_unit: bool = False,
     n_lifted: int | None = None,
     max_order: int | None = None,
 ) -> Synthesis:
@@ -108,23 +110,23 @@ def residual_h2(
     ----------
     problem : ResidualProblem
     bases : sequence of Basis
-        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured is kept. A lag
-        with a pole near one is a disturbance state, for loads.
+        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured
+        is kept. A lag with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
-        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not measured; 0 keeps every
-        state of the filter.
-    worst_unit : bool
-        Minimise the largest error of a unit in place of the mean.
+        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not
+        measured; 0 keeps every state of the filter.
     n_lifted : int, optional
-        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the states.
+        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the
+        states.
     max_order : int, optional
         Most states of the correction, whatever the tolerance.
 
     Returns
     -------
     Synthesis
-        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed; ``lower_bound`` that of
-        every correction, proven, so that `gap_percent` is what the reduction of the order costs.
+        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed;
+        ``lower_bound`` that of every correction, proven, so that `gap_percent` is what the reduction of the order
+        costs.
 
     Raises
     ------
@@ -142,43 +144,30 @@ def residual_h2(
     (True, True)
     """
     start = time.perf_counter()
-    scaled = [problem.scaled(basis) for basis in bases]
-    shaped = min(scaled, key=_Scaled.promise) if len(scaled) > 1 else scaled[0]
-    weights, note = (
-        shaped.worst_unit()
-        if worst_unit
-        else (np.full(len(shaped.spectra), 1 / len(shaped.spectra)), f"mean of {len(shaped.spectra)} units")
-    )
-    full = shaped.filter(weights)
+    shaped = min((problem.scaled(basis) for basis in bases), key=_Scaled.promise)
+    full = shaped.filter()
     K = shaped.correction(full)
-    best = shaped.norm(full, K)
-    if not np.isfinite(best):
+    if not np.isfinite(shaped.norm(full, K)):
         raise SynthesisError(
-            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and what is measured."
+            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and "
+            "what is measured."
         )
-    K = shaped.reduced(full, K, tolerance_percent, max_order)
-    norm, radius = shaped.norm(full, K), float(shaped.error_system(K).spectral_radius())
-    note += f", {shaped.basis.delays} delays, lags {shaped.basis.poles}"
+    K = shaped.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
+    norm = shaped.norm(full, K)
+    note = f"mean of {len(shaped.spectra)} units, {shaped.basis.delays} delays, lags {shaped.basis.poles}"
     note += f", order {full.n_states} reduced to {K.n_states}" if K.n_states < full.n_states else ""
     lower, gap, notes = enclosed(norm, shaped.lower_bound(full))
-    scale, n, q = problem.scale[:, None], *problem.C.shape[::-1]
-    rows = np.zeros(((n_lifted or n) - n, q))
-    controller = StateSpace(
-        K.A,
-        K.B,
-        np.vstack([scale * K.C, np.zeros((len(rows), K.n_states))]),
-        np.vstack([scale * K.D, rows]),
-        problem.dt,
-    )
+    n = len(problem.A)
+    to_lifted = np.vstack([np.diag(problem.scale), np.zeros(((n_lifted or n) - n, n))])
     return Synthesis(
         method="residual_h2",
-        controller=controller,
+        controller=gain(to_lifted, problem.dt) @ K,
         status=Status.OPTIMAL if K.n_states == full.n_states else Status.CERTIFIED,
         injection=Injection.STATE,
         h2_norm=norm,
         lower_bound=lower,
         gap_percent=gap,
-        spectral_radius=radius,
+        spectral_radius=shaped.error_system(K).largest_pole(),
         solve_s=time.perf_counter() - start,
         solver="riccati",
         notes=(note, *notes),
@@ -189,7 +178,7 @@ def promised_errors(problem: ResidualProblem) -> Array:
     """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
     shaped = problem.scaled(BASES[1])
     try:
-        K = shaped.correction(shaped.filter(np.full(len(shaped.spectra), 1 / len(shaped.spectra))))
+        K = shaped.correction(shaped.filter())
     except SynthesisError:
         return np.full(len(shaped.A), np.inf)
     return np.asarray(np.sqrt(shaped.unit_errors(K).mean(axis=0)))
@@ -206,9 +195,9 @@ class _Scaled:
     basis: Basis
     dt: float
 
-    def filter(self, weights: Array) -> StateSpace:
-        """Shaping filter of a mixture of the units' spectra."""
-        return shaping_filter(np.tensordot(weights, self.spectra, 1), self.basis, self.dt)
+    def filter(self) -> StateSpace:
+        """Shaping filter of the units' mean spectrum."""
+        return shaping_filter(self.spectra.mean(axis=0), self.basis, self.dt)
 
     def shaped(self, shaping: StateSpace) -> tuple[Array, Array, Array]:
         """Plant behind its shaping filter: dynamics, input of the white noise, measurement."""
@@ -218,14 +207,9 @@ class _Scaled:
     def lower_bound(self, shaping: StateSpace) -> float | None:
         """Root mean square of the scaled error that no correction falls below; None where none is proven."""
         A, G, C = self.shaped(shaping)
-        q, k = len(C), G.shape[1]
-        squared = predictor_bound(
-            A,
-            np.hstack([G, np.zeros((len(A), q))]),
-            C,
-            np.hstack([np.zeros((q, k)), np.diag(self.noise)]),
-            np.eye(len(self.A), len(A)),
-        )
+        (n, k), q = G.shape, len(C)
+        B, D = np.hstack([G, np.zeros((n, q))]), np.hstack([np.zeros((q, k)), np.diag(self.noise)])
+        squared = predictor_bound(A, B, C, D, np.eye(len(self.A), n))
         return None if squared is None else float(np.sqrt(squared))
 
     def correction(self, shaping: StateSpace) -> StateSpace:
@@ -259,7 +243,10 @@ class _Scaled:
         return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
-        """Root mean square of every state's scaled error, shape (n,); infinite where the error dynamics are unstable."""
+        """Root mean square of every state's scaled error, shape (n,).
+
+        Infinite where the error dynamics are unstable.
+        """
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
@@ -281,62 +268,23 @@ class _Scaled:
         return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
 
     def promise(self) -> float:
-        """Sum of logarithms of the hidden states' mean square errors under equal weights."""
-        equal = np.full(len(self.spectra), 1 / len(self.spectra))
-        return float(np.log(self.unit_errors(self.correction(self.filter(equal))).mean(axis=0)[self.hidden]).sum())
+        """Sum of logarithms of the hidden states' mean square errors on the spectra as measured."""
+        return float(np.log(self.unit_errors(self.correction(self.filter())).mean(axis=0)[self.hidden]).sum())
 
-    def worst_unit(self) -> tuple[Array, str]:
-        """Weights of the units for which the largest error of a unit is smallest."""
-
-        def errors(weights: Array) -> Array:
-            return self.unit_errors(self.correction(self.filter(weights)))[:, self.hidden]
-
-        equal = np.full(len(self.spectra), 1 / len(self.spectra))
-        start = errors(equal)
-        reference = start.mean(axis=0)
-        weights, cost = equal, np.mean(start / reference, axis=1)
-        first = best = float(cost.max())
-        chosen = weights
-        for _ in range(_ROUNDS):
-            mean = float(weights @ cost)
-            if cost.max() <= _CLOSE * mean:
-                break
-            weights = weights * (cost / mean)
-            weights = weights / weights.sum()
-            cost = np.mean(errors(weights) / reference, axis=1)
-            if cost.max() < best:
-                best, chosen = float(cost.max()), weights
-        gain = 100 * (1 - np.sqrt(best / first))
-        return (
-            chosen,
-            f"worst of {len(self.spectra)} units, whose predicted error is {gain:.1f} % below that under equal weights",
-        )
-
-    def reduced(
-        self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, max_order: int | None = None
-    ) -> StateSpace:
-        """The correction filter of lowest order within the tolerance, or of the highest one allowed."""
-        most = shaping.n_states if max_order is None else max_order
+    def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
+        """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""
         if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
-        weighted = loop.C / best[:, None]
-        P = gramian(shaping.A, shaping.B, self.dt)
-        Q = gramian(loop.A.T, weighted.T, self.dt)[-shaping.n_states :, -shaping.n_states :]
-        R, S = _root(P), _root(Q).T
-        U, h, Vh = np.linalg.svd(S @ R)
-        usable = int(np.sum(h > _NEGLIGIBLE * h[0]))
-        left, right = (U[:, :usable] / np.sqrt(h[:usable])).T @ S, R @ Vh[:usable].T / np.sqrt(h[:usable])
+        seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T, self.dt)[-shaping.n_states :]
+        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, _NEGLIGIBLE)
         allowed = (1 + tolerance_percent / 100) * best[self.hidden]
 
         def of_order(k: int) -> StateSpace:
-            return self.correction(
-                replace(
-                    shaping, A=left[:k] @ shaping.A @ right[:, :k], B=left[:k] @ shaping.B, C=shaping.C @ right[:, :k]
-                )
-            )
+            L, R = left[:k], right[:, :k]
+            return self.correction(replace(shaping, A=L @ shaping.A @ R, B=L @ shaping.B, C=shaping.C @ R))
 
-        low, high = -1, min(usable, most) + 1
+        low, high = -1, min(len(values), most) + 1
         while high - low > 1:
             k = (low + high) // 2
             trial = of_order(k)
@@ -344,9 +292,4 @@ class _Scaled:
                 K, high = trial, k
             else:
                 low = k
-        return K if K.n_states <= most else of_order(min(usable, most))
-
-
-def _root(matrix: Array) -> Array:
-    values, vectors = np.linalg.eigh(matrix)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+        return K if K.n_states <= most else of_order(min(len(values), most))

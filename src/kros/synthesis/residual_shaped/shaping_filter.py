@@ -4,15 +4,16 @@ The signal omega passes a basis of delays and first-order lags, ``z+ = A_z z + B
 
 .. math:: G = \frac{1}{2\pi} \int Z S Z^H \, d\theta, \qquad Z = (e^{j\theta} I - A_z)^{-1} B_z
 
-and is predicted from it by least squares, ``omega = Theta z + Sigma^(1/2) w``: with delays alone this is the vector autoregression of
-Yule and Walker, and lags lengthen its memory without many states. The model is ``z+ = (A_z + B_z Theta) z + B_z Sigma^(1/2) w``. Because the
-prediction error is orthogonal to z, ``G = (A_z + B_z Theta) G (...)' + B_z Sigma B_z'`` holds exactly, on a grid of frequencies too, so the
-filter is *always stable* and reproduces G. Everything is linear in the spectrum until the least squares: spectra of units may be weighted.
+and is predicted from it by least squares, ``omega = Theta z + Sigma^(1/2) w``: with delays alone this is the vector
+autoregression of Yule and Walker, and lags lengthen its memory without many states. The model is ``z+ = (A_z + B_z
+Theta) z + B_z Sigma^(1/2) w``. Because the prediction error is orthogonal to z, ``G = (A_z + B_z Theta) G (...)' + B_z
+Sigma B_z'`` holds exactly, on a grid of frequencies too, so the filter is *always stable* and reproduces G. Everything
+is linear in the spectrum until the least squares: spectra of units may be weighted.
 
 References
 ----------
-C. I. Byrnes, T. T. Georgiou and A. Lindquist, "A new approach to spectral estimation: a tunable high-resolution spectral estimator",
-IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
+C. I. Byrnes, T. T. Georgiou and A. Lindquist, "A new approach to spectral estimation: a tunable high-resolution
+spectral estimator", IEEE Transactions on Signal Processing 48 (2000) 3189-3205.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace
 
 Array = npt.NDArray[Any]
-_FLOOR = 1e-12  # white noise added to every channel, relative to the largest: a channel without residual keeps the Gramian regular
+_FLOOR = 1e-12  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 _PREDICTABLE = 1e-10
 
 
@@ -42,7 +43,8 @@ class Basis:
     def __post_init__(self) -> None:
         if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):
             raise DimensionError(
-                f"Shaping filter: needs delays of at least 0 and different poles inside the unit circle, found {self.delays} and {self.poles}."
+                "Shaping filter: needs delays of at least 0 and different poles inside the unit circle, found "
+                f"{self.delays} and {self.poles}."
             )
 
     @cached_property
@@ -87,14 +89,16 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     f, n = spectrum.shape[:2]
     if spectrum.shape != (f, n, n) or f < 2:
         raise DimensionError(
-            f"Shaping filter: the spectrum should have shape (f, n, n) with at least two frequencies, found {spectrum.shape}."
+            "Shaping filter: the spectrum should have shape (f, n, n) with at least two frequencies, found "
+            f"{spectrum.shape}."
         )
     weight = circle_weights(f)
     R = np.tensordot(weight, spectrum, 1).real
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):
         raise SynthesisError(
-            "Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open loop)."
+            "Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open "
+            "loop)."
         )
     R = R + _FLOOR * largest * np.eye(n)
     response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
@@ -109,7 +113,8 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
     if values.max() <= _PREDICTABLE * largest:
         raise SynthesisError(
-            f"Shaping filter: the residual can be predicted to {np.sqrt(max(values.max(), 0) / largest):.1g} of its size, it is constant or a few tones; "
+            f"Shaping filter: the residual can be predicted to {np.sqrt(max(values.max(), 0) / largest):.1g} of its "
+            "size, it is constant or a few tones; "
             "record longer or richer episodes."
         )
     root = vectors * np.sqrt(np.maximum(values, 0))

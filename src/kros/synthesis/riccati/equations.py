@@ -2,7 +2,8 @@
 
 Symbols
 -------
-X : stabilising solution of A' X A - X - (A' X B + S)(R + B' X B)^-1 (B' X A + S') + Q = 0 (discrete), or the continuous analogue
+X : stabilising solution of A' X A - X - (A' X B + S)(R + B' X B)^-1 (B' X A + S') + Q = 0 (discrete), or the continuous
+    analogue
 F : state feedback, u = F x;  F0 : feedforward of the disturbance, u = F x + F0 w (discrete full information)
 """
 
@@ -15,6 +16,7 @@ import numpy.typing as npt
 from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
+from ...core.lti import StateSpace
 
 Array = npt.NDArray[Any]
 
@@ -35,13 +37,15 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
         X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
     except (LinAlgError, ValueError) as error:
         raise SynthesisError(
-            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed ({error}); "
+            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed "
+            f"({error}); "
             "check stabilisability, detectability and scaling."
         ) from error
     X = (X + X.T) / 2
     if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
         raise SynthesisError(
-            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs and outputs to similar size."
+            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs "
+            "and outputs to similar size."
         )
     return X
 
@@ -52,7 +56,7 @@ def discrete_gain(A: Array, B: Array, R: Array, S: Array, X: Array) -> Array:
 
 
 def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> float:
-    """Relative size of the residual in the closed-loop (Joseph) form, which does not cancel; infinite when the loop is unstable."""
+    """Relative residual in the closed-loop (Joseph) form, which does not cancel; infinite for an unstable loop."""
     F = discrete_gain(A, B, R, S, X)
     closed = A + B @ F
     if np.abs(np.linalg.eigvals(closed)).max() >= 1:
@@ -64,7 +68,10 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
-    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, only additions of semidefinite matrices."""
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004).
+
+    Quadratic convergence, only additions of semidefinite matrices.
+    """
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS
@@ -84,3 +91,16 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
     except np.linalg.LinAlgError:
         return None
     return None
+
+
+def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
+    """Turn a controller for ``y - D22 u`` into one for ``y``."""
+    if not np.any(D22):
+        return K
+    loop = np.eye(K.n_outputs) + K.D @ D22
+    if np.linalg.cond(loop) > 1e12:
+        raise SynthesisError(
+            "Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22."
+        )
+    C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
+    return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)

@@ -3,14 +3,16 @@ r"""Errors that no predictor beats, proven without the Riccati equation: any sol
 For ``x+ = A x + B nu``, ``y = C x + D nu`` with white ``nu`` of unit covariance, every symmetric P with
 
 .. math:: M(P) = \begin{bmatrix} A \\ C \end{bmatrix} P \begin{bmatrix} A \\ C \end{bmatrix}^T
-          + \begin{bmatrix} B \\ D \end{bmatrix} \begin{bmatrix} B \\ D \end{bmatrix}^T - \begin{bmatrix} P & 0 \\ 0 & 0 \end{bmatrix} \succeq 0
+          + \begin{bmatrix} B \\ D \end{bmatrix} \begin{bmatrix} B \\ D \end{bmatrix}^T
+          - \begin{bmatrix} P & 0 \\ 0 & 0 \end{bmatrix} \succeq 0
 
-lies below the error covariance of every one-step predictor: the step of the optimal filter is monotone and does not take P below itself, and
-a stable error forgets where it began. So ``tr(Z P Z^T)`` bounds the power of ``Z (x - x_hat)`` from below, whatever P was made from.
+lies below the error covariance of every one-step predictor: the step of the optimal filter is monotone and does not
+take P below itself, and a stable error forgets where it began. So ``tr(Z P Z^T)`` bounds the power of ``Z (x - x_hat)``
+from below, whatever P was made from.
 
-P is made from a Riccati solution, moved down by what rounding may do to the inequality, carried through the closed loop by a Lyapunov equation. That
-the inequality holds is read from the eigenvalues of M(P) less a bound of every rounding error, in states of similar size (scaled by powers of
-two, which is exact).
+P is made from a Riccati solution, moved down by what rounding may do to the inequality, carried through the closed loop
+by a Lyapunov equation. That the inequality holds is read from the eigenvalues of M(P) less a bound of every rounding
+error, in states of similar size (scaled by powers of two, which is exact).
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.norms import gramian
-from .constant_gain import predictor
+from .kalman import predictor
 
 Array = npt.NDArray[Any]
 
@@ -31,7 +33,10 @@ _FIRST, _GROWTH, _TRIES = 4.0, 16.0, 12
 
 
 def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float | None:
-    """Return a squared error ``E |Z (x - x_hat)|^2`` that no one-step predictor beats; None where none above zero could be proven."""
+    """Return a squared error ``E |Z (x - x_hat)|^2`` that no one-step predictor beats.
+
+    None where none above zero could be proven.
+    """
     n = len(A)
     if not n or not Z.any():
         return None

@@ -1,16 +1,20 @@
-r"""What a rational system can do between frequencies: enclosures on arcs of the unit circle, and a ratio proven on all of them.
+r"""Enclosures of a rational system on arcs of the unit circle, and a ratio proven on all of them.
 
-Around the middle ``z_0`` of an arc, with ``R_0 = (z_0 I - A)^{-1}`` and ``h >= |z - z_0|``, the Neumann series of the resolvent gives for every row
+Around the middle ``z_0`` of an arc, with ``R_0 = (z_0 I - A)^{-1}`` and ``h >= |z - z_0|``, the Neumann series of the
+resolvent gives for every row
 
 .. math:: \|c_i^T (R - R_0) B\| \le h \|c_i^T R_0^2 B\| + h^2 \frac{\|c_i^T R_0^2\| \|R_0 B\|}{1 - h \|R_0\|},
           \qquad h \|R_0\| < 1.
 
-One term more is a straight line in z, from which the arc itself departs by ``h^2 / 2`` at most: what is left is of second order,
+One term more is a straight line in z, from which the arc itself departs by ``h^2 / 2`` at most: what is left is of
+second order,
 
-.. math:: \|c_i^T (R - R_0 + (z - z_0) R_0^2) b_j\| \le h^2 |c_i^T R_0^3 b_j| + h^3 \frac{\|c_i^T R_0^2\| \|R_0^2 b_j\|}{1 - h \|R_0\|} .
+.. math:: \|c_i^T (R - R_0 + (z - z_0) R_0^2) b_j\| \le h^2 |c_i^T R_0^3 b_j|
+          + h^3 \frac{\|c_i^T R_0^2\| \|R_0^2 b_j\|}{1 - h \|R_0\|} .
 
-It holds in all coordinates of the state; those in which white noise gives every state the same size and no correlation keep ``R_0`` small.
-Arcs on which the enclosure is not good enough are halved: no frequency is left out, and no decision is made at a point.
+It holds in all coordinates of the state; those in which white noise gives every state the same size and no correlation
+keep ``R_0`` small. Arcs on which the enclosure is not good enough are halved: no frequency is left out, and no decision
+is made at a point.
 
 Symbols
 -------
@@ -49,7 +53,7 @@ class Enclosure:
         self._B, self._C = np.linalg.solve(T, system.B), system.C @ T
 
     def __call__(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Return the response in the middle, (k, p, m), and the distance of every row from it on the arc, (k, p); infinite where the series ends."""
+        """Return the response in the middle, (k, p, m), and the distance of every row from it on the arc, (k, p)."""
         R = self._resolvent(theta)
         CR, RB = self._C @ R, R @ self._B
         response = CR @ self._B + self.system.D
@@ -66,7 +70,7 @@ class Enclosure:
         return response, np.where(reach < 1, distance, np.inf)
 
     def segments(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Return two ends, (k, 2, p, m), and how far every entry is on the arc from the segment between them, (k, p, m); infinite where the series ends."""
+        """Return two ends, (k, 2, p, m), and how far every entry is from the segment between them, (k, p, m)."""
         R = self._resolvent(theta)
         CR, RB = self._C @ R, R @ self._B
         middle, slope = CR @ self._B + self.system.D, -CR @ RB

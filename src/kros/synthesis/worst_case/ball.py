@@ -1,33 +1,33 @@
 r"""The uncertain set per frequency: a matrix ball, its worst element and its average.
 
-Derivation. With ``N = W_R W_L`` and ``||N|| < 1``, let ``X = Delta (I - N Delta)^-1``, so that ``Delta = (I + X N)^-1 X`` and
+Derivation. With ``N = W_R W_L`` and ``||N|| < 1``, let ``X = Delta (I - N Delta)^-1``, so that ``Delta = (I + X N)^-1
+X`` and
 
     ||Delta|| <= 1  <=>  X^H X <= (I + N X)^H (I + N X)  <=>  X^H Q X - X^H N^H - N X <= I,     Q = I - N^H N > 0.
 
-Completing the square with ``X_c = Q^-1 N^H = N^H (I - N N^H)^-1`` gives ``(X - X_c)^H Q (X - X_c) <= I + N Q^-1 N^H = (I - N N^H)^-1``:
+Completing the square with ``X_c = Q^-1 N^H = N^H (I - N N^H)^-1`` gives ``(X - X_c)^H Q (X - X_c) <= I + N Q^-1 N^H =
+(I - N N^H)^-1``:
 
     { Delta (I - N Delta)^-1 : ||Delta|| <= 1 } = { X_c + R_l Theta R_r : ||Theta|| <= 1 },
     R_l = (I - N^H N)^(-1/2),   R_r = (I - N N^H)^(-1/2).
 
-*Upper bound.* For a row block T and a column block M, ``||T X M||_F <= ||T X_c M||_F + ||T R_l Theta R_r M||_F``. By von Neumann's trace
-inequality ``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^2 s_i(Theta Q)^2 <= sum_i s_i(P)^2 s_i(Q)^2``, hence
+*Upper bound.* `dual_bound`. Where the ball is around zero, von Neumann's trace inequality gives the maximum itself,
+``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^2 s_i(Q)^2`` (`spread`).
 
-    ||T X M||_F <= ||T X_c M||_F + (sum_i s_i(T R_l)^2 s_i(R_r M)^2)^(1/2).
+Without a loop (``N = 0``) the set is the unit ball itself and the bound is attained; the same formulas hold whatever N
+is made of, for example ``W_R G W_L``.
 
-The smaller of this and the dual bound of `dual_bound` is used.
-
-Without a loop (``N = 0``) the set is the unit ball itself and the bound is attained; the same formulas hold whatever N is made of, for
-example ``W_R G W_L``.
-
-*Lower bound.* The worst case is at least any average over the set. Theta uniform on the matrices (b, a) with orthonormal columns or rows has
+*Lower bound.* The worst case is at least any average over the set. Theta uniform on the matrices (b, a) with
+orthonormal columns or rows has
 mean zero and ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / max(a, b)``, so for every T
 
     max_X ||T X M||_F^2 >= tr T (X_c M M^H X_c^H + R_l R_l^H ||R_r M||_F^2 / max(a, b)) T^H.
 
-If N and M are diagonal the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and without a loop not
-under ``X -> V X``; averaging over V removes the off-diagonal entries of ``X M M^H X^H``. So in both cases *the diagonal of the spectrum of any
-element* gives a lower bound as well, and because the observer's error is linear in the spectrum, so does every convex combination of such
-spectra. Elsewhere the largest diagonal spectrum below the average's is used.
+If N and M are diagonal the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and
+without a loop not under ``X -> V X``; averaging over V removes the off-diagonal entries of ``X M M^H X^H``. So in both
+cases *the diagonal of the spectrum of any element* gives a lower bound as well, and because the observer's error is
+linear in the spectrum, so does every convex combination of such spectra. Elsewhere the largest diagonal spectrum below
+the average's is used.
 
 Symbols
 -------
@@ -43,6 +43,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
+from ..problem.observer_problem import ObserverProblem
 from .dual_bound import dual_bound
 
 Array = npt.NDArray[Any]
@@ -58,7 +59,7 @@ class Ball:
 
     @classmethod
     def of(cls, N: Array, M: Array) -> Ball:
-        """Build the ball of ``Delta (I - N Delta)^-1 M`` from the loop N, shape (f, a, b), and the right factor M, shape (f, a, m)."""
+        """Build the ball of ``Delta (I - N Delta)^-1 M`` from N, shape (f, a, b), and M, shape (f, a, m)."""
         U, s, Vh = np.linalg.svd(N)
         k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
@@ -72,20 +73,16 @@ class Ball:
         return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
 
     def bound(self, T: Array) -> Array:
-        """Upper bound of ``||T X M||_F`` over the set, shape (f,)."""
-        inner, outer = T @ self.center, T @ self.left
-        simple = np.linalg.norm(inner, axis=(-2, -1)) + spread(outer, self.right)
-        return np.minimum(simple, dual_bound(inner, outer, self.right))
+        """Upper bound of ``||T X M||_F`` over the set, shape (f,).
+
+        The root of the H2 density that no member exceeds.
+        """
+        return dual_bound(T @ self.center, T @ self.left, self.right)
 
     def average(self) -> Array:
         """Average spectrum, shape (f, b, b)."""
         energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
         return self.center @ adjoint(self.center) + energy[..., None, None] * (self.left @ adjoint(self.left))
-
-    def symmetric_part(self) -> Array:
-        """``q^2 R_l R_l^H`` with ``q = ||R_r M||``: what the ball holds on both sides of its centre, shape (f, b, b)."""
-        q = np.linalg.norm(self.right, 2, axis=(-2, -1))
-        return q[:, None, None] ** 2 * (self.left @ adjoint(self.left))
 
     def spectrum(self, theta: Array) -> Array:
         """Diagonal of the spectrum of the element of a contraction (f, b, a), shape (f, b)."""
@@ -115,6 +112,17 @@ class Ball:
                     )
                 theta = polar(adjoint(P) @ error @ adjoint(self.right))
         return best
+
+
+def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
+    """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
+    N = None if problem.N is None else problem.N.frequency_response(freqs_hz)
+    return ball_of(N, problem.M.frequency_response(freqs_hz), problem.W_L.n_inputs)
+
+
+def ball_of(N: Array | None, M: Array, b: int) -> Ball:
+    """Return the ball of ``Delta (I - N Delta)^-1 M`` for Delta with b rows; N is None where there is no loop."""
+    return Ball.without_loop(M, b) if N is None else Ball.of(N, M)
 
 
 def spread(P: Array, Q: Array) -> Array:

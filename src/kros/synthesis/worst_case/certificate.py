@@ -1,12 +1,11 @@
 r"""Certified worst-case H2 norm of an observer, for any correction filter, however it was found.
 
 .. math::
-    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta,
-    \qquad b_\Delta = \|T X_c M\|_F + \Big(\sum_i \sigma_i(T R_l)^2 \sigma_i(R_r M)^2\Big)^{1/2}
+    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta
 
-or the sharper dual bound of `dual_bound`, whichever is smaller. ``b_r`` bounds the additive remainder in the same way (a ball around zero);
-it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is any
-frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
+``b_Delta`` bounds ``||T X M||_F`` over the matrix ball (`ball`), ``b_r`` the additive remainder, a ball around zero; it
+adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is
+any frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
 """
 
 from __future__ import annotations
@@ -18,9 +17,10 @@ import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
+from ...core.norms import h2_norm
 from ..problem.observer_problem import ObserverProblem
-from .ball import spread
-from .disturbance import uncertain_ball
+from ..result import Status, Synthesis
+from .ball import spread, uncertain_ball
 from .quadrature import circle_mean
 
 Array = npt.NDArray[Any]
@@ -46,7 +46,8 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
     loop = problem.error_system(controller)
     if not loop.is_stable():
         raise SynthesisError(
-            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no bound is finite."
+            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no "
+            "bound is finite."
         )
     dt = problem.nominal.dt
     squared, error = circle_mean(
@@ -54,6 +55,26 @@ def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5
     )
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
+
+
+def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:
+    """Return a controller in physical units with its certificate.
+
+    ``h2_norm`` is that of measurement and process noise alone.
+    """
+    value, error = certify(problem, controller, rtol)
+    loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
+    return Synthesis(
+        method=method,
+        controller=controller,
+        status=Status.CERTIFIED,
+        injection=problem.injection,
+        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, white:], loop.C, loop.D[:, white:], loop.dt)),
+        worst_case_h2=value,
+        quadrature_error=error,
+        spectral_radius=loop.largest_pole(),
+        solver="riccati",
+    )
 
 
 def _log_poles(problem: ObserverProblem, loop: StateSpace) -> Array:

@@ -2,14 +2,16 @@ r"""Sharper bound of the worst element of the matrix ball: a Lagrangian dual wit
 
 With singular value decompositions ``P = U diag(s) V^H``, ``Q = G diag(q) H^H`` and ``Theta' = V^H Theta G``,
 
-    ||a + P Theta Q||_F^2 = ||a||_F^2 + sum_ij s_i^2 q_j^2 |Theta'_ij|^2 + 2 Re sum_ij conj(c_ij) Theta'_ij,    c_ij = s_i q_j (U^H a H)_ij.
+    ||a + P Theta Q||_F^2 = ||a||_F^2 + sum_ij s_i^2 q_j^2 |Theta'_ij|^2 + 2 Re sum_ij conj(c_ij) Theta'_ij,
+    c_ij = s_i q_j (U^H a H)_ij.
 
-A contraction has rows and columns of norm at most one. Giving them multipliers g_i, l_j >= 0 with ``g_i + l_j >= s_i^2 q_j^2`` and completing
-the square, every element of the ball obeys
+A contraction has rows and columns of norm at most one. Giving them multipliers g_i, l_j >= 0 with ``g_i + l_j >= s_i^2
+q_j^2`` and completing the square, every element of the ball obeys
 
     ||a + P Theta Q||_F^2 <= ||a||_F^2 + sum_i g_i + sum_j l_j + sum_ij |c_ij|^2 / (g_i + l_j - s_i^2 q_j^2).
 
-*Any* feasible multipliers give a valid bound; coordinate descent only makes it good. For ``a = 0`` it is ``sum s_i^2 q_i^2``, for scalars
+*Any* feasible multipliers give a valid bound; coordinate descent only makes it good. For ``a = 0`` it is
+``sum s_i^2 q_i^2``, for scalars
 ``(|a| + s q)^2``: both exact.
 
 Symbols
@@ -60,7 +62,10 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
 
 
 def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array, Array]:
-    """Return better multipliers of rows and columns, by turns; with frequencies last, where sums over few entries are those of long vectors."""
+    """Return better multipliers of rows and columns, by turns.
+
+    With frequencies last, where sums over few entries are those of long vectors.
+    """
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)

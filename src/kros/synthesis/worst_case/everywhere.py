@@ -1,14 +1,16 @@
 r"""Filters whose power lies below that of the uncertain set at every frequency, between those of any grid too.
 
-Let a distribution of perturbations be given for the middle ``z_0`` of an arc: the average over the ball, elements that are worst for an observer,
-or a mixture. Every one of them stays in the set when frequency changes, and with ``nu = ||N(z_0)||``
+Let a distribution of perturbations be given for the middle ``z_0`` of an arc: the average over the ball, elements that
+are worst for an observer, or a mixture. Every one of them stays in the set when frequency changes, and with ``nu =
+||N(z_0)||``
 
-.. math:: \|X(z) - X(z_0)\|_F \le \delta = \frac{1}{1 - \nu}\Big(\epsilon_M + \epsilon_N \frac{\|M\|_F + \epsilon_M}{1 - \nu - \epsilon_N}\Big),
+.. math:: \|X(z) - X(z_0)\|_F \le \delta
+          = \frac{1}{1 - \nu}\Big(\epsilon_M + \epsilon_N \frac{\|M\|_F + \epsilon_M}{1 - \nu - \epsilon_N}\Big),
           \qquad X = \Delta (I - N \Delta)^{-1} M,
 
-where ``epsilon`` are the distances on the arc from `arcs`. Root mean squares over the distribution obey the triangle inequality, so the power of
-every channel is at least ``(sqrt(phi_i(z_0)) - delta)^2`` on the arc, for a distribution that may differ from arc to arc. Each filter
-is scaled by the least ratio of the two.
+where ``epsilon`` are the distances on the arc from `arcs`. Root mean squares over the distribution obey the triangle
+inequality, so the power of every channel is at least ``(sqrt(phi_i(z_0)) - delta)^2`` on the arc, for a distribution
+that may differ from arc to arc. Each filter is scaled by the least ratio of the two.
 
 Symbols
 -------
@@ -27,7 +29,7 @@ import numpy.typing as npt
 from ...core.linalg import adjoint
 from ...core.lti import StateSpace
 from .arcs import Enclosure, least_ratio
-from .ball import below
+from .ball import ball_of, below
 from .disturbance import Channels, Shaping, Spectrum, is_diagonal
 
 Array = npt.NDArray[Any]
@@ -58,10 +60,6 @@ class Everywhere:
         remainder = None if shaping.remainder is None else self._lowered(shaping.remainder, self.remaining)
         return Shaping(self._lowered(shaping.filters, partial(self.disturbance, spectrum)), shaping.behind, remainder)
 
-    def lowered_to_symmetric_part(self, shaping: Shaping) -> Shaping:
-        """Scale every filter until its power is nowhere above what the ball holds on both sides of its centre."""
-        return Shaping(self._lowered(shaping.filters, self.symmetric_part), shaping.behind, None)
-
     def _lowered(self, filters: StateSpace, size: Size) -> StateSpace:
         enclosed = Enclosure(filters)
 
@@ -88,24 +86,10 @@ class Everywhere:
             with np.errstate(invalid="ignore"):
                 distance = (distance + far * (size_M + distance) / np.maximum(room, 1e-300)) / (1 - nu)
             distance = np.where(room > 0, distance, np.inf)
-        root = np.sqrt(spectrum.power(self.channels.ball_of(N, M), self.channels.nearest(theta)))
-        if spectrum.sharp:
+        root = np.sqrt(spectrum.power(ball_of(N, M, self.channels.problem.W_L.n_inputs), self.channels.nearest(theta)))
+        if not spectrum.correlated:
             return np.maximum(root - distance[:, None], 0.0), root
-        return root * _kept(root, distance), root  # the whole matrix counts, not its diagonal alone
-
-    def symmetric_part(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Magnitude of every component of w2 for filters below ``||R_r M|| R_l``, (k, b)."""
-        M, reach_M = self.M(theta, half)
-        N, far, nu = None, np.zeros(len(theta)), np.zeros(len(theta))
-        if self.N is not None:
-            N, reach_N = self.N(theta, half)
-            far, nu = np.linalg.norm(reach_N, axis=-1), np.linalg.norm(N, 2, axis=(-2, -1))
-        ball, slack = self.channels.ball_of(N, M), 1 - nu**2
-        root, q = np.sqrt(below(ball.symmetric_part())), np.linalg.norm(ball.right, 2, axis=(-2, -1))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            lost = np.linalg.norm(reach_M, axis=-1) / (np.sqrt(slack) * q)
-            kept = np.where(lost < 1, (1 - lost) / (1 + far * (2 * nu + far) / slack), 0.0)
-        return root * kept[:, None], root
+        return root * _share_left(root, distance), root  # the whole matrix counts, not its diagonal alone
 
     def remaining(self, theta: Array, half: Array) -> tuple[Array, Array]:
         """Magnitude of every channel of the remainder, (k, n)."""
@@ -118,12 +102,15 @@ class Everywhere:
             least_L = np.maximum(size_L - reach_L, 0.0)
         else:
             size_L = np.sqrt(below(L @ adjoint(L)))
-            least_L = size_L * _kept(size_L, np.linalg.norm(reach_L, axis=-1))
+            least_L = size_L * _share_left(size_L, np.linalg.norm(reach_L, axis=-1))
         return share * np.maximum(size_Q - far_Q, 0.0)[:, None] * least_L, share * size_Q[:, None] * size_L
 
 
-def _kept(root: Array, distance: Array) -> Array:
-    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance: ``1 - distance / min_i root_i``."""
+def _share_left(root: Array, distance: Array) -> Array:
+    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance.
+
+    ``1 - distance / min_i root_i``.
+    """
     least = root.min(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(least > distance, 1 - distance / least, 0.0)[:, None]

@@ -1,11 +1,13 @@
-r"""Does the certificate hold for the units it was made from? Their errors, computed from their models, against the bounds.
+r"""Does the certificate hold for the units it was made from? Errors of their models against the bounds.
 
 For the model of every unit, without noise,
 
-.. math:: e = S\,(G_p - G)\,W_u w_1: \qquad x_p^+ = A_p x_p + B_p s, \quad e^+ = A e + (A_p - A)\,x_p + (B_p - B)\,s - J u, \quad u = K C e
+.. math:: e = S\,(G_p - G)\,W_u w_1: \qquad x_p^+ = A_p x_p + B_p s, \quad
+          e^+ = A e + (A_p - A)\,x_p + (B_p - B)\,s - J u, \quad u = K C e
 
-so that no difference of large responses is formed. The residuals that the weights cover are pseudo-inverses where a plant has more outputs than
-inputs; what these leave out belongs to the additive remainder, and this check sees both: nothing here knows of forms, weights or balls.
+so that no difference of large responses is formed. The residuals that the weights cover are pseudo-inverses where a
+plant has more outputs than inputs; what these leave out belongs to the additive remainder, and this check sees both:
+nothing here knows of forms, weights or balls.
 
 Symbols
 -------
@@ -42,8 +44,8 @@ class UnitCheck:
     h2_norm : ndarray, shape (unit,)
         Norm of ``W_p S (Gp - G) W_u``.
     density_ratio : ndarray, shape (unit,)
-        Largest ratio, over a grid of frequencies, of the unit's root power density to the bound's, both without noise: the sharpest test, since
-        norms may hide a frequency.
+        Largest ratio, over a grid of frequencies, of the unit's root power density to the bound's, both without noise:
+        the sharpest test, since norms may hide a frequency.
     worst_case_h2 : float
         The certified bound, noise included.
 
@@ -109,7 +111,8 @@ def check_units(
     >>> from kros.synthesis import ObserverProblem, check_units
     >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
     >>> problem = ObserverProblem(lag, [[1.0]], gain([[0.1]], 0.01), gain([[1.0]], 0.01), [1.0], [1.0], [0.1])
-    >>> units = StateSpace(np.full((2, 1, 1), 0.5), np.array([[[0.98]], [[1.02]]]), np.ones((2, 1, 1)), np.zeros((2, 1, 1)), 0.01)
+    >>> A, B, C = np.full((2, 1, 1), 0.5), np.array([[[0.98]], [[1.02]]]), np.ones((2, 1, 1))
+    >>> units = StateSpace(A, B, C, 0 * C, 0.01)
     >>> check_units(problem, gain([[0.2]], 0.01), units).holds
     True
     """

@@ -1,134 +1,162 @@
 r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati equation.
 
-K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a given spectrum is a
-Kalman predictor (state injection) or an H2 controller (input injection). The game between K and the spectrum is solved by fictitious play:
-start from the average spectrum of the set, find the spectrum that is worst for the resulting K, then for the next, and average these. Every
-iterate is certified independently and the best is kept, no correction and filters of lower orders among them (`search`). The last averaged spectrum
-gives the lower bound.
+K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a
+given spectrum is a Kalman predictor (state injection) or an H2 controller (input injection). The observer is designed
+for the average spectrum of the set and certified on the set itself; where it guarantees less than no correction,
+nothing is corrected.
 
-The filters themselves are in `shaped_filter`; that a lower bound holds, in `everywhere` and `riccati.filter_bound`.
+*State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
+the shaped disturbance of the state, the error is ``e = xi + r``, ``xi+ = A xi + B d - y^c``, ``y = C e + n``. The
+correction has full authority over the state, so the optimum keeps the predicted error at zero:
+
+    y^c = B C_d x_d^ + (C_r A_r - A C_r) x_r^ + (L_xi + C_r L_r) y,
+    x_d^+ = A_d x_d^ + L_d y,    x_r^+ = A_r x_r^ + L_r y
+
+with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters
+only. A performance weight with states of its own makes past errors matter, which a predictor cannot mend: then, as for
+input injection, the H2 controller of the whole plant is taken.
+
+*Lower bound.* The same model, driven by filters that lie below the spectrum of the average over the set, or of its
+worst element, at all frequencies
+(`everywhere`), gives an error that no observer beats: state injection contains input injection (``K_state = B
+K_input``), and an observer's ``W_p x_hat`` is one of the causal estimates of ``W_p x`` over which a predictor is the
+best. It is proven by `riccati.filter_bound`.
 """
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import numpy as np
+
 from ...core.errors import SynthesisError
-from ...core.lti import StateSpace
-from ...core.norms import h2_norm
+from ...core.lti import StateSpace, gain
 from ..problem.observer_problem import ObserverProblem
-from ..result import Status, Synthesis, enclosed
-from .disturbance import Channels, Fit, Shaping, default_fit, design_grid, symmetric
-from .search import Search
-from .shaped_filter import design
+from ..problem.plants import penalise, shaped_plant
+from ..result import Injection, Status, Synthesis, enclosed
+from ..riccati.filter_bound import predictor_bound
+from ..riccati.h2 import h2
+from ..riccati.kalman import predictor
+from .certificate import certified
+from .disturbance import Channels, Fit, Shaping, design_grid, symmetric
+from .everywhere import Everywhere
+
+_BOUND_ORDERS = (1, 2)  # of filters in lower bounds: W_L is behind them as it is, and what is left is smooth
 
 
 def worst_case_h2(
-    problem: ObserverProblem,
-    *,
-    order: int | None = None,
-    max_order: int = 4,
-    tolerance_db: float = 1.0,
-    refinements: int = 1,
-    rtol: float = 1e-5,
-    fit: Fit | None = None,
-    bounded: bool = True,
+    problem: ObserverProblem, *, max_order: int = 4, tolerance_db: float = 1.0, fit: Any = None, bounded: bool = True
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
 
     Parameters
     ----------
     problem : ObserverProblem
-    order : int, optional
-        Order of each shaping filter; default the smallest within `tolerance_db`, up to `max_order`, and lower ones where those do better.
     max_order : int
-    tolerance_db : float
+        Highest order of each shaping filter; the smallest within `tolerance_db` is taken.
+    tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
-    refinements : int
-        Rounds of fictitious play after the first design.
-    rtol : float
-        Accuracy of the certificate's quadrature.
     fit : callable, optional
-        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter; default
-        `kros.uncertainty.fit_magnitude`.
+        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
+        default `kros.uncertainty.fit_magnitude`.
     bounded : bool
-        False: only the first design, neither certified nor bounded from below, for those who design many and compare them on recordings.
+        False: only the design, neither certified nor bounded from below, for those who design many and compare them on
+        recordings.
 
     Returns
     -------
     Synthesis
-        ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and their gap; ``h2_norm``
-        is the norm of the error under measurement and process noise alone (the nominal machine).
+        ``worst_case_h2`` with ``quadrature_error`` included, ``lower_bound`` for all observers of either injection, and
+        their gap; ``h2_norm`` is the norm of the error under measurement and process noise alone (the nominal machine).
 
     Raises
     ------
     SynthesisError
-        When the set is not well posed, the pair undetectable, a model unstable, or a design does not survive verification.
+        When the set is not well posed, the pair undetectable, a model unstable, or the design does not survive
+        verification.
 
     Examples
     --------
     >>> from kros.core import StateSpace, gain
     >>> from kros.synthesis import ObserverProblem, worst_case_h2
-    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
-    >>> problem = ObserverProblem(lag, [[1.0]], gain([[0.1]], 0.01), gain([[1.0]], 0.01), [1.0], [1.0], [0.1])
-    >>> found = worst_case_h2(problem, max_order=1)
-    >>> found.lower_bound <= found.worst_case_h2, found.gap_percent < 5
+    >>> lag, W_L, W_R = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), gain([[0.1]], 0.01), gain([[1.0]], 0.01)
+    >>> problem = ObserverProblem(lag, [[1.0]], W_L, W_R, [1.0], [1.0], [0.1])
+    >>> observer = worst_case_h2(problem, max_order=1)
+    >>> observer.lower_bound <= observer.worst_case_h2, observer.gap_percent < 5
     (True, True)
     """
     problem.require_sound()
-    fit = fit or default_fit()
-    options = {"order": order, "max_order": max_order, "tolerance_db": tolerance_db}
+    if fit is None:
+        from ...uncertainty.weights.magnitude import fit_magnitude
+
+        fit = fit_magnitude
     channels = Channels(problem, design_grid(problem))
-    spectrum = channels.average()
-    if not bounded:
-        return _design_alone(problem, channels.shaping(spectrum, fit, "above", options))
-    search = Search(channels, fit, options, rtol)
-    search.first(spectrum)
-    for round_ in range(1, refinements + 1):
-        spectrum = spectrum.mixed_with(*channels.worst(search.best.controller), 1 / round_)
-        search.again(spectrum)
-    if not symmetric(problem):
-        return _result(problem, search, search.bound(channels.below_average()))
-    worst = channels.worst(search.best.controller)
-    return _result(problem, search, search.bound(spectrum.mixed_with(*worst, 1 / (refinements + 1))))
-
-
-def _design_alone(problem: ObserverProblem, shaping: Shaping) -> Synthesis:
+    order = {"order": None, "max_order": max_order, "tolerance_db": tolerance_db}
+    shaping = channels.shaping(channels.average(), partial(fit, **order), "above")
+    start = time.perf_counter()
     controller = design(problem, shaping)
-    radius = float(problem.error_system(controller).spectral_radius())
+    elapsed = time.perf_counter() - start
+    if not bounded:
+        return _design_alone(problem, controller)
+    nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
+    candidates = [certified(problem, K, "worst_case_h2") for K in (nothing, controller)]
+    best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
+    bounds = lower_bounds(channels, best.controller, fit, max_order)
+    lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, max(bounds, default=None))
+    note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
+    return replace(best, lower_bound=lower, gap_percent=gap, solve_s=elapsed, notes=(note, *notes))
+
+
+def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis:
+    radius = problem.error_system(controller).largest_pole()
     if radius >= 1:
         raise SynthesisError(
-            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of the weights."
+            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of "
+            "the weights."
         )
-    notes = ("A design alone, without certificate.",)
-    return Synthesis(
-        "worst_case_h2",
-        controller,
-        Status.INACCURATE,
-        problem.injection,
-        spectral_radius=radius,
-        solver="riccati",
-        notes=notes,
-    )
-
-
-def _result(problem: ObserverProblem, search: Search, lower: float | None) -> Synthesis:
-    best, loop = search.best, problem.error_system(search.best.controller)
-    n_d = problem.nominal.n_inputs + problem.nominal.n_states
-    lower, gap, notes = enclosed(best.value, lower)
     return Synthesis(
         method="worst_case_h2",
-        controller=best.controller,
-        status=Status.CERTIFIED,
+        controller=controller,
+        status=Status.INACCURATE,
         injection=problem.injection,
-        h2_norm=h2_norm(StateSpace(loop.A, loop.B[:, n_d:], loop.C, loop.D[:, n_d:], loop.dt)),
-        worst_case_h2=best.value,
-        lower_bound=lower,
-        gap_percent=gap,
-        quadrature_error=best.error,
-        spectral_radius=float(loop.spectral_radius()),
-        solve_s=search.elapsed / search.designs,
+        spectral_radius=radius,
         solver="riccati",
-        notes=(
-            "The spectral radius is that of the nominal loop; it says nothing about robustness. The certificate is worst_case_h2.",
-            *notes,
-        ),
+        notes=("A design alone, without certificate.",),
     )
+
+
+def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
+    """Return the filter that is H2-optimal for the shaped disturbances, in physical units."""
+    d, r = shaping.at_input_and_state(problem)
+    plant = shaped_plant(problem, d, r)
+    if problem.injection is Injection.INPUT or problem.performance.n_states:
+        return problem.to_physical(h2(penalise(plant, problem.correction_penalty)).controller)
+    A, B, _, _ = problem.scaled
+    n, kd, kr = len(A), d.n_states, r.n_states
+    noises = plant.B1 @ plant.B1.T, plant.D21 @ plant.D21.T, plant.B1 @ plant.D21.T
+    L, _ = predictor(plant.A, plant.C2, *noises, "Worst-case H2 synthesis")
+    L_xi, L_d, L_r = L[:n], L[n : n + kd], L[n + kd :]
+    dynamics = np.block([[d.A, np.zeros((kd, kr))], [np.zeros((kr, kd)), r.A]])
+    output = np.hstack([B @ d.C, r.C @ r.A - A @ r.C])
+    return problem.to_physical(StateSpace(dynamics, np.vstack([L_d, L_r]), output, L_xi + r.C @ L_r, d.dt))
+
+
+def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order: int) -> list[float]:
+    """Worst-case H2 norms that no observer of either injection beats.
+
+    Of the average over the set, and of its worst element for one observer.
+    """
+    apart = Channels(channels.problem, channels.freqs_hz, apart=True)
+    proofs, even = Everywhere(apart), symmetric(channels.problem)
+    spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
+    bounds = []
+    for order in sorted({min(order, max_order) for order in _BOUND_ORDERS}):
+        for spectrum in spectra:
+            shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, order=order), "below"), spectrum)
+            plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
+            squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
+            bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))
+    return [bound for bound in bounds if bound > 0]

@@ -2,7 +2,8 @@
 
 Symbols
 -------
-Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n, q)
+Q, R : process and measurement noise covariance;  P : covariance of the one-step prediction error;  L : gain, shape (n,
+    q)
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
-from ..assumptions import unreachable_modes
+from ..assumptions import require_detectable
 from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
 
@@ -42,14 +43,16 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     Returns
     -------
     Synthesis
-        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's covariance.
+        ``controller.D`` is the gain L, shape (n, q); ``h2_norm`` is the root of the trace of the prediction error's
+        covariance.
 
     Raises
     ------
     DimensionError
         When sizes do not fit.
     SynthesisError
-        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is named).
+        When R is not positive definite, Q not positive semidefinite, or the pair (A, C) undetectable (the mode is
+        named).
 
     Examples
     --------
@@ -62,18 +65,21 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     n, q = A.shape[0], C.shape[0]
     if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
         raise DimensionError(
-            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, {R.shape}."
+            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, "
+            f"{R.shape}."
         )
     if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
         raise SynthesisError(
-            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs some noise."
+            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs "
+            "some noise."
         )
     lowest = np.linalg.eigvalsh((Q + Q.T) / 2)
     if lowest.min() < -1e-12 * max(lowest.max(), 1e-300):
         raise SynthesisError(
-            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be positive semidefinite."
+            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be "
+            "positive semidefinite."
         )
-    require_detectable(A, C, "Kalman predictor")
+    require_detectable(A, C, dt, "Kalman predictor")
     start = time.perf_counter()
     L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
     elapsed = time.perf_counter() - start
@@ -81,7 +87,8 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
     if radius >= 1:
         raise SynthesisError(
-            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes on the unit circle."
+            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes "
+            "on the unit circle."
         )
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
@@ -102,12 +109,3 @@ def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> 
     """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
     P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
     return -discrete_gain(A.T, C.T, R, S, P).T, P
-
-
-def require_detectable(A: Array, C: Array, method: str) -> None:
-    """Raise a `SynthesisError` naming the first mode on or outside the unit circle that C does not see."""
-    modes = unreachable_modes(A.T, C.T, 1.0)
-    if modes:
-        raise SynthesisError(
-            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible in y; measure another state."
-        )

@@ -1,1 +1,0 @@
-"""Controllers of fewer states by balanced truncation."""

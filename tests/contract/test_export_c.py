@@ -167,8 +167,7 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
     observer, (y, u) = replace(filters(), seen=None), samples(3000, faults=False)
     A, B = observer.A.copy(), observer.B.copy()
     A[1:5, 0], B[1:5, 0] = 900.0 + A[1:5, 0], -900.0
-    controller = replace(observer.controller, D=A[:, :1])
-    observer = replace(observer, A=A, B=B, controller=controller)
+    observer = replace(observer, A=A, B=B)
     y = u[:, :1] + 1e-4 * y  # it follows its target closely
     states = observer.run(y[:, None], u[:, None])[..., :3] + 1e-3 * np.random.default_rng(0).normal(size=(3000, 1, 3))
     states[..., 2] = np.nan
@@ -176,7 +175,7 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
     found = json.loads((folder / "manifest.json").read_text())["numerical_error"]
     assert found["samples"] == 3000
     assert found["difference"] < 8e-5
-    assert abs(found["loss_percent"]["velocity"]) < 0.1
+    assert abs(found["loss_percent"]["velocity"]) < 0.2  # its two filters are larger than the estimate, and single too
     assert found["loss_percent"]["current"] is None
     assert not list(folder.glob("*.so"))
 

@@ -124,7 +124,7 @@ def test_a_changed_file_does_not_fit_its_checksum(tmp_path: Path, change: Callab
         (put("about", 5), "about should be an object"),
         (put("name", ""), "name should be text"),
         (put("kind", "model"), "not an observer file"),
-        (put("schema", 3), "not an observer file"),
+        (put("schema", 2), "not an observer file"),
     ],
 )
 def test_what_is_wrong_is_said(tmp_path: Path, change: Callable[[Any], None], found: str) -> None:

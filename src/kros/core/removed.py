@@ -11,7 +11,6 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "Subspace-identified predictors are no longer part of kros; use the method estimator, whose settings are in [estimator].",
         "memory predictor synthesis.methods=memory kros.observer.identify_predictor kros.observer.PastMoments",
     ),
-    ("The load observer chooses its own order; remove the key memories.", "load.memories"),
     (
         "Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.",
         "synthesis.noise",

@@ -69,7 +69,8 @@ class PhaseLockedLoop:
     def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float | None = None) -> None:
         settle_s = SETTLE_SAMPLES * observer.sample_period_s if settle_s is None else settle_s
         lifting = observer.lifting
-        if name not in lifting.parameters or lifting.history or lifting.input_functions or observer.runtime.delay:
+        of_inputs = any(name in formula.used for formula in lifting.input_formulas)
+        if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
                 f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
                 f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
@@ -93,12 +94,14 @@ class PhaseLockedLoop:
     def step(self, steps: Steps, y: Array, u: Array, missing: Flags | None = None) -> Array:
         """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
-        x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C]
+        x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C].copy()
         slopes, by_value = (
             steps.lifting.slopes(x, values)[..., :n],
             steps.lifting.parameter_slopes(x, values, self.name),
         )
         steps.step(y, u, missing)
+        if self.observer.bank is not None:  # measurements take the place of estimates
+            self._s[:, self._C] = 0.0
         lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
         moved = lifted @ self._model.T + (self._s_c @ K.C.T - psi @ K.D.T) @ self._into.T
         self._s, self._s_c = moved, self._s_c @ K.A.T - psi @ K.B.T

@@ -204,7 +204,8 @@ class Source:
 
         slopes = []
         for f in o.lifting.formulas:
-            by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used}
+            given = () if o.bank is None else o.measured  # measurements take the place of estimates
+            by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
             slopes.append(
                 {
                     "by_value": code(f.derivative(name)),
@@ -356,6 +357,8 @@ def _uncorrected(observer: Observer) -> Array:
     """Return what the model and the direct correction make of a change of the estimate, the lifted functions held; shape (n_lifted, n_lifted)."""
     A = observer.A.copy()
     A[:, list(observer.measured)] -= observer.into @ observer.controller.D
+    if observer.bank is not None:
+        A[:, list(observer.measured)] = 0.0
     return A
 
 

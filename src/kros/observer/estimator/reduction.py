@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.norms import gramian
+from ...loops import recursion
 from .regression import Readout
 
 Array = npt.NDArray[np.float64]
+_EPISODES = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +30,16 @@ class Filters:
     D: Array  # (n, channels)
     S: Array  # (r, channels)
     singular_values: Array  # all of them, relative to the errors of the estimates
+
+    def first(self, order: int) -> Filters:
+        """Return the first states alone."""
+        A, B, C, S = self.A[:order, :order], self.B[:order], self.C[:, :order], self.S[:order]
+        return replace(self, A=A, B=B, C=C, S=S)
+
+    def along(self, v: Array) -> Array:
+        """Return the estimates of signals v (n_samples, batch, channels), shape (n_samples, batch, n)."""
+        z = recursion(self.A, v, v[0] @ self.S.T, self.B)
+        return np.asarray(z @ self.C.T + v @ self.D.T)
 
 
 def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> Filters:
@@ -50,10 +62,16 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     root = np.sqrt(values[kept])
     L, inverse = root[:, None] * U[:, kept].T, U[:, kept] / root
     _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
-    if order is None:
-        left = np.append(np.cumsum((sigma**2)[::-1])[::-1], 0.0)
-        order = int(np.argmax(left <= 2 * loss * used.sum()))
-    V = V[: max(1, min(order, len(sigma)))]
-    scale = np.maximum(sigma[: len(V)], np.finfo(float).eps * sigma[0])  # states of RMS one
-    left_map, right_map = (V @ L) / scale[:, None], (inverse @ V.T) * scale
-    return Filters(left_map @ A @ right_map, left_map @ B, C @ right_map, D, left_map @ S, sigma)
+    scale = np.maximum(sigma, np.finfo(float).eps * sigma[0])  # states of RMS one
+    left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
+    whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
+    if order is not None:
+        return whole.first(order)
+    signals = design.signals(some=_EPISODES, length=round(10 * max(design.bank.lags, default=1.0)))
+    wanted, most = whole.along(signals), 2 * loss
+    low, high = 0, len(sigma)
+    while high - low > 1:  # of errors that grow as little as asked, the least order
+        middle = (low + high) // 2
+        missed = (whole.first(middle).along(signals) - wanted)[..., used] / errors[used]
+        low, high = (low, middle) if np.mean(missed**2, axis=(0, 1)).max() <= most else (middle, high)
+    return whole.first(high)

@@ -26,7 +26,6 @@ from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
 Read = Callable[[EpisodeKey], EpisodeBatch]
-_DECADES = np.arange(-22.0, 0.5, 2.0)  # of the penalty; below, rounding decides
 _SMALLEST = 5e4 * np.finfo(float).eps  # of singular values: what is smaller is rounding
 
 
@@ -125,6 +124,17 @@ class Design:
             if not self.channels.inputs_only:
                 targets[:, measured] -= y[at] / recordings.size[measured]
             yield key, self.bank.rows(v, at), targets, weights
+
+    def signals(self, some: int, length: int) -> Array:
+        """Return the channels of some episodes side by side, cut to a length and to the shortest, shape (n_samples, batch, channels)."""
+        found = []
+        for key in self.recordings.some(some).keys:
+            batch = self.recordings.read(key)
+            y = interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
+            own = {k: p[0] for k, p in batch.parameters.items()}
+            found.append(self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own))
+        shortest = min(length, *(len(v) for v in found))
+        return np.stack([v[:shortest] for v in found], axis=1)
 
     @cached_property
     def groups(self) -> dict[EpisodeKey, Group]:
@@ -257,7 +267,7 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, and the penalty of a state is best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
-        weights, penalties = condition_weights(moments, whitening), (10.0**_DECADES).tolist()
+        weights, penalties = condition_weights(moments, whitening), design.settings.penalties
         others = moments.without(whitening, weights, penalties)
         errors = np.array(
             [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]

@@ -36,10 +36,14 @@ class EstimatorSettings(Settings):
         ge=0,
         description="share of the training span that nonlinear channels may go beyond it; they are cut off there",
     )
-    rows: int = Field(100_000, ge=1000, description="rows of the regression; more are thinned evenly")
-    sample: int = Field(12_000, ge=1000, description="rows from which principal directions and covariances are found")
+    rows: int = Field(60_000, ge=1000, description="rows of the regression; more are thinned evenly")
+    sample: int = Field(8_000, ge=1000, description="rows from which principal directions and covariances are found")
+    penalties: tuple[float, ...] = Field(
+        tuple(10.0**decade for decade in range(-16, 1, 2)),
+        description="penalties of the regression that are tried, relative to the bank's power",
+    )
     parts: int = Field(3, ge=1, description="parts of the episodes, of which the one that is judged on is left out")
-    folds: int = Field(6, ge=2, description="folds of units that are left out in turn, at most")
+    folds: int = Field(4, ge=2, description="folds of units that are left out in turn, at most")
     directions: int = Field(
         400, ge=10, description="principal directions of the bank that the regression sees, at most"
     )

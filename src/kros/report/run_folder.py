@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, read_arrays, read_json
-from ..core.store import recorded_files
+from ..core.store import MANIFEST, recorded_files
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
@@ -52,6 +52,8 @@ class RunFolder:
     @cached_property
     def files(self) -> frozenset[str]:
         """Names of all files that belong to the run, relative to its folder."""
+        if not (self.folder / MANIFEST).exists():  # put together by hand
+            return frozenset(p.relative_to(self.folder).as_posix() for p in self.folder.rglob("*") if p.is_file())
         return recorded_files(self.folder)
 
     def has(self, name: str) -> bool:

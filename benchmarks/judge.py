@@ -43,13 +43,13 @@ import kros  # noqa: E402
 from kros.core.artifacts import write_json  # noqa: E402
 from kros.data import EpisodeBatch, EpisodeKey, Population, from_arrays, split_episodes  # noqa: E402
 from kros.design.estimators import make_learned  # noqa: E402
-from kros.design.settings import ObserverSettings, PredictorSettings, SynthesisSettings  # noqa: E402
+from kros.design.settings import ObserverSettings, SynthesisSettings  # noqa: E402
 from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
 from kros.design.validation import TrainingSet  # noqa: E402
 from kros.evaluate import true_errors  # noqa: E402
 from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibrate import segments_of  # noqa: E402
-from kros.observer import Sensor, run_observer  # noqa: E402
+from kros.observer import EstimatorSettings, Sensor, run_observer  # noqa: E402
 from kros.observer.limits import Limit  # noqa: E402
 from kros.plants import PLANTS  # noqa: E402
 from kros.uncertainty.quantify import UncertainModels  # noqa: E402
@@ -205,7 +205,7 @@ class Fold:
             self.uncertain,
             SynthesisSettings(methods=methods),
             baselines,
-            PredictorSettings(),
+            EstimatorSettings(),
             sensor=sensor,
             limits=limits,
         )

@@ -6,8 +6,7 @@ Every population is simulated and studied with ``[evaluate] folds``: for each fo
 every condition: in how many folds an observer is certified as it runs ("runs") and for the uncertain set ("set"), and in how many it could be made
 where not in all; mean over the units with the 95 % interval of a bootstrap over units, and the worst unit, of the states that are not measured, in
 percent of the largest value; power of the error around the gearbox frequency in dB relative to the paper's own observer, `koopman_edmd/mixed`. Below it:
-what is asked of the table, and by how much it is met or missed. Subspace-identified predictors are tuned longer than a study does by default, with
-velocity first. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done
+what is asked of the table, and by how much it is met or missed. ``--set KEY=VALUE`` changes the study; with ``--out`` runs are kept, and found done
 the next time (``kros run`` on a population's study.toml adds the report).
 """
 
@@ -47,7 +46,7 @@ SHOWN = (
         "koopman/residual_h2",
         "koopman_edmd/residual_h2",
     ),
-    *("linear/residual_h2", "koopman/memory", "linear/memory"),
+    *("linear/residual_h2", "koopman/estimator", "linear/estimator"),
 )
 Facts = Mapping[str, Mapping[str, Any]]
 
@@ -113,7 +112,6 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     methods = json.dumps(["paper", *SynthesisSettings().methods])
     study.write_text(
         f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n'
-        "[predictor]\nsteps = 25\nepisodes = 2\nimportance = {velocity = 16}\n"
         f"[evaluate]\nfolds = {options.folds}\nrobustness = false\n"
     )
     config = load_config(study, options.set)

@@ -29,7 +29,7 @@ from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_from_current, load_observer
 from kros.motor_drive.from_current import load_accuracy
 from kros.motor_drive.signals import low_passed, without_level
-from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
+from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
 from kros.observer.residual.models import one_step_rows
 from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
@@ -55,11 +55,9 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=6)
     parser.add_argument("--seconds", type=float, default=12.0)
     parser.add_argument("--known", type=int, default=2, help="units with a known load")
-    parser.add_argument("--memories", type=int, nargs="+", default=[8])
     parser.add_argument(
         "--level", type=float, nargs="+", default=[10.0], help="seconds after which a constant load is forgotten"
     )
-    parser.add_argument("--iterations", type=int, default=10, help="steps of tuning")
     parser.add_argument("--settle", type=float, default=2.0, help="seconds at the start that do not count")
     parser.add_argument("--unlimited", action="store_true", help="as if the current had no limit")
     parser.add_argument("--certify", action="store_true")
@@ -171,12 +169,11 @@ class Drives:
         for kind in FUNCTIONS:
             found += self.from_current(kind)
             for level in self.options.level:
-                for memories in self.options.memories:
-                    found.append(self.learned(kind, level, memories))
+                found.append(self.learned(kind, level))
             found += [self.modelled(kind), self.unaware(kind)]
         return found
 
-    def learned(self, kind: str, level_s: float, memories: int) -> dict[str, Any]:
+    def learned(self, kind: str, level_s: float) -> dict[str, Any]:
         """The observer that learned from the known load."""
         lifting = Lifting(self.population.states, FUNCTIONS[kind], ("phase",) if FUNCTIONS[kind] else ())
         calibration = calibrate_load(
@@ -189,14 +186,12 @@ class Drives:
             REAL_HZ,
             LIMIT,
         )
-        observer = load_observer(
-            f"{kind}/load", calibration, self.population.inputs, memories, iterations=self.options.iterations
-        )
+        observer = load_observer(f"{kind}/load", calibration, self.population.inputs)
         estimate = run_observer(observer, self.test.states[..., :1], self.test.inputs, self.parameters(kind, self.test))
         seen = estimate[..., 3]
         limit = np.inf if self.options.unlimited else 1.0
         found = AngleLoad(level_s, self.dt, limit=limit).run(seen, estimate[..., CURRENT], self.test.states[..., 0])
-        row = self.judged(f"{kind}, known load, {memories} memories, {level_s:g} s", found.load, seen, level_s)
+        row = self.judged(f"{kind}, known load, {level_s:g} s", found.load, seen, level_s)
         row |= {"current": self.current_percent(found.current), "left out": len(calibration.left_out)}
         if self.options.certify:
             certificate = relift_certificate(observer)
@@ -204,21 +199,17 @@ class Drives:
         return row
 
     def unaware(self, kind: str) -> dict[str, Any]:
-        """An observer with as many states that knows no load: what its current is worth."""
+        """The estimator that knows no load: what its current is worth."""
         lifting = Lifting(self.population.states, FUNCTIONS[kind], ("phase",) if FUNCTIONS[kind] else ())
         free = [i for i, k in enumerate(self.train.keys) if k.condition == "noload"]
-        observer = identify_predictor(
-            f"{kind}/memory",
-            lifting,
-            (0,),
-            self.population.inputs,
-            self.train.take(free),
-            self.options.memories[0] + 1,
-            iterations=self.options.iterations,
-        )
+        batch = self.train.take(free)
+        place = {key: i for i, key in enumerate(batch.keys)}
+        recordings = Recordings.of(batch.keys, lambda key: batch.take([place[key]]))
+        name, inputs = f"{kind}/estimator", self.population.inputs
+        observer = identify_estimator(name, lifting, (0,), inputs, recordings, self.dt).observer
         estimate = run_observer(observer, self.test.states[..., :1], self.test.inputs, self.parameters(kind, self.test))
         return {
-            "estimator": f"{kind}, memory that knows no load",
+            "estimator": f"{kind}, estimator that knows no load",
             "current": self.current_percent(estimate[..., CURRENT]),
         }
 

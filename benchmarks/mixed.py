@@ -87,7 +87,7 @@ def tasks(folder: Path) -> list[DesignTask]:
         context = Context(config, Store(folder), Work(executor))
         found = context.uncertain
         first = [
-            tasks_of(found, kind, ("open_loop",), config.synthesis, config.predictor)[0] for kind in found.models.kinds
+            tasks_of(found, kind, ("open_loop",), config.synthesis, config.estimator)[0] for kind in found.models.kinds
         ]
         return [replace(task, name=f"{task.models.name}/mixed", method="mixed") for task in first]
 

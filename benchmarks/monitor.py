@@ -134,7 +134,7 @@ def main() -> None:
     """Run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--loop", default="stiff", choices=("stiff", "soft"))
-    parser.add_argument("--method", default="koopman/memory")
+    parser.add_argument("--method", default="koopman/estimator")
     parser.add_argument("--seeds", type=int, default=40)
     parser.add_argument("--first", type=int, default=5000)
     parser.add_argument("--rate", type=float, default=RATE)

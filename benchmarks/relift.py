@@ -103,7 +103,7 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
             tasks = [
                 task
                 for kind in KINDS
-                for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.predictor)
+                for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.estimator)
             ]
             made = []
             for task, product in zip(tasks, context.work.map("synthesize", design, tasks), strict=True):

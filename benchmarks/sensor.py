@@ -3,7 +3,7 @@
     python benchmarks/sensor.py FOLDER --loop stiff --seed 301
 
 Simulates twelve drives of spread 3, identifies and quantifies eight of them (kept in FOLDER, where a second run finds them), and designs for every
-sensor the subspace predictor, the open loop, the tuned Kalman filter and the learned estimator. Prints errors on the held-out four, shown by that
+sensor the estimator, the open loop, the tuned Kalman filter and the learned estimator. Prints errors on the held-out four, shown by that
 sensor: percent of the largest value of velocity and current, mean over the units.
 """
 
@@ -20,19 +20,19 @@ import kros
 from kros.data import EpisodeBatch
 from kros.design.estimators import make_learned
 from kros.design.methods.design import design
-from kros.design.settings import PredictorSettings, SynthesisSettings
+from kros.design.settings import SynthesisSettings
 from kros.design.synthesize import tasks_of
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent
 from kros.evaluate.sensor import as_shown
 from kros.identify.calibrate import segments_of
-from kros.observer import Sensor, run_observer
+from kros.observer import EstimatorSettings, Sensor, run_observer
 from kros.observer.units import in_sizes
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.uncertainty.quantify import UncertainModels
 
 HIDDEN = (1, 2)
-METHODS = ("open_loop", "kalman_tuned", "memory")
+METHODS = ("open_loop", "kalman_tuned", "estimator")
 Run = Callable[[EpisodeBatch], np.ndarray]
 
 
@@ -70,10 +70,10 @@ def held_out(uncertain: UncertainModels, population: Any, units: list[str]) -> E
     return EpisodeBatch.read(population, [k for own in keys.values() for k in own[-2:]], parameters=phases)
 
 
-def designs(uncertain: UncertainModels, sensor: dict[str, Sensor], predictor: PredictorSettings) -> dict[str, Run]:
+def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, Run]:
     """Design and train everything for a sensor."""
     found: dict[str, Run] = {}
-    for task in tasks_of(uncertain, "koopman", METHODS, SynthesisSettings(), predictor, sensor):
+    for task in tasks_of(uncertain, "koopman", METHODS, SynthesisSettings(), EstimatorSettings(), sensor):
         made = design(task).observer
         if made is not None:
             own = in_sizes(made, {})
@@ -89,28 +89,23 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--loop", default="stiff", choices=("stiff", "soft"))
     parser.add_argument("--seed", type=int, default=301)
-    parser.add_argument("--steps", type=int, default=25)
-    parser.add_argument("--episodes", type=int, default=2)
     args = parser.parse_args()
     uncertain, population, units = prepared(args.folder, args.loop, args.seed)
-    batch, predictor = (
-        held_out(uncertain, population, units),
-        PredictorSettings(steps=args.steps, episodes=args.episodes),
-    )
+    batch = held_out(uncertain, population, units)
     size, step = uncertain.models.sizes["position"], uncertain.models.facts.resolution["position"]
     untold: dict[str, Run] = {}
     print(
-        "| sensor | predictor, told | untold | learned, told | untold | tuned Kalman, told | open loop |\n|"
+        "| sensor | estimator, told | untold | learned, told | untold | tuned Kalman, told | open loop |\n|"
         + "---|" * 7
     )
     for name, declared in sensors(size, step).items():
         sensor = {"position": Sensor(**declared)} if declared else {}  # type: ignore[arg-type]
-        told = designs(uncertain, sensor, predictor)
+        told = designs(uncertain, sensor)
         untold = untold or told
         shown = as_shown(batch, sensor, population.states)
         columns = (
-            told["memory"],
-            untold["memory"],
+            told["estimator"],
+            untold["estimator"],
             told["learned"],
             untold["learned"],
             told["kalman_tuned"],

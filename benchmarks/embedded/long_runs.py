@@ -241,8 +241,6 @@ def extended(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict) -> np.
         theta = np.concatenate([x, *(f.evaluate(named)[:, None] for f in lifting.formulas)], axis=1)
         nu = y[k].astype(real) - x[:, list(observer.measured)]
         corrected = (x_c @ linear[2].T + nu @ linear[3].T) @ into.T
-        if observer.start_in_motion is not None and k < len(observer.start_in_motion):
-            corrected = corrected + nu @ observer.start_in_motion.corrections[k].T
         x, x_c = theta @ A.T + u[k].astype(real) @ B.T + corrected, x_c @ linear[0].T + nu @ linear[1].T
     return found[..., : len(observer.recorded)]
 

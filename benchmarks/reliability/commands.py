@@ -204,8 +204,8 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
     keys += (
         "lifting.functions",
         "lifting.families",
-        "predictor.effort",
-        "predictor.lags",
+        "estimator.longest",
+        "estimator.order",
         "data.prepare",
         "data.source",
         "identify.kinds",

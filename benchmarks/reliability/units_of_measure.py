@@ -87,10 +87,9 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
         "uncertainty": {"n_freqs": 60, "max_order": 1},
         "synthesis": {
             "input_weight": 3.0,
-            "methods": ["worst_case_h2", "residual_h2", "memory"] if refine else ["residual_h2", "memory"],
+            "methods": ["worst_case_h2", "residual_h2", "estimator"] if refine else ["residual_h2", "estimator"],
             "noise": {"position": NOISE[plant] * factors.get("position", 1.0)},
         },
-        "predictor": {"states": 3, "steps": 2},
         "evaluate": {"robustness": False},
     }
     if plant == "harmonic-drive":

@@ -1,7 +1,7 @@
 """Observers on measured drives that they do not know: every drive, or both of a build, left out of a study and estimated by what came out of it.
 
 A study (`study.toml`, with any `--set` of `kros run`) is made once a fold, from the training episodes of all other drives. Its observers, the extended
-Kalman filter of its first lifted model, a filtered difference, a regression on the past and subspace-identified predictors run on every episode of the
+Kalman filter of its first lifted model, a filtered difference and a regression on the past run on every episode of the
 drives that were left out, those in which the drive stands still excepted. Errors are in percent of the largest value of an episode.
 """
 
@@ -27,7 +27,7 @@ from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
-from kros.observer import Observer, identify_predictor, relift_certificate, run_observer
+from kros.observer import Observer, run_observer
 from kros.study import Stage, StudyConfig, load_config
 
 HERE = Path(__file__).parent
@@ -56,9 +56,6 @@ def main() -> None:
         "--alone", action="store_true", help="without the other joint's motion as inputs: the commanded torque alone"
     )
     parser.add_argument(
-        "--memories", type=int, nargs="*", default=[4, 12], help="internal states of the subspace-identified predictors"
-    )
-    parser.add_argument(
         "--set", dest="settings", action="append", default=[], metavar="KEY=VALUE", help="as for kros run"
     )
     parser.add_argument("--json", action="store_true")
@@ -77,7 +74,7 @@ def main() -> None:
         kros.run(
             config.model_copy(update={"data": config.data.model_copy(update=changes)}), folder, until=Stage.SYNTHESIZE
         )
-        for name, rows in judged(recordings, held, folder, options.memories).items():
+        for name, rows in judged(recordings, held, folder).items():
             table.setdefault(name, []).extend(rows)
     sys.stdout.write(json.dumps(summary(table)) + "\n" if options.json else text(summary(table)))
 
@@ -99,7 +96,7 @@ def folds(drives: Sequence[str], builds: bool, wanted: Sequence[str] | None) -> 
     return [held for held in found if wanted is None or set(held) & set(wanted)]
 
 
-def judged(recordings: Population, held: Sequence[str], folder: Path, memories: Sequence[int]) -> dict[str, list[Row]]:
+def judged(recordings: Population, held: Sequence[str], folder: Path) -> dict[str, list[Row]]:
     """Run everything on the episodes of drives that were left out."""
     others = recordings.select([u for u in recordings.unit_ids if u not in held])
     train = tuple(k for s in split_episodes(others).values() for k in s.train)
@@ -113,7 +110,7 @@ def judged(recordings: Population, held: Sequence[str], folder: Path, memories: 
             percent = error_percent(estimate[..., : batch.states.shape[-1]], batch.states, batch.lengths).mean(axis=0)
             table.setdefault(name, []).append(Row(drive, percent, *facts))
 
-        for name, observer, facts in [*of_study(folder), *with_memory(training, memories)]:
+        for name, observer, facts in of_study(folder):
             own = observer.controller.n_states + observer.lifting.n_states - batch.states.shape[-1]
             run = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs)
             add(name, run, own, facts["relift_certified"], facts.get("worst_case_h2") is not None)
@@ -130,27 +127,6 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
         name: replace(Observer.load(folder / "observers" / f"{name}.json"), seen=None) for name in record["names"]
     }
     return [(name, observer, record["facts"][name]) for name, observer in loaded.items()]
-
-
-def with_memory(training: TrainingSet, memories: Sequence[int]) -> list[tuple[str, Observer, Mapping[str, Any]]]:
-    """Return linear subspace-identified predictors from all training episodes, as regression gives them and tuned."""
-    batch, population = training.read().batch, training.population
-    found = []
-    for count in memories:
-        for steps, how in ((0, ""), (25, ", tuned")):
-            name = f"all training episodes, predictor of {count} internal states{how}"
-            observer = identify_predictor(
-                name,
-                Lifting(population.states),
-                (0,),
-                population.inputs,
-                batch,
-                count,
-                episodes=len(batch.keys),
-                iterations=steps,
-            )
-            found.append((name, observer, {"relift_certified": relift_certificate(observer, mismatch=False).certified}))
-    return found
 
 
 def baselines(training: TrainingSet, folder: Path) -> dict[str, Any]:

@@ -8,9 +8,8 @@ import kros
 from kros.data import EpisodeBatch
 from kros.design.methods.gains import design_kalman_tuned
 from kros.design.settings import SynthesisSettings
-from kros.observer import EstimatorSettings
 from kros.design.synthesize import tasks_of
-from kros.observer import run_observer
+from kros.observer import EstimatorSettings, run_observer
 from kros.observer.residual.one_step import one_step_covariance
 from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
@@ -23,7 +22,7 @@ def uncertain():
 
 
 def task(uncertain, method):
-    return tasks_of(uncertain, "linear_edmd", {method}, SynthesisSettings()())[0]
+    return tasks_of(uncertain, "linear_edmd", {method}, SynthesisSettings(), EstimatorSettings())[0]
 
 
 def percent(estimate, batch):

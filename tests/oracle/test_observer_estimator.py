@@ -124,6 +124,27 @@ def test_reduced_filters_are_stable_at_every_order_and_tend_to_the_bank():
     assert apart[-1] < 0.02 * apart[0]
 
 
+def test_a_reduction_keeps_its_digits_where_coefficients_cancel():
+    """A channel and its double, with coefficients that leave the sum of both: the filters estimate as without them, however large they are."""
+    recordings, batches = plant(units=3, spread=0.2)
+    lifting = replace(LIFTING, functions=("2*position",))
+    channels = channels_of(lifting, (0,), ("u",), "linear", {"position": (-3.0, 3.0), "u": (-3.0, 3.0)}, FEW)
+    readout = Readout.of(Design(channels, Bank.of(channels, recordings.length, FEW), recordings, FEW))
+    bank, errors = readout.design.bank, np.exp(np.log(readout.left_out).mean(axis=0) / 2) * recordings.size
+    batch = next(iter(batches.values()))
+    v = channels.signals(batch.states[:, 0, :1], batch.inputs[:, 0], {})
+    wanted = bank.rows(v, np.arange(len(v))) @ readout.coefficients
+    lag = len(channels) - 1 + bank.delayed * (len(bank.taps) - 2)
+    large = readout.coefficients.copy()
+    large[lag : lag + 2] += 1e10 * np.outer([2.0, -1.0], errors)
+    filters = reduced(replace(readout, coefficients=large), errors, None, 0.01)
+    z, estimates = filters.S @ v[0], []
+    for row in v:
+        estimates.append(filters.C @ z + filters.D @ row)
+        z = filters.A @ z + filters.B @ row
+    assert (np.sqrt(np.mean((np.array(estimates) - wanted) ** 2, axis=0)) < errors)[1:].all()
+
+
 def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     recordings, _ = plant(units=3, episodes=2, spread=0.3)
     settings = FEW.model_copy(update={"parts": 2, "rows": 100_000})

@@ -79,7 +79,7 @@ def gramian_root(A: Array, B: Array, dt: float) -> Array:
     for _ in range(_MAX_ITERATIONS):
         step = power @ R
         R = qr_triangle(np.hstack([R, step]).T).T
-        if np.abs(step).max(initial=0.0) <= 1e-9 * np.abs(R).max(initial=0.0):
+        if np.abs(step).max(initial=0.0) <= np.finfo(float).eps * np.abs(R).max(initial=0.0):
             break
         power = power @ power
     return R

@@ -23,7 +23,6 @@ from ..core.settings import require_kind
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..identify.kinds import kind_of
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Observer, ReliftCertificate, Sensor
 from ..observer.limits import Limit, Limits, limits_of
@@ -259,7 +258,7 @@ def watched(
 def named(uncertain: UncertainModels, method: str) -> str:
     """Return the full name of an observer: that of a method for the first kind of model that it is for."""
     every = [
-        f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, kind_of(kind).refined)
+        f"{kind}/{m.name}" for kind in uncertain.models.kinds for m in suitable(BY_NAME, kind, uncertain.models.kinds)
     ]
     found = [name for name in every if method in (name, split_name(name)[1])]
     if not found:
@@ -309,7 +308,7 @@ def tasks_of(
     }
     if own_limits := limits_of(limits or {}, identified.facts.limits, identified.population.states):
         shared["limits"] = {name: limit.in_unit(recorded.sizes[name]) for name, limit in own_limits.items()}
-    methods = suitable(wanted, kind, kind_of(kind).refined)
+    methods = suitable(wanted, kind, identified.kinds)
     return [DesignTask(f"{kind}/{method.name}", method.name, **shared) for method in methods]
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
+from ...identify.kinds import kind_of
 from ..task import split_name
 
 log = logging.getLogger(__name__)
@@ -20,8 +21,8 @@ class Method:
         float  # roughly what it takes: those that take longest start first, so that no worker waits for them in the end
     )
     rank: int  # the observer of the lowest rank is deployed where none is named and others are no better
-    not_refined: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all
-    refined_only: str = ""  # why it is not made for refined models, or for these alone; empty where it is made for all
+    not_refined: str = ""  # why it is not made for refined models; empty where it is made for all
+    once: str = ""  # why it is made once for a lifting, for the refined models where there are any; empty where for all
 
 
 _LIFTED = "the paper's problem spends its correction on lifted modes that the observer as it runs does not have"
@@ -33,20 +34,21 @@ METHODS = (
     Method("paper", 1.5, 10, not_refined=_LIFTED),
     Method("worst_case_h2", 4.0, 1),
     Method("residual_h2", 2.0, 4),
-    Method("estimator", 5.0, 0, refined_only=_FITTED),
+    Method("estimator", 5.0, 0, once=_FITTED),
 )
 BY_NAME = {method.name: method for method in METHODS}
 
 
-def suitable(wanted: Iterable[str], kind: str, refined: bool) -> list[Method]:
-    """Return the methods that are made for a kind of model, in the order of the table; those that are left out are logged with the reason."""
-    found = []
+def suitable(wanted: Iterable[str], kind: str, kinds: Collection[str]) -> list[Method]:
+    """Return the methods that are made for one of the kinds of models, in the order of the table; the reasons of others are logged."""
+    found, refined = [], kind_of(kind).refined
+    again = not refined and kind.removesuffix("_edmd") in kinds
     for method in METHODS:
         if method.name in set(wanted):
             if refined and method.not_refined:
                 log.info("%s/%s is not made for refined models: %s.", kind, method.name, method.not_refined)
-            elif method.refined_only and not refined:
-                log.info("%s/%s is made for refined models alone: %s.", kind, method.name, method.refined_only)
+            elif method.once and again:
+                log.info("%s/%s is made for refined models alone: %s.", kind, method.name, method.once)
             else:
                 found.append(method)
     return found

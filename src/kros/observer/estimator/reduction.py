@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.norms import gramian
+from ...core.norms import gramian_root
 from ...loops import recursion
 from .regression import Readout
 
@@ -57,10 +57,10 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     used = np.isfinite(errors) & (errors > 0)
     errors = errors.copy()
     errors[list(design.channels.measured)] *= design.settings.measured_loss
-    values, U = np.linalg.eigh(gramian(A.T, (C[used] / errors[used, None]).T, 1.0))
-    kept = values > np.finfo(float).eps * values[-1]
-    root = np.sqrt(values[kept])
-    L, inverse = root[:, None] * U[:, kept].T, U[:, kept] / root
+    root = gramian_root(A.T, (C[used] / errors[used, None]).T, 1.0).T
+    _, values, U = np.linalg.svd(root, full_matrices=False)
+    kept = values > np.finfo(float).eps * values[0]
+    L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
     _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
     scale = np.maximum(sigma, np.finfo(float).eps * sigma[0])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale

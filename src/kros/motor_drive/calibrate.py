@@ -138,9 +138,8 @@ def calibrate_load(
     if current is not None:
         widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, dt)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
-    keys = tuple(
-        EpisodeKey(batch.keys[i].unit, _LOADED if on else _UNLOADED, str(i)) for i, on in zip(used, loaded, strict=True)
-    )
+    kinds = [_LOADED if on else _UNLOADED for on in loaded]  # of one unit: those with a known load are too few to leave out
+    keys = tuple(EpisodeKey("", kind, str(i)) for i, kind in zip(used, kinds, strict=True))
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened, shown=None, lost=None)
     at = tuple(np.flatnonzero(at_limit).tolist())
     return LoadCalibration(with_load, tuple(measured), seen_batch, level_s, tuple(used.tolist()), at)
@@ -157,7 +156,7 @@ def load_observer(
     calibration : LoadCalibration
     inputs : sequence of str
     settings : EstimatorSettings, optional
-        By default with lags up to the time after which the level of a load is forgotten.
+        By default with delays of 20 samples and one lag, as slow as the level of a load is forgotten.
 
     Returns
     -------
@@ -180,8 +179,9 @@ def load_observer(
     batch = calibration.batch
     place = {key: i for i, key in enumerate(batch.keys)}
     recordings = Recordings.of(batch.keys, lambda key: batch.take([place[key]]).head(int(batch.lengths[place[key]])))
-    longest = calibration.level_s / batch.sample_period_s / recordings.length
-    settings = settings or EstimatorSettings(last_lag=longest)
+    lag = calibration.level_s / batch.sample_period_s
+    if settings is None:  # few recordings have a known load
+        settings = EstimatorSettings(dense=20, longest=20, first_lag=lag, last_lag=lag / recordings.length)
     found = identify_estimator(
         name, calibration.lifting, calibration.measured, inputs, recordings, batch.sample_period_s, None, settings
     )

@@ -53,6 +53,15 @@ class FilterBank:
     ------
     DataError
         When a number is not finite or outside its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import FilterBank
+    >>> levels, shares = np.array([0.0, 0.5, 1.0]), np.array([[0.0], [0.2], [1.0]])
+    >>> bank = FilterBank(1, np.zeros((3, 5)), np.array([0.99]), 0.98, levels, shares, np.array([0.1]))
+    >>> bank.share(np.array([0.75])).tolist()
+    [[0.6]]
     """
 
     filters: int

@@ -27,7 +27,21 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """An estimator with what was found on the way."""
+    """An estimator with its readout, its family of channels, and facts for the records.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import EstimatorSettings, Recordings, identify_estimator
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
+    >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
+    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001, settings=few)
+    >>> sorted(found.facts["left_out_percent"])
+    ['current', 'velocity']
+    """
 
     observer: Observer
     readout: Readout
@@ -70,10 +84,11 @@ def identify_estimator(
     >>> import kros
     >>> from kros.data import EpisodeBatch
     >>> from kros.lifting import Lifting
-    >>> from kros.observer.estimator import Recordings, identify_estimator
+    >>> from kros.observer import EstimatorSettings, Recordings, identify_estimator
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
-    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001)
+    >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
+    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001, settings=few)
     >>> found.observer.recorded
     ('position', 'velocity', 'current')
     """

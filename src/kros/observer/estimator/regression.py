@@ -40,13 +40,36 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Training episodes, read one by one."""
+    """Training episodes, read one by one.
+
+    Parameters
+    ----------
+    keys : tuple of EpisodeKey
+    lengths : tuple of int
+        Samples of every episode.
+    read : callable
+        Returns the `EpisodeBatch` of one key.
+    size : ndarray, shape (n,)
+        Sizes of the recorded states.
+    ranges : tuple of ndarray, shape (n,)
+        Their least and largest values.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.observer import Recordings
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
+    >>> len(recordings.keys), recordings.size.shape
+    (4, (3,))
+    """
 
     keys: tuple[EpisodeKey, ...]
     lengths: tuple[int, ...]
     read: Read
-    size: Array  # (n,), sizes of the recorded states
-    ranges: tuple[Array, Array]  # (n,), their least and largest values
+    size: Array
+    ranges: tuple[Array, Array]
 
     @classmethod
     def of(cls, keys: Sequence[EpisodeKey], read: Read) -> Recordings:

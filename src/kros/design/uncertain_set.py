@@ -11,8 +11,9 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..identify import ModelSet
+from ..observer.estimator.certificate import linear_estimate
 from ..synthesis import ObserverProblem, check_units
-from ..synthesis.worst_case.certificate import certify
+from ..synthesis.worst_case.certificate import ErrorMaps, attained, certify_errors
 from ..uncertainty import UncertainModel
 from .settings import SynthesisSettings
 from .task import DesignResult, DesignTask
@@ -46,14 +47,31 @@ def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem 
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
-    loop = float(problem.error_system(synthesis.controller).spectral_radius())
-    facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
-        facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
+        maps = error_maps(task, found, problem)
+        loop = float(maps.system.spectral_radius())
+        facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
+        facts["worst_case_h2"] = certify_errors(problem, maps)[0]
+        if observer.bank is not None:
+            facts["worst_case_h2_attained"] = attained(problem, maps)
+            facts["constant_h2"] = float(np.linalg.norm(maps.mean))
         return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
-        return facts | {"reason": str(error)}
+        shares = {name: share for name, share in found.facts.get("outside_models_percent", {}).items() if share}
+        text = ", ".join(f"{name} {share:.2g} %" for name, share in shares.items())
+        return facts | {"reason": f"{error} Such signals make up {text} of the estimates." if text else str(error)}
+
+
+def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> ErrorMaps:
+    """Return the error of an observer as a linear map of what drives plants of the set."""
+    assert found.observer is not None
+    assert found.synthesis is not None
+    if found.observer.bank is None:
+        return ErrorMaps(problem.error_system(found.synthesis.controller))
+    estimate, mean = linear_estimate(found.observer, task.models.lifting)
+    weight = problem.performance.frequency_response([0.0])[0].real
+    return ErrorMaps(problem.estimate_error(estimate), weight @ (mean / problem.output_scale))
 
 
 def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:

@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import SynthesisError
+from ..core.lti import StateSpace
 from ..identify import ModelSet
 from ..observer.estimator.certificate import linear_estimate
 from ..synthesis import ObserverProblem, check_units
-from ..synthesis.worst_case.certificate import ErrorMaps, attained, certify_errors
+from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..uncertainty import UncertainModel
 from .settings import SynthesisSettings
 from .task import DesignResult, DesignTask
@@ -48,30 +49,29 @@ def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem 
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
     try:
-        maps = error_maps(task, found, problem)
-        loop = float(maps.system.spectral_radius())
+        errors, mean = error_maps(task, found, problem)
+        loop = float(errors.spectral_radius())
         facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
-        facts["worst_case_h2"] = certify_errors(problem, maps)[0]
+        facts["worst_case_h2"] = certify_errors(problem, errors, mean)[0]
         if observer.bank is not None:
-            facts["worst_case_h2_attained"] = attained(problem, maps)
-            facts["constant_h2"] = float(np.linalg.norm(maps.mean))
+            facts["constant_h2"] = float(np.linalg.norm(mean))
+            facts["worst_case_h2_attained"] = attained(problem, errors, mean)
         return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
-        shares = {name: share for name, share in found.facts.get("outside_models_percent", {}).items() if share}
-        text = ", ".join(f"{name} {share:.2g} %" for name, share in shares.items())
-        return facts | {"reason": f"{error} Such signals make up {text} of the estimates." if text else str(error)}
+        return facts | {"reason": str(error)}
 
 
-def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> ErrorMaps:
-    """Return the error of an observer as a linear map of what drives plants of the set."""
+def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> tuple[StateSpace, Array]:
+    """Return the system from what drives plants of the set to the weighted error of an observer, and the mean error."""
     assert found.observer is not None
     assert found.synthesis is not None
     if found.observer.bank is None:
-        return ErrorMaps(problem.error_system(found.synthesis.controller))
-    estimate, mean = linear_estimate(found.observer, task.models.lifting)
+        return problem.error_system(found.synthesis.controller), np.zeros(1)
+    outside = found.facts["outside_models_percent"]
+    estimate, mean = linear_estimate(found.observer, task.models.lifting, outside)
     weight = problem.performance.frequency_response([0.0])[0].real
-    return ErrorMaps(problem.estimate_error(estimate), weight @ (mean / problem.output_scale))
+    return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
 
 
 def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:

@@ -13,7 +13,6 @@ causal or not: the bound is for that set, and an upper bound for causal perturba
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -29,14 +28,6 @@ from .quadrature import circle_mean
 
 Array = npt.NDArray[Any]
 Density = Callable[[ObserverProblem, StateSpace, Array], Array]
-
-
-@dataclass(frozen=True, eq=False)
-class ErrorMaps:
-    """What an observer makes of a plant: the system from (d, r, n, v) and perhaps s to ``W_p e``, and the mean of it."""
-
-    system: StateSpace
-    mean: Array | float = 0.0
 
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
@@ -75,37 +66,35 @@ def _responses(
 
 def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5) -> tuple[float, float]:
     """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes."""
-    return certify_errors(problem, ErrorMaps(problem.error_system(controller)), rtol)
+    return certify_errors(problem, problem.error_system(controller), rtol=rtol)
 
 
-def certify_errors(problem: ObserverProblem, maps: ErrorMaps, rtol: float = 1e-5) -> tuple[float, float]:
-    """Return what `certify` returns for any observer whose error is linear in the plant."""
-    squared, error = _mean_square(problem, maps, density, rtol)
+def certify_errors(
+    problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-5
+) -> tuple[float, float]:
+    """Return what `certify` returns, for the error system from (d, r, n, v[, s]) and the mean of ``W_p e``."""
+    squared, error = _mean_square(problem, errors, density, rtol)
+    squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
 
 
-def attained(problem: ObserverProblem, maps: ErrorMaps, rtol: float = 1e-3) -> float:
-    """Return a lower bound of the worst case of this very observer: what one perturbation attains at every frequency."""
-    squared, error = _mean_square(problem, maps, attained_density, rtol)
-    return float(np.sqrt(max(squared - error, 0.0)))
+def attained(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-3) -> float:
+    """Return a lower bound of this very observer's worst case: what a perturbation attains at every frequency."""
+    squared, error = _mean_square(problem, errors, attained_density, rtol)
+    return float(np.sqrt(max(squared - error, 0.0) + np.sum(np.square(mean))))
 
 
-def _mean_square(problem: ObserverProblem, maps: ErrorMaps, density_of: Density, rtol: float) -> tuple[float, float]:
-    """Return the mean of a density over all frequencies with the square of the mean error, and the quadrature error."""
+def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol: float) -> tuple[float, float]:
+    """Return the mean of a density over all frequencies and the quadrature error."""
     problem.require_sound()
-    if not maps.system.is_stable():
+    if not errors.is_stable():
         raise SynthesisError(
-            f"Certificate: the nominal observer loop has spectral radius {float(maps.system.spectral_radius()):.9g}; no "
+            f"Certificate: the nominal observer loop has spectral radius {float(errors.spectral_radius()):.9g}; no "
             "bound is finite."
         )
-    dt = problem.nominal.dt
-    squared, error = circle_mean(
-        lambda theta: density_of(problem, maps.system, theta / (2 * np.pi * dt)),
-        _log_poles(problem, maps.system),
-        rtol,
-    )
-    return squared + float(np.sum(np.square(maps.mean))), error
+    rate = 2 * np.pi * problem.nominal.dt
+    return circle_mean(lambda theta: of(problem, errors, theta / rate), _log_poles(problem, errors), rtol)
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:

@@ -17,7 +17,8 @@ from kros.design.synthesize import tasks_of
 from kros.design.uncertain_set import certificate, error_maps
 from kros.lifting import Lifting
 from kros.observer import Runtime, identify_estimator, run_observer
-from kros.observer.estimator.certificate import linear_estimate
+from kros.observer.estimator.bank import Bank
+from kros.observer.estimator.certificate import linear_estimate, outside_percent
 from kros.observer.sensor import Sensor
 from kros.synthesis import ObserverProblem
 from kros.synthesis.problem.uncertainty_location import LOCATIONS
@@ -142,7 +143,7 @@ def test_no_member_exceeds_the_density_with_dynamic_weights_and_a_remainder(form
     rest = {"remainder_left": gain(0.1 * np.diag([1.0, 2.0, 0.5]), DT), "remainder_right": gain([[0.7]], DT)}
     W_u = StateSpace([[0.8]], [[0.3]], [[1.0]], [[0.1]], DT)
     case = problem(form, dynamic=True, W_u=W_u, **rest)
-    estimate, errors, mean = maps_of(case, found.observer)
+    estimate, errors, _ = maps_of(case, found.observer)
     freqs, rng = np.geomspace(1e-3, 49.9, 25), np.random.default_rng(2)
     limit = np.sqrt(density(case, errors, freqs))
     F, x, u = estimate.frequency_response(freqs), case.output_scale, case.input_scale
@@ -207,10 +208,25 @@ def test_functions_of_the_model_count_and_others_are_refused():
     estimate, _ = linear_estimate(found.observer, lifting)
     assert np.any(estimate.B[:, 4])  # the sine, the fourth lifted state, behind one measurement and three states
     assert found.facts["outside_models_percent"] == dict.fromkeys(lifting.states, 0.0)
-    with pytest.raises(
-        SynthesisError, match=r"not certified for the set of plants: the models have no signal sin\(position\)"
-    ):
-        linear_estimate(found.observer, LIFTING)
+    design = found.readout.design
+    rows, weight = design.sample
+    added = rows @ np.where(design.bank.channel[:, None] == 1, found.readout.coefficients, 0.0)  # the sine is channel 1
+    shares, size = outside_percent(found.readout, LIFTING), design.recordings.size
+    np.testing.assert_allclose(shares, 100 * np.sqrt(weight @ added**2) / size, rtol=1e-9)
+    assert (shares > 0).all()
+    refusal = r"the models have no signal sin\(position\); it carries, of the range of estimates: velocity 3 %\."
+    with pytest.raises(SynthesisError, match=refusal):
+        linear_estimate(found.observer, LIFTING, {"velocity": 3.0, "force": 0.0})
     late = replace(found.observer, sensor={"position": Sensor(delay_samples=1)})
     with pytest.raises(SynthesisError, match="late"):
         linear_estimate(late, lifting)
+
+
+def test_every_entry_of_a_bank_belongs_to_the_channel_that_moves_it():
+    rng, bank = np.random.default_rng(0), Bank(4, 2, 1, (0, 1, 2, 4, 7, 12), (5.0, 20.0), (2.0, 8.0))
+    v = np.column_stack([rng.normal(size=(60, 3)), np.ones(60)])
+    for channel in range(3):
+        moved = v.copy()
+        moved[:, channel] += rng.normal(size=60)
+        changed = (bank.rows(moved, np.arange(60)) != bank.rows(v, np.arange(60))).any(axis=0)
+        np.testing.assert_array_equal(changed, bank.channel == channel)

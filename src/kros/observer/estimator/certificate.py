@@ -97,7 +97,7 @@ def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
 
 
 def outside_percent(readout: Readout, modelled: Lifting) -> Array:
-    """Return the RMS of what channels without a signal in models add to estimates, in percent of states' sizes, (n,)."""
+    """Return the RMS of what channels without a signal in models add to estimates, (n,), percent of states' sizes."""
     design, own = readout.design, readout.design.channels.lifting
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]

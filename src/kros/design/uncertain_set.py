@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import SynthesisError
-from ..core.lti import StateSpace
+from ..core.lti import StateSpace, gain
 from ..identify import ModelSet
+from ..observer import Observer
 from ..observer.estimator.certificate import linear_estimate
 from ..synthesis import ObserverProblem, check_units
 from ..synthesis.worst_case.certificate import attained, certify_errors
@@ -52,14 +53,27 @@ def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem 
         errors, mean = error_maps(task, found, problem)
         loop = float(errors.spectral_radius())
         facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
-        facts["worst_case_h2"] = certify_errors(problem, errors, mean)[0]
+        bound = certify_errors(problem, errors, mean)[0]
         if observer.bank is not None:
             facts["constant_h2"] = float(np.linalg.norm(mean))
             facts["worst_case_h2_attained"] = attained(problem, errors, mean)
+            require_useful(problem, observer, bound)
+        facts["worst_case_h2"] = bound
         return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
+
+
+def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -> None:
+    """Refuse a bound that is no better than that of no estimate at all: inputs of the set are not related as recorded ones are."""
+    columns = len(observer.measured) + problem.nominal.n_outputs + problem.nominal.n_inputs
+    nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
+    without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
+    if bound >= without:
+        raise SynthesisError(
+            f"the bound of the set is {bound:.3g} and that of no estimate {without:.3g}: the inputs of the set are independent, recorded ones are not."
+        )
 
 
 def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> tuple[StateSpace, Array]:

@@ -6,37 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
-from kros.data import EpisodeBatch, EpisodeKey
+from kros.data import EpisodeBatch
 from kros.lifting import Lifting
-from kros.observer import EstimatorSettings, Observer, Recordings, identify_estimator, run_observer, run_with_status
+from kros.observer import Observer, Recordings, identify_estimator, run_observer, run_with_status
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import reduced
 from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated
-
-FEW = EstimatorSettings(rows=4000, sample=1500, dense=6, longest=20, gap_samples=300, gap_episodes=4)
-DT = 0.01
-
-
-def plant(units=4, episodes=3, samples=400, spread=0.0):
-    """Return recordings of a second-order plant of which the position is measured; hidden are its velocity and a lag of the input."""
-    rng, batches = np.random.default_rng(0), {}
-    for unit in range(units):
-        factor = 1 + spread * rng.normal()
-        A, B = np.array([[1, 0.1, 0], [-0.1 * factor, 0.8, 0.2], [0, 0, 0.9]]), np.array([0.0, 0.0, 0.1])
-        for episode in range(episodes):
-            u = np.convolve(rng.normal(size=samples), np.ones(10) / 3, "same")
-            x = np.zeros((samples, 3))
-            for k in range(samples - 1):
-                x[k + 1] = A @ x[k] + B * u[k]
-            key = EpisodeKey(f"{unit}", "", f"{episode}")
-            batches[key] = EpisodeBatch((key,), np.array([samples]), x[:, None], u[:, None, None], DT)
-    return Recordings.of(list(batches), batches.__getitem__), batches
-
-
-LIFTING = Lifting(("position", "velocity", "force"))
 
 
 def design(recordings, family="linear", settings=FEW):

@@ -10,9 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import SynthesisError
+from ..core.lti import StateSpace, gain
 from ..identify import ModelSet
+from ..observer import Observer
+from ..observer.estimator.certificate import linear_estimate
 from ..synthesis import ObserverProblem, check_units
-from ..synthesis.worst_case.certificate import certify
+from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..uncertainty import UncertainModel
 from .settings import SynthesisSettings
 from .task import DesignResult, DesignTask
@@ -46,14 +49,43 @@ def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem 
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=synthesis.injection)
-    loop = float(problem.error_system(synthesis.controller).spectral_radius())
-    facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
     try:
-        facts["worst_case_h2"] = certify(problem, synthesis.controller)[0]
+        errors, mean = error_maps(task, found, problem)
+        loop = float(errors.spectral_radius())
+        facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
+        bound = certify_errors(problem, errors, mean)[0]
+        if observer.bank is not None:
+            facts["constant_h2"] = float(np.linalg.norm(mean))
+            facts["worst_case_h2_attained"] = attained(problem, errors, mean)
+            require_useful(problem, observer, bound)
+        facts["worst_case_h2"] = bound
         return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
+
+
+def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -> None:
+    """Refuse a bound that is no better than that of no estimate at all: inputs of the set are not related as recorded ones are."""
+    columns = len(observer.measured) + problem.nominal.n_outputs + problem.nominal.n_inputs
+    nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
+    without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
+    if bound >= without:
+        raise SynthesisError(
+            f"the bound of the set is {bound:.3g} and that of no estimate {without:.3g}: the inputs of the set are independent, recorded ones are not."
+        )
+
+
+def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> tuple[StateSpace, Array]:
+    """Return the system from what drives plants of the set to the weighted error of an observer, and the mean error."""
+    assert found.observer is not None
+    assert found.synthesis is not None
+    if found.observer.bank is None:
+        return problem.error_system(found.synthesis.controller), np.zeros(1)
+    outside = found.facts["outside_models_percent"]
+    estimate, mean = linear_estimate(found.observer, task.models.lifting, outside)
+    weight = problem.performance.frequency_response([0.0])[0].real
+    return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
 
 
 def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:

@@ -55,6 +55,13 @@ class Bank:
             + 1
         )
 
+    @property
+    def channel(self) -> npt.NDArray[np.int64]:
+        """Channel of every entry, shape (len(self),)."""
+        every, moving = np.arange(self.channels), np.arange(self.channels - 1)
+        blocks = [moving[: self.delayed]] * (len(self.taps) - 2)
+        return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[every] * len(self.starts), every[-1:]])
+
     def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
         """Return the bank at some samples of an episode's signals, v (n_samples, channels); shape (len(at), len(self))."""
         from scipy.signal import lfilter

@@ -16,6 +16,7 @@ from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..runtime import Runtime
 from .bank import Bank
+from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
 from .gaps import with_gaps
 from .reduction import Filters, reduced
@@ -122,6 +123,7 @@ def identify_estimator(
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": dict(zip(states, (100 * worst).tolist(), strict=True)),
+        "outside_models_percent": dict(zip(states, outside_percent(readout, lifting).tolist(), strict=True)),
         "settle_samples": settle_samples(filters, fallback, observer.bank),
     }
     return Identified(observer, readout, family, facts)

@@ -17,13 +17,18 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import hinf_norm
+from ...lifting import Lifting
 from ..certificate.certificate import ReliftCertificate
 from ..certificate.error import ReliftScales
 from ..certificate.signals import SignalBound
 from ..certificate.status import ReliftStatus
 from ..data import ObserverData
+from ..sensor import delay_of
+from .channels import CONSTANT
+from .regression import Readout
 
 Array = npt.NDArray[np.float64]
 ASSUMPTIONS = (
@@ -41,6 +46,65 @@ def noise_response(observer: ObserverData) -> StateSpace:
     z, at = slice(n, n + observer.bank.filters), list(observer.measured)
     A = observer.A
     return StateSpace(A[z, z], A[z, :][:, at], A[:n, z], A[:n, at], observer.sample_period_s)
+
+
+def linear_estimate(
+    observer: ObserverData, modelled: Lifting, outside: Mapping[str, float] | None = None
+) -> tuple[StateSpace, Array]:
+    """Return the estimate of a model's lifted states from its (y, x, u), a strictly causal system, and its mean (n,).
+
+    Of x only functions of measured states are read, as the lifted states that models know them by. The mean is what the
+    constant channel leaves when everything else is at rest. `outside` is what `outside_percent` found, for the reason.
+
+    Raises
+    ------
+    SynthesisError
+        When the estimate depends on channels that models have no signal for, or measurements arrive late.
+    """
+    assert observer.bank is not None
+    own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
+    if delay_of(observer.sensor):
+        raise SynthesisError("not certified for the set of plants: measurements arrive late, which the set leaves out.")
+    size, first = n + observer.bank.filters, q + modelled.n_states
+    weights = np.hstack([observer.A, observer.B])[:size]
+    signals = _signals(modelled, observer.inputs)
+    B, constant, unknown = np.zeros((size, first + len(signals))), np.zeros(size), list[str]()
+    B[:, :q] = weights[:, list(observer.measured)]
+    for text, column in zip(_signals(own, observer.inputs), weights[:, own.n_states :].T, strict=True):
+        if text in signals:
+            B[:, first + signals.index(text)] = column
+        elif text == CONSTANT:
+            constant = column
+        elif column.any():
+            unknown.append(text)
+    if unknown:
+        more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
+        shares = ", ".join(f"{name} {percent:.2g} %" for name, percent in (outside or {}).items() if percent)
+        share = f"; it carries, of the range of estimates: {shares}" if shares else ""
+        reason = f"the models have no signal {unknown[0]}{more}{share}."
+        raise SynthesisError(f"not certified for the set of plants: {reason}")
+    A = weights[:, :size].copy()
+    A[:, list(observer.measured)] = 0.0  # measurements stand there
+    C = np.eye(modelled.n_lifted, size) * (np.arange(modelled.n_lifted) < n)[:, None]
+    mean = C @ np.linalg.solve(np.eye(size) - A, constant)
+    return StateSpace(A, B, C, np.zeros((len(C), B.shape[1])), observer.sample_period_s), mean
+
+
+def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
+    """Return what stands behind the states in [theta(x); u; gamma(u, x)]."""
+    functions, of_inputs = ([f.text for f in formulas] for formulas in (lifting.formulas, lifting.input_formulas))
+    return [*functions, *inputs, *of_inputs]
+
+
+def outside_percent(readout: Readout, modelled: Lifting) -> Array:
+    """Return the RMS of what channels without a signal in models add to estimates, (n,), percent of states' sizes."""
+    design, own = readout.design, readout.design.channels.lifting
+    known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
+    texts = [*own.states, *_signals(own, own.inputs)]
+    outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
+    rows, weight = design.sample
+    added = rows[:, outside] @ readout.coefficients[outside]
+    return np.asarray(100 * np.sqrt(weight @ added**2) / design.recordings.size)
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:

@@ -367,6 +367,39 @@ class ObserverProblem:
         return self.error_plant().close(self.to_scaled(controller))
 
     @property
+    def error_inputs(self) -> int:
+        """Number of the signals (d, r, n, v) that drive an error system; behind them the input may follow."""
+        return self.nominal.n_inputs + 2 * self.nominal.n_states + len(self.C)
+
+    def estimate_error(self, estimate: StateSpace) -> StateSpace:
+        """Error system from (d, r, n, v, s), scaled, to W_p e, for an estimate that nothing is fed back to.
+
+        ``e = x - F [C x + n; x; s]``, ``x = G (s + d) + r + (zI - A)^-1 v``; F from measurements, states (for functions
+        of what is measured) and inputs to all states, in physical units.
+        """
+        A, B, C, _ = self.scaled
+        n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
+        filters = (
+            gain(np.diag(1 / self.output_scale), dt)
+            @ estimate
+            @ gain(np.diag([*self.noise, *self.output_scale, *self.input_scale]), dt)
+        )
+        truth = np.vstack([C, eye(n), np.zeros((m, n))])
+        columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
+        blocks = {
+            "plant": StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt),
+            "F": filters,
+            "W_p": self.performance,
+        }
+        wires = {
+            "plant": {"d": B, "s": B, "v": np.diag(self.scaled_process_noise)},
+            "F": {"plant": truth, "r": truth} | columns,
+            "W_p": {"plant": eye(n), "r": eye(n), "F": -eye(n)},
+        }
+        inputs = {"d": m, "r": n, "n": q, "v": n, "s": m}
+        return interconnect(blocks, wires, inputs, {"z": {"W_p": eye(self.performance.n_outputs)}})
+
+    @property
     def _scales(self) -> tuple[StateSpace, StateSpace]:
         """Sizes of the correction and of the measurements, as gains."""
         correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale

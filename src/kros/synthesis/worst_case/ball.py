@@ -72,12 +72,12 @@ class Ball:
         f, _, m = M.shape
         return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
 
-    def bound(self, T: Array) -> Array:
-        """Upper bound of ``||T X M||_F`` over the set, shape (f,).
+    def bound(self, T: Array, certain: Array | float = 0.0) -> Array:
+        """Upper bound of ``||certain + T X M||_F`` over the set, shape (f,); `certain` is (f, p, m).
 
         The root of the H2 density that no member exceeds.
         """
-        return dual_bound(T @ self.center, T @ self.left, self.right)
+        return dual_bound(certain + T @ self.center, T @ self.left, self.right)
 
     def average(self) -> Array:
         """Average spectrum, shape (f, b, b)."""
@@ -88,21 +88,23 @@ class Ball:
         """Diagonal of the spectrum of the element of a contraction (f, b, a), shape (f, b)."""
         return np.sum(np.abs(self.center + self.left @ theta @ self.right) ** 2, axis=-1)
 
-    def worst(self, T: Array, iterations: int = 15) -> Array:
-        """Contraction of an element that is (locally) worst for T, shape (f, b, a)."""
+    def worst(self, T: Array, certain: Array | float = 0.0, iterations: int = 15) -> Array:
+        """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
         P = T @ self.left
         _, _, Vh_p = np.linalg.svd(P)
         U_q, _, _ = np.linalg.svd(self.right)
         k = min(P.shape[-1], self.right.shape[-2])
         starts = (
             polar(adjoint(self.left) @ self.center @ adjoint(self.right)),  # aligned with the centre
-            polar(adjoint(P) @ (T @ self.center) @ adjoint(self.right)),  # aligned with the centre, as T sees it
+            polar(
+                adjoint(P) @ (certain + T @ self.center) @ adjoint(self.right)
+            ),  # aligned with the centre, as T sees it
             adjoint(Vh_p)[..., :k] @ adjoint(U_q)[..., :k, :],  # worst without the centre
         )
         best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
         for theta in starts:
             for k in range(iterations + 1):
-                error = T @ (self.center + self.left @ theta @ self.right)
+                error = certain + T @ (self.center + self.left @ theta @ self.right)
                 if k in (0, iterations):
                     value = np.linalg.norm(error, axis=(-2, -1))
                     better = value > best_value * (1 + 1e-6)

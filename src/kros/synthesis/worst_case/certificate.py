@@ -1,15 +1,18 @@
-r"""Certified worst-case H2 norm of an observer, for any correction filter, however it was found.
+r"""Certified worst-case H2 norm of an observer, however it was found: a correction filter, or filters without feedback.
 
 .. math::
-    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta
+    \frac{1}{2\pi}\int \Big(b_\Delta(\theta) + b_r(\theta)\Big)^2 + \|T_n\|_F^2 \, d\theta + \|\bar e\|^2
 
-``b_Delta`` bounds ``||T X M||_F`` over the matrix ball (`ball`), ``b_r`` the additive remainder, a ball around zero; it
-adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds. Delta is
-any frequency-wise contraction, causal or not: the bound is for that set, and an upper bound for causal perturbations.
+``b_Delta`` bounds ``||T_s W_u + T X M||_F`` over the matrix ball (`ball`): ``T_s``, from the input to the error on the
+nominal model, is zero for observers that correct that model. ``b_r`` bounds the additive remainder, a ball around zero;
+it adds by the triangle inequality since the same input drives both. The noise is independent, so its square adds; so
+does that of the mean error ``bar e``, which a constant in the estimate leaves. Delta is any frequency-wise contraction,
+causal or not: the bound is for that set, and an upper bound for causal perturbations.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -24,37 +27,74 @@ from .ball import spread, uncertain_ball
 from .quadrature import circle_mean
 
 Array = npt.NDArray[Any]
+Density = Callable[[ObserverProblem, StateSpace, Array], Array]
 
 
-def density(problem: ObserverProblem, loop: StateSpace, freqs_hz: Array) -> Array:
-    """Certified worst-case power density of ``W_p e``, shape (f,), for the closed error system `loop`."""
+def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
+    """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
     m, n = problem.nominal.n_inputs, problem.nominal.n_states
-    response = loop.frequency_response(freqs_hz)
-    T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
-    uncertain = uncertain_ball(problem, freqs_hz).bound(T)
+    response, T, certain, noise = _responses(problem, errors, freqs_hz)
+    uncertain = uncertain_ball(problem, freqs_hz).bound(T, certain)
     if problem.remainder_left is not None and problem.remainder_right is not None:
         left = response[..., m : m + n] @ problem.remainder_left.frequency_response(freqs_hz)
         uncertain = uncertain + spread(
             left, (problem.remainder_right @ problem.input_weight).frequency_response(freqs_hz)
         )
-    return uncertain**2 + np.sum(np.abs(response[..., m + n :]) ** 2, axis=(-2, -1))
+    return uncertain**2 + noise
+
+
+def attained_density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
+    """Power density of ``W_p e``, shape (f,), for a perturbation that is locally worst; without the remainder."""
+    _, T, certain, noise = _responses(problem, errors, freqs_hz)
+    ball = uncertain_ball(problem, freqs_hz)
+    response = certain + T @ (ball.center + ball.left @ ball.worst(T, certain) @ ball.right)
+    return np.sum(np.abs(response) ** 2, axis=(-2, -1)) + noise
+
+
+def _responses(
+    problem: ObserverProblem, errors: StateSpace, freqs_hz: Array
+) -> tuple[Array, Array, Array | float, Array]:
+    """Return the response of an error system, T, ``T_s W_u``, and the density of noise."""
+    white, direct = problem.nominal.n_inputs + problem.nominal.n_states, problem.error_inputs
+    response = errors.frequency_response(freqs_hz)
+    T = response[..., problem.uncertainty_input] @ problem.W_L.frequency_response(freqs_hz)
+    certain: Array | float = 0.0
+    if errors.n_inputs > direct:
+        certain = response[..., direct:] @ problem.input_weight.frequency_response(freqs_hz)
+    return response, T, certain, np.sum(np.abs(response[..., white:direct]) ** 2, axis=(-2, -1))
 
 
 def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5) -> tuple[float, float]:
     """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes."""
-    problem.require_sound()
-    loop = problem.error_system(controller)
-    if not loop.is_stable():
-        raise SynthesisError(
-            f"Certificate: the nominal observer loop has spectral radius {float(loop.spectral_radius()):.9g}; no "
-            "bound is finite."
-        )
-    dt = problem.nominal.dt
-    squared, error = circle_mean(
-        lambda theta: density(problem, loop, theta / (2 * np.pi * dt)), _log_poles(problem, loop), rtol
-    )
+    return certify_errors(problem, problem.error_system(controller), rtol=rtol)
+
+
+def certify_errors(
+    problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-5
+) -> tuple[float, float]:
+    """Return what `certify` returns, for the error system from (d, r, n, v[, s]) and the mean of ``W_p e``."""
+    squared, error = _mean_square(problem, errors, density, rtol)
+    squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
+
+
+def attained(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-3) -> float:
+    """Return a lower bound of this very observer's worst case: what a perturbation attains at every frequency."""
+    squared, error = _mean_square(problem, errors, attained_density, rtol)
+    return float(np.sqrt(max(squared - error, 0.0) + np.sum(np.square(mean))))
+
+
+def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol: float) -> tuple[float, float]:
+    """Return the mean of a density over all frequencies and the quadrature error."""
+    problem.require_sound()
+    if not errors.is_stable():
+        raise SynthesisError(
+            f"Certificate: the nominal observer loop has spectral radius {float(errors.spectral_radius()):.9g}; no "
+            "bound is finite."
+        )
+    rate = 2 * np.pi * problem.nominal.dt
+    return circle_mean(lambda theta: of(problem, errors, theta / rate), _log_poles(problem, errors), rtol)
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:

@@ -44,6 +44,8 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     g, multipliers = _without_centre(s, q)
     g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]
     g, multipliers = _descended(c, d, g, multipliers)
+    rounding = 4 * np.finfo(float).eps
+    g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
     slack = g[..., :, None] + multipliers[..., None, :] - d
     rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
     squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest

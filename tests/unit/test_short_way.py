@@ -51,14 +51,14 @@ def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainMod
     design = kros.synthesize(uncertain, methods=("residual_h2",), observer=observer)
     assert design.name.split("/")[1] in ("open_loop", "kalman_tuned", "residual_h2")
     with pytest.raises(SynthesisError, match="there is no such observer"):
-        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/memory"})
+        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/estimator"})
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
     with pytest.raises(
-        ConfigError, match=r"'memory': it is not made for these kinds of models.*known are linear_edmd/open_loop"
+        ConfigError, match=r"'estimator': it is not made for these kinds of models.*known are linear_edmd/open_loop"
     ):
-        kros.synthesize(uncertain, method="memory")
+        kros.synthesize(uncertain, method="estimator")
     with pytest.raises(DimensionError, match=r"Quantify: needs .*, found Population; .*the result of kros.identify"):
         kros.quantify(population)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="Synthesize: needs UncertainModels, found IdentifiedModels"):

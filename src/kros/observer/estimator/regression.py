@@ -262,7 +262,10 @@ class Readout:
         errors = np.array(
             [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         )
-        best = np.argmin(np.log(errors).mean(axis=0), axis=0)
+        counted = (moments.power > 0)[
+            :, None
+        ]  # a state at zero throughout a group would ask for no estimate of it at all
+        best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
         n = np.arange(errors.shape[2])
         coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
         return cls(

@@ -70,7 +70,7 @@ def identify_estimator(
     >>> import kros
     >>> from kros.data import EpisodeBatch
     >>> from kros.lifting import Lifting
-    >>> from kros.observer.estimator import Recordings, identify_estimator
+    >>> from kros.observer import Recordings, identify_estimator
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
     >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001)

@@ -38,7 +38,7 @@ class LoadCalibration:
         Of the recorded states and the load.
     measured : tuple of int
     batch : EpisodeBatch
-        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its conditions are "loaded" and "unloaded".
+        Recorded states, the load's share taken off the current, and the load, both as far as they can be seen; its conditions end with "loaded" and "unloaded".
     level_s : float
         Time after which a constant load is forgotten.
     used, left_out : tuple of int
@@ -139,7 +139,8 @@ def calibrate_load(
         widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, dt)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     keys = tuple(
-        EpisodeKey(batch.keys[i].unit, _LOADED if on else _UNLOADED, str(i)) for i, on in zip(used, loaded, strict=True)
+        EpisodeKey(key.unit, f"{key.condition}, {_LOADED if on else _UNLOADED}", key.episode)
+        for key, on in zip((batch.keys[i] for i in used), loaded, strict=True)
     )
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened, shown=None, lost=None)
     at = tuple(np.flatnonzero(at_limit).tolist())

@@ -242,12 +242,10 @@ def against_paper(tables: Mapping[str, ErrorTable], name: str) -> list[str]:
     """Errors and powers beside those of the paper's own observer."""
     lines, papers = [], [n for n in (PAPER, ENTRYWISE) if n in tables[HOME].cells]
     for paper, (channel, times) in product(papers, (("current", 3.0), ("velocity", 4.0))):
-        theirs, ours = (tables[HOME].cells[n][channel].units for n in (paper, name))
-        shared = [unit for unit in ours if ours[unit] is not None and theirs.get(unit) is not None]
-        ratio = sum(theirs[unit] or 0.0 for unit in shared) / sum(ours[unit] or inf for unit in shared)
-        where = "" if len(shared) == len(ours) else f" on the {len(shared)} units that it could be made for"
+        theirs, ours = (tables[HOME].cells[n][channel].mean for n in (paper, name))
+        ratio = (theirs or inf) / (ours or inf)
         lines.append(
-            f"(b) {channel} of {paper}{where} over that of {name}: {ratio:.2f}, asked {times:g} {met(ratio >= times)}"
+            f"(b) {channel} of {paper} over that of {name}: {ratio:.2f}, asked {times:g} {met(ratio >= times)}"
         )
     for condition, table in tables.items():
         for channel in HIDDEN:

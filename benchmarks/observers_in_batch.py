@@ -39,7 +39,6 @@ KOOPMAN = Lifting(("position", "velocity", "current"), ("sin(100*position + phas
 LINEAR = Lifting(("position", "velocity", "current"))
 ORDERS = (0, 4, 9, 12)  # of the corrections: gains, worst-case H2, residual-shaped, the paper's
 COUNTS = (8, 2, 2, 2)  # of either lifting, for refined and plain models together
-MEMORIES = 12  # states of the subspace-identified predictor
 TOGETHER, EPISODES = 2, 32  # observers and episodes that a study of this size runs side by side
 
 
@@ -69,15 +68,10 @@ def main() -> None:
             run(block)
 
     for lifting, name in ((KOOPMAN, "Koopman"), (LINEAR, "linear")):
-        memory = observer(with_internal(lifting), 0)
-        timed(f"{name} formulas, once a process", partial(load, [observer(lifting, 0), memory], blocks[0].first(2)))
+        timed(f"{name} formulas, once a process", partial(load, [observer(lifting, 0)], blocks[0].first(2)))
         for order, count in zip(ORDERS, COUNTS, strict=True):
             work = partial(every, partial(side_by_side, [observer(lifting, order)] * TOGETHER))
             timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)
-        timed(
-            f"1 {name} subspace-identified predictor of {MEMORIES} states",
-            partial(every, partial(side_by_side, [memory])),
-        )
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
     timed("extended Kalman filter", lambda: every(lambda block: extended.run(block.y, block.u, block.phase)))
@@ -91,7 +85,7 @@ def main() -> None:
         lambda: Moments.of(features, (part for block in blocks for part in block.one_by_one())),
     )
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
-    estimates = 2 * (sum(COUNTS) + 1) + 3
+    estimates = 2 * sum(COUNTS) + 3
     made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
     summaries = partial(every, lambda block: summarise_all(made[blocks.index(block)], block.states, block.lengths, DT))
     timed(f"errors and spectra of {estimates} estimates", summaries, estimates / TOGETHER)
@@ -163,11 +157,6 @@ def load(observers: list[Observer], block: Block) -> None:
     """Run observers so that their formulas and the compiled loops are there."""
     for each in observers:
         side_by_side([each], block)
-
-
-def with_internal(lifting: Lifting) -> Lifting:
-    """The same lifting with states of the observer's own."""
-    return replace(lifting, states=(*lifting.states, *(f"memory_{i + 1}" for i in range(MEMORIES))))
 
 
 def observer(lifting: Lifting, order: int, runtime: Runtime | None = None) -> Observer:

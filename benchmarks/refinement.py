@@ -22,7 +22,7 @@ import kros
 from kros.core.norms import hinf_norm
 from kros.core.work import Work
 from kros.identify import KoopmanMatrices, ModelSet, free_run
-from kros.identify.refine import RefinedModels
+from kros.identify.refine.model import Refinement
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -66,7 +66,7 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     """Return errors, ratios and weights of one study."""
     sets = {name: context.identified.models(name) for name in context.identified.kinds}
     errors = {name: percent(context, models) for name, models in sets.items()}
-    refined = {name: RefinedModels.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
+    refined = {name: Refinement.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
     pooled = {name: percent(context, sets[name], found.pooled) for name, found in refined.items()}
     middle = {name: np.median(e, axis=0) for name, e in errors.items()}
     found: dict[str, Any] = {

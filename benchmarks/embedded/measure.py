@@ -3,22 +3,23 @@
     make embedded        or        python benchmarks/embedded/measure.py [deployed.json [PARAMETER]]
 
 Needs arm-none-eabi-gcc with newlib and qemu-system-arm (packages of most distributions); says so and ends well where they are missing. Without an observer
-it takes one of the shape of a drive's subspace-identified predictor: fifteen states, twelve of them its own, a sine and a cosine.
+it takes an estimator of simulated drives with twelve filters, a sine and a cosine.
 A parameter is followed by a phase-locked loop.
 """
 
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 
-from kros.core.lti import StateSpace
+from kros.data import EpisodeBatch
 from kros.export.c99.board import OnBoard, missing_tools
 from kros.export.c99.write import c_files
 from kros.lifting import Lifting
-from kros.observer import Observer, Seen
-from kros.synthesis import Injection
+from kros.observer import EstimatorSettings, Observer, Recordings, Seen, identify_estimator
+from kros.plants import HarmonicDrivePopulation
 
 
 def main() -> None:
@@ -29,7 +30,7 @@ def main() -> None:
         )
         return
     observer, track = (
-        Observer.load(sys.argv[1]) if len(sys.argv) > 1 else predictor(),
+        Observer.load(sys.argv[1]) if len(sys.argv) > 1 else estimator(),
         sys.argv[2] if len(sys.argv) > 2 else None,
     )
     print(f"{observer!r}\n{'build':<12}{'flash':>8}{'state':>7}{'stack':>7}{'instructions a step':>21}")
@@ -44,35 +45,16 @@ def main() -> None:
                 raise SystemExit("the self-test failed on the board")
 
 
-def predictor() -> Observer:
-    """Return an observer of the size of a drive's predictor."""
-    rng, n, own = np.random.default_rng(3), 15, [f"memory_{i + 1}" for i in range(12)]
-    lifting = Lifting(
-        ("position", "velocity", "current", *own),
-        ("sin(100*position + phase)", "cos(100*position + phase)"),
-        ("phase",),
+def estimator() -> Observer:
+    """Return the estimator of two simulated drives."""
+    drives = HarmonicDrivePopulation(2, 2, 2.0).simulate().population
+    phases = {unit: {"phase": 0.3} for unit in drives.unit_ids}
+    recordings = Recordings.of(list(drives.keys()), lambda key: EpisodeBatch.read(drives, [key], None, phases))
+    lifting, settings = Lifting(drives.states, ("sin(100*position + phase)",), ("phase",)), EstimatorSettings(order=12)
+    found = identify_estimator(
+        "estimator", lifting, (0,), drives.inputs, recordings, drives.sample_period_s, {"phase": 0.3}, settings
     )
-    A = np.zeros((17, 17))
-    A[:n, :n], A[:n, n:] = 0.05 * rng.normal(size=(n, n)) + 0.7 * np.eye(n), 1e-3 * rng.normal(size=(n, 2))
-    A[:n, 0], A[0, 0] = 0.1 * A[:n, 0], 1.0
-    B = np.vstack([0.01 * rng.normal(size=(n, 2)), np.zeros((2, 2))])
-    gain = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((17, 0)), A[:, :1], 1e-3)
-    seen, inputs = Seen(np.array([6.3]), np.array([6.3, 3.2])), ("target_position", "target_velocity")
-    return Observer(
-        "predictor",
-        lifting,
-        A,
-        B,
-        (0,),
-        inputs,
-        gain,
-        Injection.STATE,
-        1e-3,
-        {"phase": 0.3},
-        seen=seen,
-        replaces=True,
-        internal=12,
-    )
+    return replace(found.observer, seen=Seen(np.array([6.3]), np.array([6.3, 3.2])))
 
 
 if __name__ == "__main__":

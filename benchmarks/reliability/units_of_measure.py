@@ -48,7 +48,7 @@ class Multiplied:
 
     def __call__(self, key: Any) -> Any:
         """Return the samples of an episode."""
-        return self.source(key) * self.factors
+        return self.source(key)[:, : len(self.factors)] * self.factors
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,11 @@ def simulated(plant: str, seed: int) -> Population:
 
 
 def in_units(population: Population, factors: Factors) -> Population:
-    """Return the recordings with channels multiplied."""
+    """Return the recordings with channels multiplied, without the true signals."""
     return replace(
         population,
         source=Multiplied(population.source, np.array([factors.get(c.name, 1.0) for c in population.channels])),
+        truths=(),
     )
 
 

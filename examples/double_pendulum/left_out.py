@@ -1,7 +1,7 @@
 """Observers on measured drives that they do not know: every drive, or both of a build, left out of a study and estimated by what came out of it.
 
 A study (`study.toml`, with any `--set` of `kros run`) is made once a fold, from the training episodes of all other drives. Its observers, the extended
-Kalman filter of its first lifted model, a filtered difference and a regression on the past run on every episode of the
+Kalman filter of its first lifted model, a filtered difference, a regression on the past and a linear estimator run on every episode of the
 drives that were left out, those in which the drive stands still excepted. Errors are in percent of the largest value of an episode.
 """
 
@@ -27,7 +27,8 @@ from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
 from kros.lifting import Lifting
-from kros.observer import Observer, run_observer
+from kros.observer import Observer, Recordings, ReliftScales, identify_estimator, run_observer
+from kros.observer.estimator.certificate import filter_certificate
 from kros.study import Stage, StudyConfig, load_config
 
 HERE = Path(__file__).parent
@@ -110,7 +111,7 @@ def judged(recordings: Population, held: Sequence[str], folder: Path) -> dict[st
             percent = error_percent(estimate[..., : batch.states.shape[-1]], batch.states, batch.lengths).mean(axis=0)
             table.setdefault(name, []).append(Row(drive, percent, *facts))
 
-        for name, observer, facts in of_study(folder):
+        for name, observer, facts in [*of_study(folder), linear_estimator(training)]:
             own = observer.controller.n_states + observer.lifting.n_states - batch.states.shape[-1]
             run = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs)
             add(name, run, own, facts["relift_certified"], facts.get("worst_case_h2") is not None)
@@ -127,6 +128,16 @@ def of_study(folder: Path) -> list[tuple[str, Observer, Mapping[str, Any]]]:
         name: replace(Observer.load(folder / "observers" / f"{name}.json"), seen=None) for name in record["names"]
     }
     return [(name, observer, record["facts"][name]) for name, observer in loaded.items()]
+
+
+def linear_estimator(training: TrainingSet) -> tuple[str, Observer, Mapping[str, Any]]:
+    """Return the estimator without lifted functions, which needs no model."""
+    population, name = training.population, "linear estimator"
+    recordings = Recordings.of(training.keys, training.read_one)
+    lifting, dt = Lifting(population.states), population.sample_period_s
+    observer = identify_estimator(name, lifting, (0,), population.inputs, recordings, dt).observer
+    scales = ReliftScales(recordings.size, recordings.size, recordings.size[:1])
+    return name, observer, {"relift_certified": filter_certificate(observer, scales).certified}
 
 
 def baselines(training: TrainingSet, folder: Path) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Load estimates against analytic loads, a linear machine under a known step, and the simulator's truth."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,7 +13,8 @@ from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
 from kros.motor_drive.from_current import load_accuracy
 from kros.motor_drive.signals import without_level
-from kros.observer import Observer, run_observer
+from kros.observer import Observer, ReliftScales, run_observer
+from kros.observer.estimator.certificate import filter_certificate
 from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
 
@@ -111,13 +113,13 @@ def drives() -> SimpleNamespace:
             [truth.load_torque(k) if k.condition == "load" else np.zeros(len(values)) for k in keys], axis=1
         )
         phase = np.array([phases[k.unit] for k in keys])
-        return SimpleNamespace(x=values[..., :3], u=values[..., 3:], load=load.astype(float), phase={"phase": phase})
+        x, u = values[..., :3], values[..., 3:]
+        batch = replace(batch_of(x, u, DT, {"phase": phase}), keys=tuple(keys))
+        return SimpleNamespace(x=x, u=u, load=load.astype(float), phase={"phase": phase}, batch=batch)
 
     known, others = read(train), read(test)
     lifting = Lifting(population.states, ("sin(100*position + phase)",), ("phase",))
-    calibration = calibrate_load(
-        lifting, (0,), batch_of(known.x, known.u, DT, known.phase), known.load, 2, corner_hz=20.0
-    )
+    calibration = calibrate_load(lifting, (0,), known.batch, known.load, 2, corner_hz=20.0)
     observer = load_observer("koopman/load", calibration, population.inputs)
     estimate = run_observer(observer, others.x[..., :1], others.u, others.phase)
     leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
@@ -141,6 +143,11 @@ def test_ripple_in_the_load_is_far_below_that_of_the_current(drives: SimpleNames
         ripple_power(s[:, free], position, speed, 100.0, DT) for s in (drives.estimate[..., 3], drives.others.x[..., 2])
     ]
     assert 10 * np.log10(powers[1].mean() / powers[0].mean()) > 10
+
+
+def test_the_load_observer_is_certified_as_it_runs(drives: SimpleNamespace) -> None:
+    scales = ReliftScales(np.ones(4), np.ones(4), np.ones(1))
+    assert filter_certificate(drives.observer, scales).certified
 
 
 def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:

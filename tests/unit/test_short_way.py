@@ -51,7 +51,7 @@ def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainMod
     design = kros.synthesize(uncertain, methods=("residual_h2",), observer=observer)
     assert design.name.split("/")[1] in ("open_loop", "kalman_tuned", "residual_h2")
     with pytest.raises(SynthesisError, match="there is no such observer"):
-        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/memory"})
+        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/estimator"})
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:

@@ -19,7 +19,9 @@ from .certificate.error import ReliftScales
 from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import ReliftStatus
-from .estimator import EstimatorSettings, Recordings, identify_estimator
+from .estimator.build import identify_estimator
+from .estimator.regression import Recordings
+from .estimator.settings import EstimatorSettings
 from .filter_bank import FilterBank
 from .guard import Guard
 from .monitor import Monitor

@@ -60,7 +60,7 @@ class FilterBank:
     >>> from kros.observer import FilterBank
     >>> levels, shares = np.array([0.0, 0.5, 1.0]), np.array([[0.0], [0.2], [1.0]])
     >>> bank = FilterBank(1, np.zeros((3, 5)), np.array([0.99]), 0.98, levels, shares, np.array([0.1]))
-    >>> bank.share(np.array([0.75])).tolist()
+    >>> bank.share(np.array([0.75])).round(3).tolist()
     [[0.6]]
     """
 

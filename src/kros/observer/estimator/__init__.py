@@ -3,8 +3,6 @@
 measurements, lifting and inputs --channels--> signals --filters--> bank --ridge regression--> estimate --balanced truncation--> observer
 """
 
-from .build import Identified, identify_estimator
-from .regression import Recordings
-from .settings import EstimatorSettings
+from .build import Identified
 
-__all__ = ["EstimatorSettings", "Identified", "Recordings", "identify_estimator"]
+__all__ = ["Identified"]

@@ -256,21 +256,22 @@ class Moments:
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
     def known(self, group: Group) -> npt.NDArray[np.bool_]:
-        """Return which groups know neither the units nor the episodes of one; of one fold or one part there is no other."""
+        """Return which groups know neither the units nor the episodes of one; where that leaves none in its condition, not the units, or not the episodes."""
+        alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         for known in (folds & parts, folds, parts):
-            if known.any():
+            if (known & alike).any():
                 return known
         return np.ones(len(folds), dtype=bool)
 
     def without(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
         """Return the coefficients that do not know a group, for every group and penalty."""
-        found: dict[tuple[int, int], list[Array]] = {}
-        for group in self.groups:
-            if (group.fold, group.part) not in found:
-                rest = np.where(self.known(group), weights, 0.0)
-                found[group.fold, group.part] = list(self.solved(whitening, rest, penalties))
-        return {group: found[group.fold, group.part] for group in self.groups}
+        found: dict[bytes, list[Array]] = {}
+        known = {group: self.known(group) for group in self.groups}
+        for rest in known.values():
+            if rest.tobytes() not in found:
+                found[rest.tobytes()] = list(self.solved(whitening, np.where(rest, weights, 0.0), penalties))
+        return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,7 +296,10 @@ class Readout:
         errors = np.array(
             [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         )
-        best = np.argmin(np.log(errors).mean(axis=0), axis=0)
+        counted = (moments.power > 0)[
+            :, None
+        ]  # a state at zero throughout a group would ask for no estimate of it at all
+        best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
         n = np.arange(errors.shape[2])
         coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
         return cls(

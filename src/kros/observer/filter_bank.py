@@ -53,6 +53,13 @@ class FilterBank:
     ------
     DataError
         When a number is not finite or outside its range.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import FilterBank
+    >>> FilterBank(2, np.zeros((6, 3)), np.array([0.9]), 0.95, np.array([0.0, 1.0]), np.array([[0.0], [0.4]]), np.ones(1)).filters
+    2
     """
 
     filters: int

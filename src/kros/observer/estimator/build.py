@@ -27,7 +27,20 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """An estimator with what was found on the way."""
+    """An estimator with what was found on the way.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.observer import Recordings, identify_estimator
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
+    >>> identified = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, motors.sample_period_s)
+    >>> sorted(identified.facts)[:3]
+    ['bank', 'channels', 'filters']
+    """
 
     observer: Observer
     readout: Readout
@@ -73,7 +86,7 @@ def identify_estimator(
     >>> from kros.observer import Recordings, identify_estimator
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
-    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001)
+    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, motors.sample_period_s)
     >>> found.observer.recorded
     ('position', 'velocity', 'current')
     """

@@ -41,7 +41,17 @@ class Group:
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
-    """Training episodes, read one by one."""
+    """Training episodes, read one by one.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.observer import Recordings
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key])).length
+    500.0
+    """
 
     keys: tuple[EpisodeKey, ...]
     lengths: tuple[int, ...]

@@ -89,8 +89,8 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
         "synthesis": {
             "input_weight": 3.0,
             "methods": ["worst_case_h2", "residual_h2", "estimator"] if refine else ["residual_h2", "estimator"],
-            "noise": {"position": NOISE[plant] * factors.get("position", 1.0)},
         },
+        "sensor": {"position": {"noise": NOISE[plant] * factors.get("position", 1.0)}},
         "evaluate": {"robustness": False},
     }
     if plant == "harmonic-drive":

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import KrosError
+from .errors import SynthesisError
 from .lti import StateSpace
 
 DIGITS, MOST_DIGITS, MOST_STATES = 40, 160, 60
@@ -20,7 +20,7 @@ def precise_h2_norm(system: StateSpace) -> float:
     import mpmath
 
     if system.n_states > MOST_STATES:
-        raise KrosError(
+        raise SynthesisError(
             f"H2 norm: double precision cannot tell it, and more than {MOST_STATES} states, {system.n_states}, take "
             "too long in multiple precision; "
             "reduce the system, or scale its states alike."
@@ -32,7 +32,7 @@ def precise_h2_norm(system: StateSpace) -> float:
         if before is not None and (norm == before or abs(norm - before) <= 1e-9 * abs(norm)):
             return norm
         before, digits = norm, 2 * digits
-    raise KrosError(
+    raise SynthesisError(
         f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit."
     )
 

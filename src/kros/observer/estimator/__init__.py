@@ -1,6 +1,12 @@
-"""The estimator: a linear regression of all states on a bank of fixed stable filters of what is measured, lifted and commanded.
+"""The estimator: a linear regression of all states on a bank of fixed stable filters.
 
-measurements, lifting and inputs --channels--> signals --filters--> bank --ridge regression--> estimate --balanced truncation--> observer
+measurements, lifting, inputs --channels--> signals --filters--> bank --ridge regression--> estimate --reduction--> observer
+
+Examples
+--------
+>>> from kros.observer import EstimatorSettings
+>>> EstimatorSettings(first_lag=500.0).lags(6000)
+(300.0, 600.0, 1200.0, 2400.0)
 """
 
 from .build import Identified

@@ -209,7 +209,7 @@ def test_units_of_measure_change_nothing():
 
 def test_families_grow_and_a_measurement_that_never_arrives_is_refused():
     recordings, _ = plant(units=2, episodes=1)
-    sizes = [len(design(recordings, family).channels) for family in FAMILIES]
+    sizes = [len(design(recordings, family).bank) for family in FAMILIES]
     assert sizes == sorted(set(sizes))
     with pytest.raises(kros.core.errors.DataError, match="no sample of a measurement arrives"):
         interpolated(np.full((10, 1), np.nan))

@@ -141,7 +141,7 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
     lifting = Lifting(("position", "filter_1", "position_from_inputs"), (), (), ("torque",), ("1",))
-    bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "memory": 0.5} | changes
+    bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "half": 5.0, "recovery": 0.5} | changes
     own = FilterBank(**{"levels": np.array([0.0, 1.0]), "shares": np.array([[0.0], [1.0]]), "reach": np.ones(1)} | bank)
     none = gain(np.zeros((3, 1)), 0.01)
     return Observer(

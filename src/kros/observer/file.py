@@ -239,9 +239,17 @@ def _bank(found: Any, n: int, columns: int, measured: int, where: str) -> Filter
     start = matrix(found["start"], (n, columns), f"{where}: filter_bank.start")
     shares = matrix(found["shares"], (count, recorded), f"{where}: filter_bank.shares")
     _require(type(found["filters"]) is int, f"{where}: filter_bank.filters should be a whole number", found["filters"])
-    _require(_is_finite(found["memory"]), f"{where}: filter_bank.memory should be a number", found["memory"])
+    for name in ("half", "recovery"):
+        _require(_is_finite(found[name]), f"{where}: filter_bank.{name} should be a number", found[name])
     return FilterBank(
-        found["filters"], start, rows["forget"], float(found["memory"]), rows["levels"], shares, rows["reach"]
+        found["filters"],
+        start,
+        rows["forget"],
+        float(found["half"]),
+        float(found["recovery"]),
+        rows["levels"],
+        shares,
+        rows["reach"],
     )
 
 

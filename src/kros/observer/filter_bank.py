@@ -6,11 +6,12 @@ their own estimate :math:`x^u` of all recorded states. The fallback
 
 .. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
 
-continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. With the level :math:`m = 1 - \lambda^g` of a gap
-of g samples so far, zero as soon as all measurements arrive, the estimate changes over from z to the fallback by shares :math:`\beta(m)` that training
-chose. A missing measurement is replaced by its estimate, at most :math:`(1 - m)` times a reach away from the fallback: what the filters see is bounded
-for any pattern of losses, and so are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit
-ramp was run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
+continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. The age a of a gap is the number of samples that are
+missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. With the level
+:math:`m = a / (a + T)` the estimate changes over from z to the fallback by shares :math:`\beta(m)` that training chose. A missing measurement is
+replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback: what the filters see is bounded for any pattern of losses, and so
+are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is
+corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -40,8 +41,10 @@ class FilterBank:
         First estimate from the lifted first sample: ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, states that are not measured taken as zero.
     forget : ndarray, shape (n,)
         rho of every recorded state, between zero and one.
-    memory : float
-        lambda, between zero and one.
+    half : float
+        T, the age of a gap at which its level is one half, in samples.
+    recovery : float
+        mu, between zero and one.
     levels : ndarray, shape (k,)
         Levels m, increasing from zero to one.
     shares : ndarray, shape (k, n)
@@ -59,7 +62,7 @@ class FilterBank:
     >>> import numpy as np
     >>> from kros.observer import FilterBank
     >>> levels, shares = np.array([0.0, 0.5, 1.0]), np.array([[0.0], [0.2], [1.0]])
-    >>> bank = FilterBank(1, np.zeros((3, 5)), np.array([0.99]), 0.98, levels, shares, np.array([0.1]))
+    >>> bank = FilterBank(1, np.zeros((3, 5)), np.array([0.99]), 30.0, 0.97, levels, shares, np.array([0.1]))
     >>> bank.share(np.array([0.75])).round(3).tolist()
     [[0.6]]
     """
@@ -67,7 +70,8 @@ class FilterBank:
     filters: int
     start: Array
     forget: Array
-    memory: float
+    half: float
+    recovery: float
     levels: Array
     shares: Array
     reach: Array
@@ -75,12 +79,15 @@ class FilterBank:
     def __post_init__(self) -> None:
         for name in _ARRAYS:
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
-        shares = [self.forget, self.shares, self.levels, np.array(self.memory)]
-        if not (np.isfinite(self.start).all() and np.isfinite(self.reach).all() and (self.reach >= 0).all()) or not all(
-            ((v >= 0) & (v <= 1)).all() for v in shares
-        ):
+        shares = [self.forget, self.shares, self.levels, np.array(self.recovery)]
+        if not (
+            np.isfinite(self.start).all()
+            and np.isfinite(self.reach).all()
+            and (self.reach >= 0).all()
+            and self.half > 0
+        ) or not all(((v >= 0) & (v <= 1)).all() for v in shares):
             raise DataError(
-                f"Filter bank: start and reach should be finite, and forget {self.forget}, memory {self.memory}, levels and shares between 0 and 1."
+                f"Filter bank: start and reach should be finite, and forget {self.forget}, recovery {self.recovery}, levels and shares between 0 and 1."
             )
         if not (len(self.levels) == len(self.shares) and (np.diff(self.levels) > 0).all()):
             raise DataError(f"Filter bank: levels {self.levels} should increase, with shares for each.")
@@ -113,7 +120,8 @@ class FilterBank:
         """Return what an observer's file holds of it."""
         return {name: getattr(self, name).tolist() for name in _ARRAYS} | {
             "filters": self.filters,
-            "memory": self.memory,
+            "half": self.half,
+            "recovery": self.recovery,
         }
 
     @classmethod
@@ -131,15 +139,20 @@ class Gaps:
         self.filters = slice(first, first + bank.filters)
         self.fallback = slice(n - recorded, n)
         self._A, self._B = A[self.filters, self.filters], A[self.filters, :][:, self.measured]
-        self.offset, self.level = np.zeros((batch, recorded)), np.zeros(batch)
+        self.offset, self.age = np.zeros((batch, recorded)), np.zeros(batch)
         self.held = np.zeros((batch, q))  # the fallback of measurements
         self.filtered = self.expected = np.zeros((batch, recorded))  # by filters and by the fallback, after a step
         self.ramp, self.count = np.zeros((batch, bank.filters, q)), np.zeros((batch, q))
 
     def begin(self, rows: Any) -> None:
         """Start some machines: nothing is missing."""
-        for values in (self.offset, self.level, self.ramp, self.count):
+        for values in (self.offset, self.age, self.ramp, self.count):
             values[rows] = 0.0
+
+    @property
+    def level(self) -> Array:
+        """Level of the gap of every machine, shape (batch,)."""
+        return np.asarray(self.age / (self.age + self.bank.half))
 
     def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
         """Put measurements (batch, q) and what stands for missing ones into states (batch, n), and bridge gaps that end."""
@@ -159,13 +172,13 @@ class Gaps:
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = np.where(missing, self.held, last[:, self.measured])
         offset = bank.forget * (last - x[:, self.fallback])
-        level = np.where(some, bank.memory * self.level + (1 - bank.memory), 0.0)
         count = np.where(missing, self.count + 1, 0.0)
-        share = bank.share(level)
+        age = np.maximum(np.where(some, self.age, bank.recovery * self.age), count.max(axis=1, initial=0.0))
+        share = bank.share(age / (age + bank.half))
         fallback = following[:, self.fallback] + offset
         self.filtered, self.expected = following[:, : self.recorded].copy(), fallback
         following[:, : self.recorded] += share * (fallback - following[:, : self.recorded])
         if some.any() or self.count.any():
             ramp = self.ramp.swapaxes(1, 2) @ self._A.T + (self._B * count[:, None, :]).swapaxes(1, 2)
             self.ramp[moving] = np.where(missing[..., None], ramp, 0.0).swapaxes(1, 2)[moving]
-        self.offset[moving], self.level[moving], self.count[moving] = offset[moving], level[moving], count[moving]
+        self.offset[moving], self.age[moving], self.count[moving] = offset[moving], age[moving], count[moving]

@@ -36,9 +36,9 @@ class Bank:
     @classmethod
     def of(cls, channels: Channels, length: float, settings: EstimatorSettings) -> Bank:
         """Return the bank for a median episode of so many samples."""
-        lags = settings.lags(length)
-        blocks = settings.blocks(length)
-        return cls(len(channels), channels.linear, channels.nonlinear, blocks, lags, (*settings.start, *lags))
+        lags = () if channels.recent else settings.lags(length)
+        starts = () if channels.recent else (*settings.start, *lags)
+        return cls(len(channels), channels.linear, channels.nonlinear, settings.blocks(length), lags, starts)
 
     @property
     def delayed(self) -> int:

@@ -15,7 +15,7 @@ Array = npt.NDArray[np.float64]
 Ranges = Mapping[str, tuple[float, float]]  # of measured states and inputs in training, in the recordings' units
 _QUADRATURE = {"sin": "cos", "cos": "sin"}
 CONSTANT = "1"
-FAMILIES = ("linear", "products", "products and random features")
+FAMILIES = ("delays", "linear", "products", "products and random features")  # the first without lags and start
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,6 +27,7 @@ class Channels:
     n_inputs: int
     linear: int  # so many channels are linear: measurements, the user's functions and inputs
     nonlinear: int = 0  # so many after them are functions with lags but no delays
+    recent: bool = False  # whether delays alone are filters, without lags and start
     inputs_only: bool = False  # whether they leave measurements out: for gaps
 
     @property
@@ -42,7 +43,7 @@ class Channels:
 
     def without_measurements(self) -> Channels:
         """Return the inputs and the constant alone."""
-        return replace(self, linear=self.n_inputs, nonlinear=0, inputs_only=True)
+        return replace(self, linear=self.n_inputs, nonlinear=0, recent=False, inputs_only=True)
 
     def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
         """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""
@@ -70,14 +71,14 @@ def channels_of(
     functions = list(dict.fromkeys(functions))
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
     names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
-    if family in FAMILIES[1:]:
-        nonlinear += products(names[: len(measured)], inputs, ranges, settings.beyond)
     if family in FAMILIES[2:]:
+        nonlinear += products(names[: len(measured)], inputs, ranges, settings.beyond)
+    if family in FAMILIES[3:]:
         nonlinear += random_features(names, inputs, ranges, settings)
     bare = replace(
         lifting, functions=tuple(functions), inputs=tuple(inputs), input_functions=(*of_inputs, *nonlinear, CONSTANT)
     )
-    return Channels(bare, tuple(measured), len(inputs), linear, len(nonlinear))
+    return Channels(bare, tuple(measured), len(inputs), linear, len(nonlinear), family == FAMILIES[0])
 
 
 def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:

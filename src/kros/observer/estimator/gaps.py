@@ -56,7 +56,7 @@ def losses(rng: np.random.Generator, shape: tuple[int, int, int]) -> Flags:
     n_samples, batch, _ = shape
     missing = np.zeros(shape, dtype=bool)
     for i in range(batch):
-        share, mean = rng.choice([0.1, 0.3, 0.5, 0.7, 0.9]), np.exp(rng.uniform(0, np.log(max(2, n_samples / 8))))
+        share, mean = rng.choice([0.1, 0.3, 0.5, 0.7, 0.9]), np.exp(rng.uniform(0, np.log(max(2, n_samples / 4))))
         state = False
         leave = 1 / max(mean, 1 / (1 - share)) if i % 2 else 1 - share
         enter = leave * share / (1 - share) if i % 2 else share
@@ -70,7 +70,7 @@ def losses(rng: np.random.Generator, shape: tuple[int, int, int]) -> Flags:
 
 
 def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
-    """Return the filter bank with the forgetting, memory and shares that make errors under simulated losses least."""
+    """Return the filter bank with the forgetting, level and shares that make errors under simulated losses least."""
     bank = observer.bank
     assert bank is not None
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
@@ -82,8 +82,9 @@ def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSet
         bank, forget=forgetting(observer, recordings, settings), levels=levels, shares=np.zeros((len(levels), n))
     )
     tried = []
-    for share in settings.memories:
-        one = replace(bank, memory=settings.memory(share))
+    recovery = float(np.exp(-1 / max(1.0, settings.recovery * settings.longest)))
+    for half in settings.halves:
+        one = replace(bank, half=half * settings.longest, recovery=recovery)
         main, fallback, level = alternatives(replace(observer, bank=one), y, inputs, parameters)
         shares = best_shares(states, main, fallback, level, levels)
         shares[:, at] = 0.0  # they stand for measurements, near the fallback

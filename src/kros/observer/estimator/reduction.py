@@ -67,7 +67,7 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:
         return whole.first(order)
-    signals = design.signals(some=_EPISODES, length=round(10 * max(design.bank.lags, default=1.0)))
+    signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
     wanted, most = whole.along(signals), 2 * loss
     low, high = 0, len(sigma)
     while high - low > 1:  # of errors that grow as little as asked, the least order

@@ -63,9 +63,14 @@ class EstimatorSettings(Settings):
         ge=1,
         description="how many times less an error of a measured state counts in the reduction than one of a hidden state",
     )
-    memories: tuple[float, ...] = Field(
+    halves: tuple[float, ...] = Field(
         (0.3, 1.0, 3.0, 10.0),
-        description="time constants of the level of a gap that are tried, in longest delays; the level decides how far the fallback counts",
+        description="ages of a gap at level one half that are tried, in longest delays; the level decides how far the fallback counts",
+    )
+    recovery: float = Field(
+        0.3,
+        gt=0,
+        description="time constant in which the age of a gap falls when measurements return, in longest delays",
     )
     room: float = Field(
         0.5,
@@ -100,7 +105,3 @@ class EstimatorSettings(Settings):
             width *= self.growth
             edges.append(min(longest, edges[-1] + int(np.ceil(width))))
         return tuple(edges)
-
-    def memory(self, share: float) -> float:
-        """Return the pole of the level of a gap, for a time constant in longest delays."""
-        return float(np.exp(-1 / max(1.0, share * self.longest)))

@@ -138,7 +138,9 @@ def calibrate_load(
     if current is not None:
         widened[..., current] -= load[:, used] - without_level(load[:, used], level_s, dt)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
-    kinds = [_LOADED if on else _UNLOADED for on in loaded]  # of one unit: those with a known load are too few to leave out
+    kinds = [
+        _LOADED if on else _UNLOADED for on in loaded
+    ]  # of one unit: those with a known load are too few to leave out
     keys = tuple(EpisodeKey("", kind, str(i)) for i, kind in zip(used, kinds, strict=True))
     seen_batch = replace(batch.take(used.tolist()), keys=keys, states=widened, shown=None, lost=None)
     at = tuple(np.flatnonzero(at_limit).tolist())

@@ -33,7 +33,7 @@ from .sections import Sections
 
 Array = npt.NDArray[Any]
 
-NEPER_DB = 20 * np.log10(np.e)
+NEPER_DB = 20 / np.log(10.0)
 _FARTHEST = 1.5  # nepers: largest change of a parameter in a step
 _NEGLIGIBLE = 1e-4  # weight of a term in a smoothed maximum
 _TINY = 1e-300

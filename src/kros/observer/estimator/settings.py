@@ -73,7 +73,7 @@ class EstimatorSettings(Settings):
         description="time constant in which the age of a gap falls when measurements return, in longest delays",
     )
     room: float = Field(
-        0.5,
+        0.25,
         ge=0,
         description="share of its range in training by which the estimate of a hidden state may leave it; it is cut off there",
     )

@@ -1,0 +1,81 @@
+"""Random patterns of lost measurements on the deployed observers of finished runs.
+
+    python benchmarks/losses.py RUN RUN ... [--patterns 200]
+
+Every pattern is independent loss of 10 to 95 %, a two-state Markov chain, or one long gap, over the first half of a test
+episode; the second half is complete. Printed are the largest error of a state in its ranges, of the fallback of inputs alone too,
+and the largest distance from the undisturbed estimate at the end, in percent of the range.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from kros.data import EpisodeBatch
+from kros.data.readers.parquet import read_parquet
+from kros.identify import IdentifiedModels
+from kros.observer import Observer, run_observer
+
+LONGEST = 6000
+
+
+def pattern(rng: np.random.Generator, samples: int) -> np.ndarray:
+    """Return which samples of the first half are lost."""
+    lost, half, kind = np.zeros(samples, dtype=bool), samples // 2, rng.integers(3)
+    if kind == 0:
+        lost[1:half] = rng.random(half - 1) < rng.uniform(0.1, 0.95)
+    elif kind == 1:
+        share, mean, state = rng.uniform(0.1, 0.95), np.exp(rng.uniform(0, np.log(half / 4))), False
+        for k in range(1, half):
+            leave = 1 / max(mean, 1.0)
+            state = bool(rng.random() >= leave) if state else bool(rng.random() < leave * share / (1 - share))
+            lost[k] = state
+    else:
+        start = int(rng.integers(1, half // 2))
+        lost[start : start + int(rng.integers(1, half - start))] = True
+    return lost
+
+
+def main() -> None:
+    """Try the deployed observer of every run."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", type=Path, nargs="+")
+    parser.add_argument("--patterns", type=int, default=200)
+    options = parser.parse_args()
+    for run in options.runs:
+        print(run, *tried(run, options.patterns))
+
+
+def tried(run: Path, patterns: int) -> list[str]:
+    """Return what is printed of a run."""
+    observer = Observer.load(run / "observers" / "deployed.json")
+    facts = json.loads((run / "population" / "facts.json").read_text())
+    population, identified = read_parquet(run / facts["recordings"]), IdentifiedModels.load(run)
+    keys = [key for key in identified.facts.test if key.unit in identified.parameters]
+    rng = np.random.default_rng(0)
+    chosen = [keys[i] for i in rng.integers(0, len(keys), patterns)]
+    batch = EpisodeBatch.read(population, chosen, LONGEST, identified.parameters)
+    batch = batch.head(int(batch.lengths.min()))
+    n, y = len(population.states), batch.states[..., list(observer.measured)]
+    lost = np.stack([pattern(rng, len(y)) for _ in chosen], axis=1)
+    values = observer.own(batch.parameters)
+    undisturbed = run_observer(observer, y, batch.inputs, values)
+    estimate = run_observer(observer, np.where(lost[..., None], np.nan, y), batch.inputs, values)
+    ranges = np.abs(batch.states).max(axis=(0, 1))
+    error = np.abs(estimate[..., :n] - batch.states).max(axis=(0, 1)) / ranges
+    end = np.abs(estimate - undisturbed)[-1, :, :n].max(axis=0) / ranges
+    return [
+        f"{observer.name}, {patterns} patterns of {len(y)} samples:",
+        "largest error, ranges:",
+        ", ".join(f"{name} {e:.3g}" for name, e in zip(population.states, error, strict=True)),
+        "; left at the end, percent:",
+        ", ".join(f"{100 * e:.2g}" for e in end),
+    ]
+
+
+if __name__ == "__main__":
+    main()

@@ -6,7 +6,7 @@ Examples
 --------
 >>> from kros.observer import EstimatorSettings
 >>> EstimatorSettings(first_lag=500.0).lags(6000)
-(300.0, 600.0, 1200.0, 2400.0)
+(300.0, 600.0)
 """
 
 from .build import Identified

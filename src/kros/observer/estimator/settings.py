@@ -15,7 +15,7 @@ class EstimatorSettings(Settings):
     --------
     >>> from kros.observer import EstimatorSettings
     >>> EstimatorSettings(dense=2, longest=8).blocks(6000), EstimatorSettings(first_lag=500.0).lags(6000)
-    ((0, 1, 2, 4, 6, 8), (300.0, 600.0, 1200.0, 2400.0))
+    ((0, 1, 2, 4, 6, 8), (300.0, 600.0))
     """
 
     dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
@@ -25,7 +25,7 @@ class EstimatorSettings(Settings):
     growth: float = Field(1.3, gt=1, description="ratio of the widths of blocks of delays beyond the dense ones")
     first_lag: float = Field(16.0, gt=0, description="shortest time constant of the first-order lags, in samples")
     lag_ratio: float = Field(2.0, gt=1, description="ratio of successive time constants")
-    last_lag: float = Field(0.4, gt=0, description="longest time constant, as a share of the median training episode")
+    last_lag: float = Field(0.1, gt=0, description="longest time constant, as a share of the median training episode")
     start: tuple[float, ...] = Field((2.0, 8.0, 32.0), description="further time constants of the start, in samples")
     features: int = Field(32, ge=0, description="random features of the richest family of channels")
     margin: float = Field(

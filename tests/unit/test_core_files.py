@@ -22,10 +22,9 @@ from kros.core.artifacts import (
     read_arrays,
     read_json,
     save_artifact,
-    write_bytes,
 )
 from kros.core.errors import ConfigError, DataError
-from kros.core.files import read_bytes, read_toml
+from kros.core.files import read_bytes, read_toml, write_bytes
 from kros.core.store import place
 
 

@@ -34,31 +34,24 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
     """Return what `pack_arrays` packed."""
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-            return {_array_name(info): _array(info, archive) for info in archive.infolist()}
+            return {info.filename.removesuffix(_ENDING): _array(info, archive) for info in archive.infolist()}
     except _DAMAGED as error:
-        raise DataError(
-            f"Reading {path}: not a valid archive of arrays ({error or type(error).__name__}); write it again with "
-            "the step that made it."
-        ) from error
-
-
-def _array_name(info: zipfile.ZipInfo) -> str:
-    if not info.filename.endswith(_ENDING):
-        raise ValueError(f"{info.filename!r} is not an array")
-    return info.filename.removesuffix(_ENDING)
+        problem = f"not a valid archive of arrays ({error or type(error).__name__})"
+        raise DataError(f"Reading {path}: {problem}; write it again with the step that made it.") from error
 
 
 def _array(info: zipfile.ZipInfo, archive: zipfile.ZipFile) -> np.ndarray:
-    if info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-        raise ValueError(f"{info.filename!r} is compressed, which kros never does")
+    """Return one array, whose header states as many bytes as there are."""
+    name = info.filename
+    if not name.endswith(_ENDING) or info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+        raise ValueError(f"{name!r} is compressed, which kros never does, or not an array")
     content = archive.read(info)  # checks the CRC
     file = io.BytesIO(content)
-    version = np.lib.format.read_magic(file)
-    if version != (1, 0):
-        raise ValueError(f"{info.filename!r} has a header of version {version}")
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name!r} has a header of another version")
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
     start, count = file.tell(), math.prod(shape)
     if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(content) - start:
-        raise ValueError(f"{info.filename!r} holds {len(content) - start} bytes, {dtype} of shape {shape} would not")
+        raise ValueError(f"{name!r} holds {len(content) - start} bytes, {dtype} of shape {shape} would not")
     values = np.frombuffer(content, dtype, count, start).reshape(shape, order="F" if fortran else "C")
     return np.array(values, order="K")

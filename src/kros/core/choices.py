@@ -15,6 +15,5 @@ def member(kind: type[E], value: E | str, what: str) -> E:
     try:
         return kind(value)
     except ValueError as error:
-        raise ConfigError(
-            f"{what} {value!r} is unknown; choose one of {', '.join(str(m.value) for m in kind)}."
-        ) from error
+        names = ", ".join(str(m.value) for m in kind)
+        raise ConfigError(f"{what} {value!r} is unknown; choose one of {names}.") from error

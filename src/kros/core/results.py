@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from .archive import pack_arrays, unpack_arrays
-from .artifacts import write_bytes
 from .errors import DataError
-from .files import read_bytes
+from .files import read_bytes, write_bytes
 from .limits import MAX_ARRAYS_BYTES
 from .store import digest_of
 
@@ -43,7 +42,7 @@ class Results:
 
     def read(self, digest: str | None, kinds: Iterable[type]) -> Any:
         """Return a result, or None."""
-        path = result_path(self.folder, digest or "none")
+        path = self.folder / f"{digest}.npz"
         if digest is None or not path.exists():
             return None
         try:
@@ -64,13 +63,8 @@ class Storing:
         """Compute."""
         result = self.function(task[1])
         if task[0] is not None:
-            write_bytes(result_path(self.folder, task[0]), packed(result))
+            write_bytes(self.folder / f"{task[0]}.npz", packed(result))
         return result
-
-
-def result_path(folder: Path, digest: str) -> Path:
-    """Return where a result is."""
-    return folder / f"{digest}.npz"
 
 
 def packed(value: Any) -> bytes:
@@ -87,32 +81,34 @@ def unpacked(content: bytes, path: Path, kinds: Mapping[str, type]) -> Any:
 
 
 def _plain(value: Any, arrays: list[np.ndarray]) -> Any:
-    """Turn a value into what JSON can hold; everything that is not JSON's own stands under the name of its kind."""
+    """Turn a value into what JSON can hold: what is not JSON's own becomes ``[kind, ...]``."""
     if value is None or type(value) in (str, int, bool, float):
         return value
     if isinstance(value, np.ndarray | np.generic):
         arrays.append(np.asarray(value))
-        return {"array" if isinstance(value, np.ndarray) else "number": len(arrays) - 1, "shape": np.shape(value)}
+        return ["array" if isinstance(value, np.ndarray) else "number", len(arrays) - 1, np.shape(value)]
     if dataclasses.is_dataclass(value):
-        fields = {f.name: _plain(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
-        return {"is": type(value).__name__, "with": fields}
+        return [
+            type(value).__name__,
+            {f.name: _plain(getattr(value, f.name), arrays) for f in dataclasses.fields(value)},
+        ]
     if isinstance(value, list | tuple):
-        return {type(value).__name__: [_plain(v, arrays) for v in value]}
+        return [type(value).__name__, [_plain(v, arrays) for v in value]]
     if isinstance(value, dict):
-        return {"dict": {k: _plain(v, arrays) for k, v in value.items()}}
+        return ["dict", {k: _plain(v, arrays) for k, v in value.items()}]
     raise TypeError(f"Storing a result: {type(value).__name__} is of no kind that can be stored.")
 
 
 def _restored(value: Any, arrays: Mapping[str, np.ndarray], kinds: Mapping[str, type]) -> Any:
-    if not isinstance(value, dict):
+    """Return what `_plain` turned into JSON."""
+    if not isinstance(value, list):
         return value
-    if "is" in value:
-        return kinds[value["is"]](**{name: _restored(v, arrays, kinds) for name, v in value["with"].items()})
-    if "shape" in value:
-        array = arrays[str(value.get("array", value.get("number")))].reshape(value["shape"])
-        return array if "array" in value else array[()]
-    ((kind, content),) = value.items()
-    if kind == "dict":
-        return {k: _restored(v, arrays, kinds) for k, v in content.items()}
-    items = [_restored(v, arrays, kinds) for v in content]
-    return tuple(items) if kind == "tuple" else items
+    kind, content, *shape = value
+    if shape:
+        array = arrays[str(content)].reshape(shape[0])
+        return array if kind == "array" else array[()]
+    if isinstance(content, list):
+        items = [_restored(v, arrays, kinds) for v in content]
+        return tuple(items) if kind == "tuple" else items
+    fields = {name: _restored(v, arrays, kinds) for name, v in content.items()}
+    return fields if kind == "dict" else kinds[kind](**fields)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from .results import Results, Storing
 
@@ -13,24 +13,16 @@ T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 
-class Executor(Protocol):
-    """Maps a function over tasks, in order."""
-
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        ...
-
-
-class SerialExecutor:
-    """Runs every task in this process."""
+class Executor:
+    """Maps a function over tasks: here, one behind the other; others derive from it."""
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Yield results in the order of the tasks."""
         return map(function, tasks)
 
 
-class Progress(Protocol):
-    """Told which part of a computation runs and how far it is."""
+class Progress:
+    """Listens to which part of a computation runs and how far it is; this one ignores everything."""
 
     def start(self, stage: str, total: int | None) -> None:
         """A stage (or a part of one) begins."""
@@ -42,32 +34,23 @@ class Progress(Protocol):
         """A stage is done, or was skipped."""
 
 
-class Silent:
-    """A progress listener that ignores everything."""
-
-    def start(self, stage: str, total: int | None) -> None:
-        """Ignore."""
-
-    def advance(self) -> None:
-        """Ignore."""
-
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """Ignore."""
-
-
 @dataclass(frozen=True)
 class Work:
     """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
-    executor: Executor = field(default_factory=SerialExecutor)
-    progress: Progress = field(default_factory=Silent)
+    executor: Executor = field(default_factory=Executor)
+    progress: Progress = field(default_factory=Progress)
     results: Results | None = None
 
     def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Map a function over tasks, in order."""
         tasks = list(tasks)
-        self.progress.start(title, len(tasks))
-        for result in self.executor.map(function, tasks):
+        return self._followed(title, len(tasks), self.executor.map(function, tasks))
+
+    def _followed(self, title: str, total: int, results: Iterator[T]) -> Iterator[T]:
+        """Yield results, and report progress."""
+        self.progress.start(title, total)
+        for result in results:
             self.progress.advance()
             yield result
 
@@ -85,11 +68,10 @@ class Work:
             yield from self.map(title, function, tasks)
             return
         tasks, kinds, digests = list(tasks), tuple(kinds), self.results.digests(function, marks)
-        earlier = [self.results.read(digest, kinds) for digest in digests]
-        earlier = [
-            None if result is None or not usable(task, result) else result
-            for task, result in zip(tasks, earlier, strict=True)
-        ]
+        earlier: list[Any] = []
+        for task, digest in zip(tasks, digests, strict=True):
+            result = self.results.read(digest, kinds)
+            earlier.append(result if result is not None and usable(task, result) else None)
         new = [row for row, result in zip(zip(digests, tasks, strict=True), earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
@@ -106,16 +88,7 @@ class Work:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         pieces = list(work)
         running = self.executor.map(_call, pieces)
-
-        def results() -> list[T]:
-            self.progress.start(title, len(pieces))
-            computed = []
-            for result in running:
-                self.progress.advance()
-                computed.append(result)
-            return computed
-
-        return results
+        return lambda: list(self._followed(title, len(pieces), running))
 
 
 def _call(work: Callable[[], T]) -> T:

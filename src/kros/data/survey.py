@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact
+from ..core.artifacts import load_artifact, loader
 from ..core.errors import DataError
 from ..core.files import is_file
-from ..core.loading import loader
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, refuse_copies, scan_digests

@@ -8,10 +8,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.choices import member
 from ..core.errors import SynthesisError
-from ..core.loading import loader
 from ..core.lti import StateSpace
 
 log = logging.getLogger(__name__)

@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError
-from ...core.files import did_you_mean, require_regular, shortened
-from ...core.memory import pass_on_shortage
+from ...core.files import did_you_mean, pass_on_shortage, require_regular, shortened
 from ..arrow import fill
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit

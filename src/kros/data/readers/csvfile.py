@@ -18,8 +18,7 @@ import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened
-from ...core.memory import pass_on_shortage
+from ...core.files import pass_on_shortage, require_regular, shortened
 from ..arrow import fill
 
 # cells of spreadsheets without a number

@@ -17,8 +17,7 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.artifacts import load_artifact
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened
-from ...core.memory import pass_on_shortage
+from ...core.files import pass_on_shortage, require_regular, shortened
 from ..arrow import fill
 from ..checks import check_period
 from ..population import Channel, EpisodeKey, Population, Role, Unit, columns_in_order

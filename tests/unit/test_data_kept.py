@@ -5,7 +5,7 @@ import pytest
 
 import kros
 from kros.data import write_parquet
-from kros.data.readers.parquet import Kept, read_parquet
+from kros.data.readers.parquet import ArrayCache, read_parquet
 
 RAMP = np.arange(40.0).reshape(20, 2)
 
@@ -31,7 +31,7 @@ def test_a_file_that_was_written_anew_is_read_anew(tmp_path):
 
 
 def test_no_more_is_kept_than_stated_and_a_large_array_throws_nothing_out():
-    kept = Kept(limit=1000)
+    kept = ArrayCache(limit=1000)
     for name in "abcd":
         kept.take(name, lambda: np.zeros(40))
     assert list(kept.arrays) == ["b", "c", "d"]

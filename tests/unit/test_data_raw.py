@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, Unit, from_arrays, write_raw
+from kros.data import EpisodeKey, Unit, from_arrays, prepare, write_raw
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, read_motor_drive_raw
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
@@ -175,10 +175,7 @@ def simulated(seed: int = 0) -> np.ndarray:
 
 
 def prepared_channels() -> tuple:
-    channels = CHANNELS
-    for step in STEPS:
-        channels = step.channels_after(channels)
-    return channels
+    return prepare(from_arrays({"a": [np.ones((2, 5))]}, CHANNELS, 1e-3), STEPS).channels
 
 
 def test_write_raw_is_the_inverse_of_the_reader(tmp_path: Path) -> None:

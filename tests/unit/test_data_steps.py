@@ -79,7 +79,7 @@ def test_resampling_straight_lines_is_exact_at_any_rate() -> None:
     time = uneven(0.01, 500, 1)
     lines = np.column_stack([3 * time + 1, -time, 0 * time])
     for period in (0.004, 0.01, 0.025, 0.1):
-        result = Resample(period).resampled(time, lines, 0.01)
+        result = Resample(period).on_grid(time, lines, 0.01)
         grid = time[0] + period * np.arange(len(result))
         assert grid[-1] <= time[-1] + 1e-9 < grid[-1] + period + 1e-6
         np.testing.assert_allclose(result, np.column_stack([3 * grid + 1, -grid, 0 * grid]), atol=1e-12)
@@ -88,7 +88,7 @@ def test_resampling_straight_lines_is_exact_at_any_rate() -> None:
 def test_resampling_keeps_slow_and_removes_what_would_alias() -> None:
     time = np.arange(0, 20, 0.001)
     slow, fast = np.sin(2 * np.pi * 3 * time), np.sin(2 * np.pi * 97 * time)  # 97 Hz aliases to 3 Hz at 50 Hz
-    result = Resample(0.02).resampled(time, np.column_stack([slow, fast]), 0.001)
+    result = Resample(0.02).on_grid(time, np.column_stack([slow, fast]), 0.001)
     middle = slice(50, -50)
     np.testing.assert_allclose(
         result[middle, 0], np.sin(2 * np.pi * 3 * 0.02 * np.arange(len(result)))[middle], atol=5e-3

@@ -9,13 +9,14 @@ import stat
 import tempfile
 import tomllib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
+from .locks import locked
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -34,6 +35,12 @@ def is_file(path: Path) -> bool:
         return stat.S_ISREG(path.lstat().st_mode)
     except (OSError, ValueError):
         return False
+
+
+def stamp_of(path: Path) -> tuple[int, int]:
+    """Return size and time of change of a file."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:
@@ -91,16 +98,23 @@ def whole_folder(out: Path) -> Iterator[Path]:
     out = out.absolute()
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
-    with draft_beside(out.parent) as draft:
-        draft.mkdir()
-        yield draft
-        if out.exists() and os.name == "nt":
-            out.rmdir()
-        try:
-            draft.replace(out)
-        except OSError as error:
-            advice = "was another process at work on it? Choose another name"
-            raise DataError(f"Writing {out}: it cannot be put into its place ({error}); {advice}.") from error
+    work = out.with_name(f"{TEMPORARY}{out.name}")
+    draft = work / "draft"
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(work):
+            shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed
+            try:
+                draft.mkdir()
+                yield draft
+                with suppress(FileNotFoundError):
+                    out.rmdir()
+                draft.replace(out)
+            finally:
+                shutil.rmtree(draft, ignore_errors=True)
+    finally:
+        with suppress(OSError):  # another process has begun
+            work.rmdir()
 
 
 def link_or_copy(source: Path, target: Path) -> None:

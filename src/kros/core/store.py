@@ -22,7 +22,7 @@ from pydantic import Field, NonNegativeFloat
 
 from .artifacts import CHECKSUM, check_checksum, read_json, with_checksum, write_json
 from .errors import ConfigError, DataError
-from .files import TEMPORARY, draft_beside, is_file, link_or_copy
+from .files import TEMPORARY, draft_beside, is_file, link_or_copy, stamp_of
 from .settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
@@ -46,7 +46,7 @@ class Artefact(Settings):
     def matches(self, folder: Path, name: str) -> bool:
         """Return whether a file is in a folder as it was written; one with its size and time is not read."""
         path, (content, *stamp) = place(folder, name), self.files[name]
-        return is_file(path) and (_stamp(path) == tuple(stamp) or file_digest(path) == content)
+        return is_file(path) and (stamp_of(path) == tuple(stamp) or file_digest(path) == content)
 
 
 def digest_of(*content: object) -> str:
@@ -62,12 +62,7 @@ def file_digest(path: Path) -> str:
 
 def describe(path: Path) -> Described:
     """Return digest, size and time of a file."""
-    return file_digest(path), *_stamp(path)
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
+    return file_digest(path), *stamp_of(path)
 
 
 def place(folder: Path, name: str) -> Path:

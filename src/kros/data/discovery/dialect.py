@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.errors import DataError
-from ..readers.csvfile import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
+from ..readers.tables import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
 from .measures import is_unit_row
 
 HEAD_BYTES = 1 << 18

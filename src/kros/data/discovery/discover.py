@@ -19,8 +19,8 @@ from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
-from ..readers.csv_folder import csv_files, file_fields, parquet_columns, parquet_head, read_csv_folder
-from ..readers.csvfile import Dialect, read_columns
+from ..readers.csv_folder import csv_files, read_csv_folder
+from ..readers.tables import Dialect, file_fields, parquet_head, read_columns
 from ..recording import some, usable
 from .dialect import ROWS, TableHead, look_at
 from .examine import RULE, Examined, examine
@@ -220,7 +220,8 @@ def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     if path.suffix == ".parquet":
-        return parquet_columns(path, [head.fields[i] for i in columns])
+        fields = file_fields(path)
+        return read_columns(path, fields, [head.fields[i] for i in columns])
     names = [f"{field or 'column'} #{i + 1}" for i, field in enumerate(head.fields)]
     return read_columns(path, names, [names[i] for i in columns], head.dialect)
 

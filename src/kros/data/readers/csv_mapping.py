@@ -12,10 +12,9 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core.files import read_toml
 from ...core.settings import Settings
-from ..population import Channel, Role, columns_in_order
-from ..scaling import Scaling
+from ..population import Channel, Role, Scaling, columns_in_order
 from ..steps import Scale, Step, parse_steps
-from .csvfile import Dialect
+from .tables import Dialect
 
 Column = str | int  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")

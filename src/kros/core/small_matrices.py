@@ -1,7 +1,7 @@
 """Products and largest singular values of many small matrices, on long vectors.
 
-NumPy multiplies stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every
-entry is a long vector over units and frequencies: a product of small matrices is a few dozen vector operations.
+LAPACK takes stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every entry
+is a long vector over units and frequencies.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
-_UNROLL = 6  # beyond this inner size BLAS wins
 _RANK = 1e-12  # columns closer to parallel than this are left to the SVD, which decides about the rank
 
 
@@ -29,19 +28,7 @@ def entries_last(matrices: Array) -> Array:
 
 def multiply(left: Array, right: Array) -> Array:
     """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
-    p, r, m = left.shape[0], left.shape[1], right.shape[1]
-    rest = np.broadcast_shapes(left.shape[2:], right.shape[2:])
-    out = np.empty((p, m, *rest), np.result_type(left, right))
-    if r > _UNROLL:
-        out[...] = entries_first(entries_last(left) @ entries_last(right))
-        return out
-    scratch = np.empty(rest, out.dtype)
-    for i in range(p):
-        for j in range(m):
-            np.multiply(left[i, 0], right[0, j], out=out[i, j, ...])
-            for k in range(1, r):
-                out[i, j] += np.multiply(left[i, k], right[k, j], out=scratch)
-    return out
+    return np.asarray(np.einsum("ik...,kj...->ij...", left, right))
 
 
 def adjoint(matrices: Array) -> Array:

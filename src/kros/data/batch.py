@@ -66,10 +66,7 @@ class EpisodeBatch:
         parameters: Mapping[str, Mapping[str, float]] | None = None,
         truths: bool = False,
     ) -> EpisodeBatch:
-        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have.
-
-        With `truths` also what states really were, for evaluation.
-        """
+        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have."""
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
         pairs = [population.read_with_truths(key) for key in keys]
@@ -88,10 +85,7 @@ class EpisodeBatch:
         return tuple(k.unit for k in self.keys)
 
     def measurements(self, measured: Sequence[int], arrived: bool = True) -> Array:
-        """Return what the sensor shows of some states, shape (n_samples, batch, q).
-
-        NaN where a sample does not arrive; what would have arrived there where `arrived` is false.
-        """
+        """Return what the sensor shows of some states, (n_samples, batch, q), NaN where a sample has not `arrived`."""
         at = list(measured)
         y = np.ascontiguousarray((self.states if self.shown is None else self.shown)[..., at])
         return np.where(self.lost[..., at], np.nan, y) if arrived and self.lost is not None else y
@@ -115,25 +109,13 @@ class EpisodeBatch:
         return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
     def first_states(self, history: int = 0) -> Array:
-        """Return what a simulation starts from: the first states of every episode, with `history` more for delays.
-
-        Returns
-        -------
-        ndarray, shape (batch, n), or (batch, history + 1, n) for a lifting with delays
-
-        Raises
-        ------
-        DataError
-            When an episode is shorter than the history.
-        """
+        """Return the first states of every episode, (batch, n), or (batch, history + 1, n) for a lifting with delays."""
         if not history:
             return self.states[0]
         for key, length in zip(self.keys, self.lengths, strict=True):
             if length < history + 1:
-                raise DataError(
-                    f"Simulation of {key}: needs {history + 1} samples for delays of up to {history}, found {length}; "
-                    "leave the episode out."
-                )
+                needs = f"needs {history + 1} samples for delays of up to {history}, found {length}"
+                raise DataError(f"Simulation of {key}: {needs}; leave the episode out.")
         return np.swapaxes(self.states[: history + 1], 0, 1)
 
 

@@ -20,7 +20,6 @@ from kros.data import (
     EpisodeKey,
     Role,
     from_arrays,
-    from_frame,
     from_pykoop,
     prepare,
     read,
@@ -80,12 +79,6 @@ def test_text_that_is_no_table(tmp_path: Path, content: bytes, found: str) -> No
     (tmp_path / "a.csv").write_bytes(content)
     with pytest.raises(DataError, match=found):
         scan(tmp_path)
-
-
-def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(b'made "on monday\nby, me\n' + GOOD)
-    found = scan(tmp_path, skip_rows=2)
-    assert found.read(found.episodes[0])[1, 0] == pytest.approx(np.sin(1), abs=1e-4)
 
 
 def bomb(path: Path, line: bytes, megabytes: int) -> None:
@@ -151,19 +144,6 @@ def test_periods_that_are_none(period: Any) -> None:
         from_pykoop(np.column_stack([np.zeros(80), samples(0)]), 1, period)
 
 
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("time_scale", 0), ("time_scale", -1), ("time_scale", float("nan"))],
-)
-def test_numbers_of_a_mapping(tmp_path: Path, key: str, value: Any) -> None:
-    with pytest.raises(ConfigError, match=key):
-        read(tmp_path.parent, "csv", mapping={**MAPPING, key: value})
-    without = {k: v for k, v in MAPPING.items() if k != "time"}
-    for period in (0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ConfigError, match="sample_period_s"):
-            read(tmp_path.parent, "csv", mapping={**without, "sample_period_s": period})
-
-
 @pytest.mark.parametrize("cutoff", [0.0, -1.0, 50.0, 51.0, float("nan"), float("inf")])
 def test_cut_offs_lie_between_zero_and_nyquist(cutoff: float) -> None:
     population = from_arrays({"a": [samples(0)]}, CHANNELS, 0.01)
@@ -196,18 +176,6 @@ def test_names_that_are_none(name: str) -> None:
 def test_arrays_that_hold_no_numbers(values: Any) -> None:
     with pytest.raises(DataError, match=r"Episode 0 of unit a .* needs numbers"):
         from_arrays({"a": [values]}, CHANNELS, 0.01)
-
-
-def test_frames_that_hold_no_numbers() -> None:
-    import pandas as pd
-
-    good = pd.DataFrame(samples(0), columns=["x", "v", "u"]).assign(unit="a")
-    from_frame(good, CHANNELS, sample_period_s=0.01)
-    for kind in ("complex128", "str", "datetime64[ns]"):
-        with pytest.raises(DataError, match="column 'v' should hold numbers"):
-            from_frame(good.assign(v=good["v"].astype(kind)), CHANNELS, sample_period_s=0.01)
-    with pytest.raises(DataError, match="column 'v' occurs 2 times"):
-        from_frame(pd.concat([good, good[["v"]]], axis=1), CHANNELS, sample_period_s=0.01)
 
 
 # ------------------------------------------------------------------------------------------------------------------------------- Parquet
@@ -311,3 +279,9 @@ def test_a_speed_that_is_no_slope_is_said(scale: float) -> None:
     found = [a for a in period_alerts(motion, CHANNELS, 1e-2 * scale) if "slope" in a]
     assert len(found) >= 1
     assert "'v' is the slope of 'x'" in found[0]
+
+
+def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b'made "on monday\nby, me\n' + GOOD)
+    found = scan(tmp_path, skip_rows=2)
+    assert found.read(found.episodes[0])[1, 0] == pytest.approx(np.sin(1), abs=1e-4)

@@ -51,11 +51,6 @@ def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
     assert named.read(named.episodes[0]).shape[1] == len(named.channels)
 
 
-@pytest.mark.parametrize("name", ["empty", "other", "missing"])
-def test_nothing_fits(folders: Path, name: str) -> None:
-    assert detect_reader(folders / name) is None
-
-
 @pytest.mark.parametrize(
     ("reader", "folder", "found"),
     [

@@ -7,7 +7,6 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
-from kros.data.recording import Recording, estimate_period
 from kros.data.steps import Resample, lowpass
 
 KEY = EpisodeKey("a", "default", "0")
@@ -21,13 +20,6 @@ def population(values: np.ndarray, period: float = 0.1) -> Population:
 def counting(n: int = 10) -> np.ndarray:
     k = np.arange(n, dtype=float)
     return np.column_stack([k, 100 + k, 200 + k])
-
-
-def test_scale_touches_its_channels_and_their_unit() -> None:
-    scaled = prepare(population(counting()), [steps.Scale(("x",), 0.5, "rad")])
-    np.testing.assert_array_equal(scaled.read(KEY), counting() * [0.5, 1, 1])
-    assert [c.unit for c in scaled.channels] == ["rad", "", ""]
-    assert scaled.channels[0].measured
 
 
 @pytest.mark.parametrize("lag", [0, 1, 3, -1, -3])
@@ -192,10 +184,3 @@ def test_steps_from_toml() -> None:
 def test_steps_from_toml_refuse(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         steps.parse_steps([table])
-
-
-@pytest.mark.parametrize("jitter", [0.0, 1e-12, 1e-5, 0.3])
-def test_the_period_is_the_median_step_in_six_digits(jitter):
-    steps = 1e-3 * (1 + jitter * np.random.default_rng(0).uniform(-1, 1, 501))
-    recording = Recording(KEY, np.zeros((502, 1)), np.concatenate([[5.0], 5.0 + np.cumsum(steps)]))
-    assert estimate_period(recording) == float(f"{np.median(np.diff(recording.time_s)):.6g}")

@@ -187,3 +187,13 @@ def test_what_a_killed_writer_left_goes_and_two_at_once_are_refused(tmp_path: Pa
     write_parquet(population(), out)
     assert [p.name for p in tmp_path.iterdir()] == ["population"]
     assert not (out / "half").exists()
+
+
+def test_an_episode_is_read_once_and_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
+    for name, units in (("one", ("a",)), ("two", ("b", "a"))):
+        write_parquet(population(units), tmp_path / name)
+    found, key = read_parquet(tmp_path / "one"), EpisodeKey("a", "cold", "0")
+    first = found.read(key)
+    assert found.read(key) is first
+    (tmp_path / "two" / "a@cold.parquet").replace(tmp_path / "one" / "a@cold.parquet")
+    np.testing.assert_array_equal(found.read(key), population(("b", "a")).read(key))

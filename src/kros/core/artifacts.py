@@ -8,8 +8,12 @@ is not read: a file that was edited on purpose is accepted once its key ``checks
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import math
+import struct
+import tokenize
+import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import wraps
@@ -20,7 +24,6 @@ import numpy as np
 from pydantic_core import to_jsonable_python
 
 from . import limits
-from .archive import pack_arrays, unpack_arrays
 from .errors import DataError, KrosError
 from .files import read_bytes, shortened, write_bytes
 
@@ -28,6 +31,9 @@ T = TypeVar("T")
 SCHEMA = 1
 CHECKSUM = "checksum"
 _AGAIN = "write it again with the step that made it"
+_ENDING = ".npy"
+_DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
+_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError)  # of bytes that were changed
 
 
 class LoadedContent(dict[Any, Any]):
@@ -104,6 +110,44 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
         advice = f'write it again, or remove the key "{CHECKSUM}" where it was edited on purpose'
         raise DataError(f"Reading {path}: {problem}; {advice}.")
     return CHECKSUM in content
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return an .npz of arrays, without pickle and not compressed."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}{_ENDING}", date_time=(1980, 1, 1, 0, 0, 0)), content.getvalue())
+    return buffer.getvalue()
+
+
+def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
+    """Return what `pack_arrays` packed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+            return {info.filename.removesuffix(_ENDING): _array(info, archive) for info in archive.infolist()}
+    except _DAMAGED as error:
+        problem = f"not a valid archive of arrays ({error or type(error).__name__})"
+        raise DataError(f"Reading {path}: {problem}; write it again with the step that made it.") from error
+
+
+def _array(info: zipfile.ZipInfo, archive: zipfile.ZipFile) -> np.ndarray:
+    """Return one array, whose header states as many bytes as there are."""
+    name = info.filename
+    if not name.endswith(_ENDING) or info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+        raise ValueError(f"{name!r} is compressed, which kros never does, or not an array")
+    content = archive.read(info)  # checks the CRC
+    file = io.BytesIO(content)
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name!r} has a header of another version")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    start, count = file.tell(), math.prod(shape)
+    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(content) - start:
+        raise ValueError(f"{name!r} holds {len(content) - start} bytes, {dtype} of shape {shape} would not")
+    values = np.frombuffer(content, dtype, count, start).reshape(shape, order="F" if fortran else "C")
+    return np.array(values, order="K")
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:

@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..core.choices import member
 from ..core.errors import DataError
+from ..core.settings import member
 
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results

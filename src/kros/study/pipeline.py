@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.choices import member
 from ..core.errors import ConfigError
+from ..core.settings import member
 from ..core.work import Executor, Progress, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader

@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from ..core.artifacts import load_artifact, loader, save_artifact
-from ..core.choices import member
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
+from ..core.settings import member
 
 log = logging.getLogger(__name__)
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
-from ...core.memory import keep_freed_memory
-from ...core.work import Executor
+from ...core.work import Executor, keep_freed_memory
 from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")

@@ -1,4 +1,4 @@
-"""Every reader gives the same population: raw layout, Parquet, CSV with a mapping, arrays, a long frame, pykoop's array."""
+"""Every reader gives the same population: raw layout, Parquet, CSV, arrays, a long frame, pykoop's array."""
 
 from collections.abc import Callable
 from dataclasses import replace

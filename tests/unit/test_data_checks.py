@@ -37,7 +37,8 @@ def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population
 def test_non_finite(rows: slice, value: Any, found: str) -> None:
     bad = values()
     bad[rows, 1] = value
-    match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; fix the source or set data\.on_nan = \"drop_episode\"\.$"
+    advice = r"fix the source or set data\.on_nan = \"drop_episode\""
+    match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; {advice}\.$"
     with pytest.raises(DataError, match=match):
         check_episode(bad, KEY, CHANNELS)
 
@@ -99,7 +100,7 @@ def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
     stuck = [np.tile([0.0, 2.5, 1.0], (20, 1)), np.tile([1.0, later, 1.0], (30, 1))]
     with pytest.raises(
         DataError,
-        match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor",
+        match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check",
     ):
         scan_digests(population({"a": stuck}))
 

@@ -186,7 +186,7 @@ def test_another_rate(folder: Path) -> None:
         ({"files": "(?P<run>a)"}, "names the group 'run'; known groups are unit, condition, episode, group"),
         ({"time": None}, "one of time and sample_period_s"),
         ({"sample_period_s": 0.1}, "one of time and sample_period_s"),
-        ({"time": 0}, "numbered from 1, found 0"),
+        ({"time": 0}, "greater than or equal to 1, found 0"),
         ({"header": False}, "leaves columns without names, found 't'"),
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),

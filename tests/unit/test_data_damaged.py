@@ -1,4 +1,4 @@
-"""Recordings that are no recordings, or not those they are said to be: refused with a reason, in bounded time and memory."""
+"""Recordings that are none, or not those they are said to be: refused with a reason, in bounded time and memory."""
 
 import gzip
 import json
@@ -51,7 +51,7 @@ def scan(folder: Path, **mapping: Any) -> Any:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------------------- files of text
+# ------------------------------------------------------------------------------------------------- files of text
 @pytest.mark.parametrize(
     ("content", "found"),
     [
@@ -135,7 +135,7 @@ def test_names_that_no_table_can_show(tmp_path: Path) -> None:
         scan(tmp_path, files=r"(?P<unit>.+)\.csv")
 
 
-# ---------------------------------------------------------------------------------------------------------------- periods, cut-offs, names
+# -------------------------------------------------------------------------------------- periods, cut-offs, names
 @pytest.mark.parametrize("period", [0, -0.01, float("nan"), float("inf"), "0.01", None, True])
 def test_periods_that_are_none(period: Any) -> None:
     with pytest.raises(DataError, match="sampling period should be a number of seconds above zero"):
@@ -168,7 +168,7 @@ def test_names_that_are_none(name: str) -> None:
         prepare(from_arrays({"a": [samples(0)]}, CHANNELS, 0.01), [steps.Differentiate("x", name, 5.0)])
 
 
-# --------------------------------------------------------------------------------------------------------------------------- in memory
+# ----------------------------------------------------------------------------------------------------- in memory
 @pytest.mark.parametrize(
     "values",
     [samples(0).astype(complex), samples(0).astype(str), samples(0).astype("datetime64[s]"), [[1, "2", 3]] * 9],
@@ -178,7 +178,7 @@ def test_arrays_that_hold_no_numbers(values: Any) -> None:
         from_arrays({"a": [values]}, CHANNELS, 0.01)
 
 
-# ------------------------------------------------------------------------------------------------------------------------------- Parquet
+# ------------------------------------------------------------------------------------------------------- Parquet
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
     write_parquet(
@@ -245,7 +245,7 @@ def test_files_elsewhere_are_not_read(stored: Path) -> None:
         read_parquet(stored)
 
 
-# -------------------------------------------------------------------------------------------------------------- copies, stuck, periods
+# ---------------------------------------------------------------------------------------- copies, stuck, periods
 @pytest.mark.parametrize(
     "copied",
     [

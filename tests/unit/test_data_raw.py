@@ -16,7 +16,7 @@ DEG = math.pi / 180 / 100
 
 
 def truth(seed: int, n: int = N) -> np.ndarray:
-    """Motor-side samples: time, position, velocity, torque, target position, target velocity, targets beside their measurements."""
+    """Motor-side samples: time, position, velocity, torque, target position and velocity beside their measurements."""
     rng = np.random.default_rng(seed)
     time = np.arange(n) * 1e-3
     moving = np.where(np.arange(n) >= 1000, time - 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Recordings that are odd rather than unreadable: units of measure mixed up, wild samples, repeated stamps, short episodes, names of other layouts."""
+"""Recordings that are odd rather than unreadable: units mixed up, wild samples, repeated stamps, other layouts."""
 
 from __future__ import annotations
 

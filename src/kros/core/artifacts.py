@@ -2,7 +2,7 @@
 
 An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum
 of both). Files appear whole or not at all: they are written beside their place and moved there. What was changed since
-is not read: a file that was edited on purpose is accepted once its key ``checksum`` is removed, and its reader checks it.
+is not read. A file that was edited on purpose is accepted once its key ``checksum`` is removed; its reader checks it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class LoadedContent(dict[Any, Any]):
 
 
 def plain(value: Any) -> Any:
-    """Turn dataclasses, enums, dates, NumPy's numbers and arrays into JSON's own types; NaN and infinity become null."""
+    """Turn dataclasses, enums, dates and NumPy's arrays into JSON's own types; NaN and infinity become null."""
     return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
 
 
@@ -209,7 +209,7 @@ def as_written(what: str, path: Path) -> Iterator[None]:
 
 
 def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
-    """Wrap a ``load(cls, path)`` in `as_written`; stands under ``@classmethod``."""
+    """Wrap a ``load(cls, path)`` in `as_written`; applied below ``@classmethod``."""
 
     @wraps(load)
     def guarded(cls: Any, path: Any) -> T:

@@ -91,7 +91,7 @@ class StateSpace:
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
-        """Return any object with `A, B, C, D, dt` as a `StateSpace`; a period of None is that of a continuous system."""
+        """Return any object with `A, B, C, D, dt` as a `StateSpace`; a period of None means continuous time."""
         if isinstance(system, cls):
             return system
         try:

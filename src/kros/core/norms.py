@@ -46,13 +46,19 @@ def as_state_space(system: Any) -> StateSpace:
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Gramian of a stable pair: ``P = A P A' + B B'``, or ``A P + P A' + B B' = 0`` for ``dt = 0``."""
-    if dt > 0:
-        R = gramian_root(A, B, dt)
-        return np.asarray(R @ R.T)
-    from scipy.linalg import solve_continuous_lyapunov
+    """Gramian of a stable pair, ``P = A P A' + B B'`` by doubling; ``A P + P A' + B B' = 0`` for ``dt = 0``."""
+    power, P = A, B @ B.T
+    if dt == 0:
+        from scipy.linalg import solve_continuous_lyapunov
 
-    return np.asarray(solve_continuous_lyapunov(A, -B @ B.T))
+        return np.asarray(solve_continuous_lyapunov(A, -P))
+    for _ in range(_MAX_ITERATIONS):
+        step = power @ P @ power.T
+        P = P + step
+        if np.abs(step).max(initial=0.0) <= _EPSILON * np.abs(P).max(initial=0.0):
+            break
+        power = power @ power
+    return (P + P.T) / 2
 
 
 def gramian_root(A: Array, B: Array, dt: float) -> Array:
@@ -164,7 +170,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    search, room = (_largest, tol) if error <= tol else (_peak, error)  # eigenvalues are no better than gains
+    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
     for _ in range(_MAX_ITERATIONS):
         peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
         before, (at, lower) = lower, max((peak, best), (at, lower), key=lambda pair: pair[1])

@@ -13,7 +13,6 @@ from ..core.errors import DataError
 from .population import EpisodeKey, Population
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 512  # samples of all episodes that are put side by side at once: they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ class EpisodeBatch:
         return np.where(self.lost[..., at], np.nan, y) if arrived and self.lost is not None else y
 
     def head(self, n_samples: int) -> EpisodeBatch:
-        """Return the same episodes, cut to so many samples."""
+        """Return the same episodes, cut to a number of samples."""
         return replace(self, lengths=np.minimum(self.lengths, n_samples), **self._signals(np.s_[:n_samples]))
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
@@ -109,7 +108,7 @@ class EpisodeBatch:
         return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
     def first_states(self, history: int = 0) -> Array:
-        """Return the first states of every episode, (batch, n), or (batch, history + 1, n) for a lifting with delays."""
+        """Return the first states of every episode, (batch, n), or (batch, history + 1, n) with delays."""
         if not history:
             return self.states[0]
         for key, length in zip(self.keys, self.lengths, strict=True):
@@ -132,9 +131,7 @@ def hold_missing(y: Array) -> Array:
 def _side_by_side(episodes: Sequence[Array], lengths: npt.NDArray[np.int64]) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
     values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))
-    for start in range(0, len(values), _AT_ONCE):
-        for i, episode in enumerate(episodes):
-            part = episode[start : start + _AT_ONCE]
-            values[start : start + len(part), i] = part
-            values[start + len(part) : start + _AT_ONCE, i] = episode[-1]
+    for i, episode in enumerate(episodes):
+        values[: len(episode), i] = episode
+        values[len(episode) :, i] = episode[-1]
     return values

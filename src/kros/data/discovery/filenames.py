@@ -209,7 +209,7 @@ def _contiguous(roles: Roles) -> Roles:
 
 
 def quoted(text: str) -> str:
-    """Return a text as an expression, without escapes that nobody needs."""
+    """Return a text as an expression, without escapes that are not needed."""
     return re.sub(r"\\([^\w\s.^$*+?{}\[\]|()\\])|\\ ", lambda m: m[1] or " ", re.escape(text))
 
 

@@ -1,4 +1,4 @@
-"""Columns of a table: their units of measure, kinds of quantities and names of channels, and what they are likely to be.
+"""Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be.
 
 A column is time, a measured state, a hidden state, an input, or not needed.
 """

@@ -140,7 +140,9 @@ def parquet_head(path: Path, rows: int) -> tuple[list[str], list[tuple[str, ...]
 
     fields = file_fields(path)
     batch = next(parquet.ParquetFile(path).iter_batches(batch_size=rows), None)
-    columns = () if batch is None else [["" if v is None else str(v) for v in c.to_pylist()] for c in batch.columns]
+    if batch is None:
+        return fields, []
+    columns = [["" if value is None else str(value) for value in c.to_pylist()] for c in batch.columns]
     return fields, list(zip(*columns, strict=True))
 
 

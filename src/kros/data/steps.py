@@ -6,9 +6,19 @@ table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000`
 
 Examples
 --------
+The column `late` lags by a sample, and the angle, in degrees, has an offset that the target shows in the first samples:
+
 >>> import kros
->>> kros.data.steps.parse_steps([{"step": "shift", "channels": ["torque"], "lag": 1}])
-(Shift(channels=('torque',), lag=1),)
+>>> from kros.data import steps
+>>> names = {"states": ["angle", "late"], "inputs": ["target"], "measured": ["angle"], "sample_period_s": 0.01}
+>>> rows = [[5.0, 9.0, 0.0], [5.0, 1.0, 0.0], [95.0, 2.0, 90.0], [185.0, 3.0, 180.0], [185.0, 4.0, 180.0]]
+>>> data = kros.from_arrays({"a": [rows]}, **names)
+>>> declared = [steps.Shift(("late",), lag=1), steps.Offset("angle", "target", 0, 2), steps.Trim(start=1)]
+>>> prepared = kros.data.prepare(data, [*declared, steps.Scale(("angle",), 0.0174533, "rad")])
+>>> prepared.read(prepared.keys()[0]).round(2).tolist(), prepared.channels[0].unit
+([[0.0, 2.0, 0.0], [1.57, 3.0, 90.0], [3.14, 4.0, 180.0]], 'rad')
+>>> steps.parse_steps([{"step": "resample", "period_s": 0.005}])
+(Resample(period_s=0.005, max_gap_s=None, passband=0.8),)
 """
 
 from __future__ import annotations
@@ -110,16 +120,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Scale(Step):
-    """Multiply channels by a factor; `unit` names the new unit of measure.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[180.0], [90.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> turned = kros.data.prepare(data, [kros.data.steps.Scale(("x",), 3.14159 / 180, unit="rad")])
-    >>> turned.channels[0].unit
-    'rad'
-    """
+    """Multiply channels by a factor; `unit` names the new unit of measure."""
 
     channels: tuple[str, ...]
     factor: float
@@ -148,14 +149,6 @@ class Shift(Step):
     """Move channels that lag the others by `lag` samples back into place; a negative `lag` is a lead.
 
     The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
-
-    Examples
-    --------
-    >>> import kros
-    >>> names = {"states": ["x", "late"], "measured": ["x"], "sample_period_s": 0.01}
-    >>> data = kros.from_arrays({"a": [[[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]]}, **names)
-    >>> kros.data.prepare(data, [kros.data.steps.Shift(("late",), lag=1)]).read(data.keys()[0]).tolist()
-    [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
     """
 
     channels: tuple[str, ...]
@@ -185,17 +178,7 @@ class Shift(Step):
 
 @dataclass(frozen=True)
 class Offset(Step):
-    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)``.
-
-    Examples
-    --------
-    >>> import kros
-    >>> names = {"states": ["x"], "inputs": ["target"], "measured": ["x"], "sample_period_s": 0.01}
-    >>> data = kros.from_arrays({"a": [[[0.5, 0.0], [1.5, 1.0], [2.5, 2.0]]]}, **names)
-    >>> shifted = kros.data.prepare(data, [kros.data.steps.Offset("x", "target", 0, 2)])
-    >>> shifted.read(shifted.keys()[0])[:, 0].tolist()
-    [0.0, 1.0, 2.0]
-    """
+    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)``."""
 
     channel: str
     reference: str
@@ -226,15 +209,7 @@ class Offset(Step):
 
 @dataclass(frozen=True)
 class Trim(Step):
-    """Retain samples ``[start, stop)``, without the last `tail`.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> kros.data.prepare(data, [kros.data.steps.Trim(start=1, tail=1)]).source.steps
-    (Trim(start=1, stop=None, tail=1),)
-    """
+    """Retain samples ``[start, stop)``, without the last `tail`."""
 
     start: int = 0
     stop: int | None = None
@@ -273,14 +248,6 @@ class Resample(Step):
         Longest gap in time that a straight line bridges, a longer one is an error; default: ten median steps.
     passband : float
         Cut-off of the filter as a share of the new Nyquist frequency.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> finer = kros.data.prepare(data, [kros.data.steps.Resample(0.005)])
-    >>> finer.read(finer.keys()[0]).ravel().tolist()
-    [0.0, 0.5, 1.0, 1.5, 2.0]
     """
 
     period_s: float
@@ -328,15 +295,6 @@ class Differentiate(Step):
 
     The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a
     running observer could have measured.
-
-    Examples
-    --------
-    >>> import kros
-    >>> parabola = {"a": [[[(0.01 * k) ** 2] for k in range(200)]]}
-    >>> data = kros.from_arrays(parabola, states=["angle"], measured=["angle"], sample_period_s=0.01)
-    >>> with_rate = kros.data.prepare(data, [kros.data.steps.Differentiate("angle", "rate", cutoff_hz=5.0)])
-    >>> with_rate.states, float(with_rate.read(with_rate.keys()[0])[100, 1].round(6))
-    (('angle', 'rate'), 2.0)
     """
 
     channel: str

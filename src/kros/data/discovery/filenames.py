@@ -46,22 +46,12 @@ class FileNames:
     other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
 
 
-@dataclass(frozen=True)
 class _Cut:
     """Paths cut into words: `rows` with a word for every place, `marks` with what is between places, path by path."""
 
-    rows: list[list[str]]
-    marks: list[list[str]]
-
-    @classmethod
-    def of(cls, parts: Sequence[Sequence[str]]) -> _Cut:
-        """Return the cut of words that alternate with marks."""
-        return cls([list(p[::2]) for p in parts], [list(p[1::2]) for p in parts])
-
-    @property
-    def columns(self) -> list[tuple[str, ...]]:
-        """The words at every place."""
-        return list(zip(*self.rows, strict=True))
+    def __init__(self, parts: Sequence[Sequence[str]]) -> None:
+        self.rows, self.marks = [p[::2] for p in parts], [p[1::2] for p in parts]
+        self.columns = list(zip(*self.rows, strict=True))
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
@@ -96,7 +86,7 @@ def _words(stems: Sequence[str]) -> _Cut | None:
     for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)"):
         parts = [re.split(marks, s) for s in stems]
         if len(set(map(len, parts))) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
-            return _Cut.of(parts)
+            return _Cut(parts)
     return None
 
 
@@ -108,7 +98,7 @@ def _aligned(stems: Sequence[str]) -> _Cut | None:
         head += 2
     tail = fewest - head - 1
     cut = [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts]
-    return _Cut.of(cut) if tail > 0 else None
+    return _Cut(cut) if tail > 0 else None
 
 
 def _whole(stems: Sequence[str]) -> _Cut | None:
@@ -117,9 +107,7 @@ def _whole(stems: Sequence[str]) -> _Cut | None:
     if len(set(map(len, parts))) != 1:
         return None
     last = [match.groups() for p in parts if (match := re.match(r"([^_\- ]+)([_\- ]+)(.+)$", p[-1]))]
-    return _Cut.of(
-        [[*p[:-1], *words] for p, words in zip(parts, last, strict=True)] if len(last) == len(parts) else parts
-    )
+    return _Cut([[*p[:-1], *words] for p, words in zip(parts, last, strict=True)] if len(last) == len(parts) else parts)
 
 
 def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:

@@ -254,8 +254,7 @@ def _read_group(task: _Group) -> _GroupFacts:
         record = write_group(population, unit, condition, task.folder, task.on_nan, look)
         digests, record = record.recognised, replace(record, digests=())
     if not digests:
-        what = f"Unit {unit} ({condition}): every episode was dropped"
-        raise DataError(f"{what}; fix the source or leave the unit out.")
+        raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
     if record is not None and task.folder is not None:
         written = file_digest(task.folder / record.file)
     resolution = {name: smallest_step(first[0][:, names.index(name)]) for name in population.measured}

@@ -283,8 +283,7 @@ def _examined(
     wrong = dict(examined.wrong)
     if not examined.counts:
         key, why = next(iter(wrong.items()), (next(iter(examined.nan), ""), "no number in some samples"))
-        problem = f"none of {len(population.episodes)} episodes can be used; {key}: {why}"
-        raise DataError(f"Looking at {source}: {problem}.")
+        raise DataError(f"Looking at {source}: none of {len(population.episodes)} episodes can be used; {key}: {why}.")
     few = [group for group, n in examined.counts.items() if n < 2]
     if few and 2 * len(few) > len(examined.counts) and examined.shortest >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}

@@ -60,7 +60,7 @@ def infer_names(paths: Sequence[str]) -> FileNames:
     endings = sorted({re.escape(ending) for _, ending in parts if ending})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
     stems = [stem for stem, _ in parts]
-    for cut in (_words(stems), _aligned(stems), _whole(stems)):
+    for cut in (_words(stems), _aligned(stems)):
         if cut is None:
             continue
         roles, sure = _roles(cut.columns)
@@ -99,15 +99,6 @@ def _aligned(stems: Sequence[str]) -> _Cut | None:
     tail = fewest - head - 1
     cut = [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts]
     return _Cut(cut) if tail > 0 else None
-
-
-def _whole(stems: Sequence[str]) -> _Cut | None:
-    """Cut into folders and the first word of the name, where that is all that paths have in common."""
-    parts = [re.split(r"(/)", s) for s in stems]
-    if len(set(map(len, parts))) != 1:
-        return None
-    last = [match.groups() for p in parts if (match := re.match(r"([^_\- ]+)([_\- ]+)(.+)$", p[-1]))]
-    return _Cut([[*p[:-1], *words] for p, words in zip(parts, last, strict=True)] if len(last) == len(parts) else parts)
 
 
 def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
@@ -173,9 +164,7 @@ def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequ
         elif roles[i] is None:
             few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i]) and i != varying[-1]
             labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
-            free: str = (
-                UNIT if labels and not before else EPISODE
-            )  # KDN_1bar, O-ring257_3bar: these words count nothing
+            free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
             roles[i] = CONDITION if (before or few) and CONDITION not in roles else free
 
 

@@ -31,25 +31,10 @@ from .steps import Signals, Step
 
 
 @dataclass(frozen=True, eq=False)
-class EvenRecordings:
-    """Recordings of a population that is even already."""
-
-    source: EpisodeSource
-
-    def __call__(self, key: EpisodeKey) -> Recording:
-        """Return one episode."""
-        return Recording(key, self.source(key))
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> EvenRecordings:
-        """Return the same for fewer episodes."""
-        return EvenRecordings(restrict(self.source, keys))
-
-
-@dataclass(frozen=True, eq=False)
 class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
-    recordings: Recordings | EvenRecordings  # returns a `Recording` for an `EpisodeKey`
+    recordings: Recordings | EpisodeSource  # of a reader, or samples that are even already
     channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
@@ -58,7 +43,7 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        recording = self.recordings(key)
+        recording = self.recorded(key)
         if not any(step.makes_even for step in self.steps):
             where = self.recordings.where(key) if isinstance(self.recordings, Recordings) else ""
             check_even(recording, self.period_s, self.reference, where)
@@ -68,6 +53,11 @@ class PreparedSource:
             signals = step.describe(signals)
         check_episode(recording.values, key, signals.channels, gaps=self.gaps)
         return recording.values
+
+    def recorded(self, key: EpisodeKey) -> Recording:
+        """Return one episode as recorded."""
+        recording = self.recordings(key)
+        return recording if isinstance(recording, Recording) else Recording(key, recording)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
         """Return the same for fewer episodes."""
@@ -142,7 +132,7 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
         return population
     signals = Signals(population.columns, population.sample_period_s, population.scaling)
     if not isinstance(source, PreparedSource):
-        source = PreparedSource(EvenRecordings(source), signals.channels, signals.period_s, population.episodes[0])
+        source = PreparedSource(source, signals.channels, signals.period_s, population.episodes[0])
     for step in added:
         signals = step.describe(signals)
     check_structure(signals.channels, population.episodes)
@@ -181,10 +171,9 @@ def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declar
     These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
     """
     about: list[Any] = []
-    while isinstance(source, PreparedSource | EvenRecordings):
-        if isinstance(source, PreparedSource):
-            about.append((source.channels, source.period_s, source.steps, source.gaps))
-        source = source.recordings if isinstance(source, PreparedSource) else source.source
+    while isinstance(source, PreparedSource):
+        about.append((source.channels, source.period_s, source.steps, source.gaps))
+        source = source.recordings
     if not isinstance(source, Recordings):
         return [None for _ in groups]
     settings = [(f.name, getattr(source, f.name)) for f in fields(source) if f.name != "places"]

@@ -13,8 +13,7 @@ from ...core.errors import DataError
 from ...core.work import Work
 from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import EpisodeKey, Population
-from ..prepare import PreparedSource
-from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, check_increasing
+from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, check_increasing
 
 Array = npt.NDArray[np.float64]
 
@@ -108,7 +107,7 @@ def _look(population: Population) -> list[EpisodeLook]:
     for key in population.episodes:
         looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
-            recording = source.recordings(key) if isinstance(source, PreparedSource) else Recording(key, source(key))
+            recording = source.recorded(key)
             check_increasing(recording)
             looks[key] = _timed(replace(looks[key], n_samples=len(recording.values)), recording.time_s)
             check_episode(recording.values, key, population.columns)

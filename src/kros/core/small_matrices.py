@@ -68,9 +68,7 @@ def sigma_max_squared(matrices: Array) -> Array:
     if columns.shape[1] == 1:
         return first
     second = squared(columns[:, 1]).sum(axis=0)
-    cross = np.conj(columns[0, 0]) * columns[0, 1]
-    for i in range(1, columns.shape[0]):
-        cross += np.conj(columns[i, 0]) * columns[i, 1]
+    cross = np.einsum("i...,i...->...", np.conj(columns[:, 0]), columns[:, 1])
     half = (first - second) / 2
     return (first + second) / 2 + np.sqrt(half**2 + squared(cross))
 
@@ -111,17 +109,5 @@ def pseudo_inverse_first(matrices: Array) -> Array:
 
 def lower_factor(pseudo_inverse: Array) -> Array:
     """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s."""
-    if pseudo_inverse.shape[0] > 2:
-        R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
-        return entries_first(np.conj(np.swapaxes(R, -1, -2)))
-    size = np.sqrt(squared(pseudo_inverse[0]).sum(axis=0))
-    if pseudo_inverse.shape[0] == 1:
-        return size[None, None] + 0j
-    q = pseudo_inverse[0] / np.where(size > 0, size, 1.0)
-    along = (np.conj(q) * pseudo_inverse[1]).sum(axis=0)
-    rest = pseudo_inverse[1] - q * along
-    again = (np.conj(q) * rest).sum(axis=0)
-    rest -= q * again
-    out = np.zeros((2, 2, *size.shape), complex)
-    out[0, 0], out[1, 0], out[1, 1] = size, along + again, np.sqrt(squared(rest).sum(axis=0))
-    return out
+    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
+    return entries_first(np.conj(np.swapaxes(R, -1, -2)))

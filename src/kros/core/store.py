@@ -1,7 +1,7 @@
 """Artefacts: folders named by the digest of all that they follow from, written beside their place and renamed into it.
 
     <run>/store/<digest>/       what a stage wrote, and `artefact.json`, which lists it
-    <run>/store/<digest>.npz    the result of one task of a map; see `results`
+    <run>/store/<digest>.npz    the result of one task of a map; see `work`
     <run>/manifest.json         the artefacts of a run; their files are at their places in the run folder too
 
 A digest is of settings, inputs and source. So what is there need not be computed, and what is computed twice is the

@@ -247,8 +247,8 @@ class Population:
 
     def unit(self, unit_id: str) -> Unit:
         """Return one unit's facts."""
-        if unit_id in self._unit_positions:
-            return self.units[self._unit_positions[unit_id]]
+        if unit_id in self._units:
+            return self._units[unit_id]
         known = ", ".join(self.unit_ids[:10]) + (" ..." if len(self.units) > 10 else "")
         raise DataError(f"Asked for unit {unit_id!r}; the population has {known}.")
 
@@ -297,8 +297,8 @@ class Population:
         return positions
 
     @cached_property
-    def _unit_positions(self) -> dict[str, int]:
-        return {unit.id: i for i, unit in enumerate(self.units)}
+    def _units(self) -> dict[str, Unit]:
+        return {unit.id: unit for unit in self.units}
 
 
 def split_episodes(population: Population, test: Iterable[str] | None = None) -> dict[tuple[str, str], Split]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
 
@@ -64,11 +64,6 @@ class PreparedSource:
         return replace(self, recordings=restrict(self.recordings, keys))
 
 
-def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
-    """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
-    return tuple((natural_key(name), name) for name in (key.unit, key.condition, key.episode))
-
-
 def assemble(
     recordings: Recordings,
     channels: tuple[Channel, ...],
@@ -84,7 +79,8 @@ def assemble(
     if channels != columns_in_order(channels):
         roles = [(c.name, c.role.value) for c in channels]
         raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
-    episodes = tuple(sorted(recordings.places, key=episode_order))
+    order = [(tuple((natural_key(name), name) for name in astuple(key)), key) for key in recordings.places]
+    episodes = tuple(key for _, key in sorted(order, key=lambda pair: pair[0]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
     period = estimate_period(recordings(episodes[0])) if sample_period_s is None else sample_period_s

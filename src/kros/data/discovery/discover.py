@@ -60,7 +60,7 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     mapping, notes = _names(list(alike), wanted.files)
-    mapping |= _dialect_keys(head.dialect)
+    mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, why = _columns(source, head, list(alike.values()), wanted.period_s)
     mapping, notes = mapping | keys, notes | why
     columns = _decided(columns, wanted, ask)
@@ -135,13 +135,6 @@ def _head_of(path: Path) -> TableHead | None:
     except DataError:
         return None
     return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(rows))
-
-
-def _dialect_keys(dialect: Dialect) -> dict[str, Any]:
-    """Return what is not as usual."""
-    names = ("delimiter", "decimal", "encoding", "header", "skip_rows", "unit_rows")
-    values = {name: getattr(dialect, name) for name in names}
-    return {name: value for name, value in values.items() if value != getattr(Dialect(), name)}
 
 
 def _columns(

@@ -3,9 +3,7 @@
 A flat top is a run of samples at a signal's extreme value, within its noise. It may be a smooth peak, a commanded
 plateau, the top level of a coarse signal, or a limit. It counts as a limit where
 
-- the signal has many levels,
 - the signal is constant there and changes sharply before or after (a smooth peak falls with the square of the time),
-- it does not bend: the middle of the run is no higher than its ends,
 - it is there several times, in more than one episode, at the same value, and nothing was recorded beyond,
 - every input took different values there: what an input holds at one value may be that input's doing.
 
@@ -31,10 +29,8 @@ class LimitRule:
     shortest: int = 8  # samples of a run: as many as a filter of a sensor may smear
     runs: int = 5  # fewest runs
     episodes: int = 2  # in so many of which they are
-    levels: int = 64  # of a signal; fewer make a coarse one, whose top level is no limit
     noise: float = 5.0  # standard deviations that noise is wide
     far: float = 5.0  # widths of the noise by which the signal falls beside a run
-    bent: float = 0.25  # width of the noise that the middle of a run may be above its ends
     varied: float = 0.02  # of an input's range that it covers in the runs
 
 
@@ -49,8 +45,7 @@ class FlatTops:
     episode: str  # the episode's name holds its condition
     top: float  # largest value of the signal, noise apart
     width: float  # of the noise
-    # Of every run, shape (runs, 4 + m): its mean, its samples, whether the signal is far away shortly before or after
-    # it, by how much its middle is above its ends, and its mean inputs.
+    # Of every run, shape (runs, 3 + m): mean, samples, whether the signal is far away shortly before or after, inputs.
     runs: Array
 
 
@@ -82,7 +77,6 @@ def found_limit(ends: Sequence[Ends], ranges: Array) -> FoundLimit | None:
     """Return the limits that all episodes of a population speak for; None where they speak for none."""
     below, above = zip(*ends, strict=True)
     lower, upper = _level(below, ranges), _level(above, ranges)
-    lower, upper = lower or _mirrored(upper, below), upper or _mirrored(lower, above)
     levels = [level for level in (lower, upper) if level is not None]
     if not levels:
         return None
@@ -100,26 +94,15 @@ class _Level:
     samples: int = 0
 
 
-def _mirrored(other: _Level | None, tops: Sequence[FlatTops]) -> _Level | None:
-    """Return the limit of the other end where the signal goes as far at this one."""
-    furthest = max(tops, key=lambda f: f.top)
-    return None if other is None or abs(furthest.top - other.value) > furthest.width else _Level(other.value)
-
-
 def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
     """Return the flat tops of a signal at its upper end, with noise of a width, and how far the signal goes."""
     place = _RULE.shortest if len(signal) > 2 * _RULE.shortest else 1
     top = float(np.partition(signal, -place)[-place])
-    for _ in range(2):
-        top = float(signal[signal >= top - width].mean())
     edges = np.flatnonzero(np.diff(np.concatenate([[False], signal >= top - width, [False]])))
-    coarse = len(np.unique(signal[:: _RULE.levels])) < _RULE.levels and len(np.unique(signal)) < _RULE.levels
-    long = (edges[1::2] - edges[::2] >= _RULE.shortest) & (not coarse)
+    long = edges[1::2] - edges[::2] >= _RULE.shortest
     starts, stops = edges[::2][long], edges[1::2][long]
-    third, values = (stops - starts) // 3, _means(signal, starts, stops)
-    bend = 1.5 * (_means(signal, starts + third, stops - third) - values)
     steep = _steep(signal, starts, stops, top - _RULE.far * width)
-    columns = [values, stops - starts, steep, bend, *(_means(u, starts, stops) for u in inputs.T)]
+    columns = [_means(signal, starts, stops), stops - starts, steep, *(_means(u, starts, stops) for u in inputs.T)]
     return FlatTops(unit, episode, top, width, np.column_stack(columns).astype(float))
 
 
@@ -130,11 +113,10 @@ def _level(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
     near = [(f, runs) for f, runs in near if len(runs)]
     if not near or any(f.top > level + 2 * f.width for f in tops):
         return None
-    values, lengths, steep, bend, *inputs = np.concatenate([runs for _, runs in near]).T
+    values, lengths, steep, *inputs = np.concatenate([runs for _, runs in near]).T
     often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in near}) >= _RULE.episodes
-    straight = abs(np.average(bend, weights=lengths)) <= _RULE.bent * max(f.width for f, _ in near)
     varied = all(np.ptp(u) > _RULE.varied * size for u, size in zip(inputs, ranges, strict=True))
-    if not (often and straight and varied and np.average(steep, weights=lengths) >= 0.5):
+    if not (often and varied):
         return None
     units = tuple(dict.fromkeys(f.unit for f, _ in near))
     return _Level(float(np.average(values, weights=lengths * steep)), units, int(lengths.sum()))

@@ -30,7 +30,6 @@ class AlertRule:
 
     near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
     compact: float = 3.0  # by which sizes may differ on either side of it
-    apart: float = 0.6  # of the gap between both sides that sizes of one side may span
     correlated: float = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
     decades: float = 0.05  # by which the factor between both may differ from a thousand or a million
 
@@ -73,7 +72,7 @@ def _two_scales(sizes: Mapping[str, float]) -> str:
     cut = int(np.diff(logs).argmax()) + 1
     gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
     kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_RULE.near)]
-    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_RULE.compact), _RULE.apart * gap):
+    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > np.log(_RULE.compact):
         return ""
     smaller = cut <= len(names) - cut
     fewer = some(names[:cut] if smaller else names[cut:])

@@ -252,7 +252,7 @@ def _read_group(task: _Group) -> _GroupFacts:
         digests = scan_digests(population, on_nan=task.on_nan, look=look)
     else:
         record = write_group(population, unit, condition, task.folder, task.on_nan, look)
-        digests, record = record.recognised, replace(record, digests=())
+        digests = record.recognised
     if not digests:
         raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
     if record is not None and task.folder is not None:
@@ -267,21 +267,15 @@ def _limits(groups: Sequence[_GroupFacts]) -> dict[str, FoundLimit]:
     if not groups:
         return {}
     reach = np.concatenate([inputs for group in groups for inputs in group.inputs])
-    limits = {
-        name: found_limit([e for g in groups for e in g.ends[name]], np.ptp(reach, axis=0)) for name in groups[0].ends
-    }
+    ranges, names = np.ptp(reach, axis=0), groups[0].ends
+    limits = {name: found_limit([e for g in groups for e in g.ends[name]], ranges) for name in names}
     return {name: limit for name, limit in limits.items() if limit is not None}
 
 
 def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:
     """Return the population of usable episodes, that of the copy where there is one."""
     if folder is not None:
-        records = [
-            replace(group.record, digests=tuple(digest for _, digest in group.scanned))
-            for group in groups
-            if group.record is not None
-        ]
-        write_index(population, records, folder, converted=False)
+        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
         return read_parquet(folder)
     scanned = [pair for group in groups for pair in group.scanned]
     refuse_copies(scanned)

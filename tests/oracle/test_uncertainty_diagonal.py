@@ -51,16 +51,6 @@ def test_systems_have_the_magnitudes_of_the_sections_and_are_stable_with_their_i
     assert sections.orders.tolist() == [2, 3]
 
 
-def test_poles_on_zeros_change_nothing_until_they_are_taken_out_again() -> None:
-    sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
-    more = sections.with_pairs(np.array([0, 1]), np.array([0.3, -0.4]), 0.7)
-    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
-    assert more.orders.tolist() == [4, 5]
-    for entry in (0, 1):
-        more = more.without(more.weakest(entry, tau))
-    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
-
-
 def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
     """Diagonal residuals of one unit whose moduli are of order two and one."""
     w = 1j * np.tan(np.pi * np.minimum(np.asarray(freqs), 500 - 1e-9) * DT)
@@ -72,9 +62,7 @@ def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() 
     weight, cover = fit_weight(of_function(lags_and_leads), FREQS, Target(DT, tolerance_db=0.3))
     assert weight.overbound_db_max <= 0.3
     assert weight.within_tolerance
-    assert (
-        sum(weight.left_orders) + sum(weight.right_orders) < 12
-    )  # three would do; what is left out is sought step by step, not the fewest
+    assert sum(weight.left_orders) + sum(weight.right_orders) <= 4  # three would do
     used = weight.magnitudes(FREQS).entries()
     exact = np.abs(np.einsum("kfii->fi", lags_and_leads(FREQS)))
     assert (np.einsum("fii->fi", used) >= exact * (1 - 1e-9)).all()

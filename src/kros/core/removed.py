@@ -20,6 +20,15 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "uncertainty.structure",
     ),
     (
+        "How weights and outlier scores are computed is no longer set in a study; use kros.quantify, which takes nominal, "
+        "max_order, tolerance_db and false_alarm_rate.",
+        "uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate",
+    ),
+    (
+        "Flagged units are no longer dropped by a study itself; name them under data.exclude.",
+        "uncertainty.drop_outliers",
+    ),
+    (
         "Systems and responses are no longer quantified by functions of their own; use quantify, which takes systems, responses "
         "(form before freqs_hz) and models of kros.identify.",
         "kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses",

@@ -25,8 +25,7 @@ from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import choose_nominals
 from .settings import FitSettings
 from .weights.bilinear import BilinearAxis, beyond, continuous_grid
-from .weights.cover import Structure, as_structure
-from .weights.fit import Target, fit_entries, fit_weight
+from .weights.fit import Target, fit_weight
 from .weights.residuals import Residuals
 
 Array = npt.NDArray[Any]
@@ -46,7 +45,6 @@ class Options:
     output_scale: npt.ArrayLike | None = None
     input_scale: npt.ArrayLike | None = None
     nominal: Any = None
-    structure: Structure | str = Structure.DIAGONAL
     max_order: int = 4
     tolerance_db: float = 1.0
     sample_period_s: float = 0.0
@@ -54,7 +52,7 @@ class Options:
 
     @classmethod
     def of(cls, options: dict[str, Any]) -> Options:
-        """Check options by name, order, tolerance and structure."""
+        """Check options by name, order and tolerance."""
         unknown = sorted(set(options) - set(cls.__dataclass_fields__))
         if unknown:
             raise ConfigError(
@@ -66,7 +64,7 @@ class Options:
                 f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
                 f"{read.tolerance_db} not negative."
             )
-        return replace(read, structure=as_structure(read.structure))
+        return read
 
 
 def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, options: Options) -> UncertainModel:
@@ -183,8 +181,7 @@ def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, op
 def _bound_discrete(residuals: Residuals, freqs_hz: Array, dt: float, options: Options) -> dict[str, Any]:
     """Return bound, cover, weight, misfit, and cover and weight of the remainder where the form leaves one."""
     target = Target(dt, options.max_order, options.tolerance_db, options.fit)
-    fit = fit_entries if options.structure is Structure.ENTRYWISE else fit_weight
-    weight, cover = fit(residuals, freqs_hz, target)
+    weight, cover = fit_weight(residuals, freqs_hz, target)
     G, ratios, largest = residuals.nominal(freqs_hz), [], []
     for rows in residuals.blocks(options.fit.block):
         E = residuals.at(freqs_hz)[rows] if len(rows) == len(residuals) else residuals.of(rows).at(freqs_hz)

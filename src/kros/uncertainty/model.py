@@ -20,8 +20,8 @@ from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.certificate import Method
-from .weights.cover import Cover, Structure, as_structure
-from .weights.weight import EntrywiseWeight, Weight
+from .weights.cover import Cover
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
@@ -205,7 +205,7 @@ class UncertainModel(Uncertainty):
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = ("structure", "cover_max", "overbound_db_max", "within_tolerance", "method", "remaining_margin")
+_OF_WEIGHT = ("cover_max", "overbound_db_max", "within_tolerance", "method", "remaining_margin")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
@@ -218,13 +218,8 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
 
 
 def _facts(weight: Weight) -> dict[str, Any]:
-    excess = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
     orders = {"orders": [weight.left_orders, weight.right_orders]}
-    return excess | orders | {name: getattr(weight, name) for name in _OF_WEIGHT}
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
+    return orders | {name: getattr(weight, name) for name in _OF_WEIGHT}
 
 
 def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
@@ -247,11 +242,7 @@ def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], d
         "right": _unpack_system(f"{name}_right", arrays, dt),
         "left_orders": tuple(facts["orders"][0]),
         "right_orders": tuple(facts["orders"][1]),
-        "structure": as_structure(facts["structure"]),
         "method": Method(facts["method"]),
-        "remaining_margin": _number(facts["remaining_margin"]),
+        "remaining_margin": float("nan") if facts["remaining_margin"] is None else facts["remaining_margin"],
     }
-    cover = Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
-    if fields["structure"] is Structure.ENTRYWISE:
-        return EntrywiseWeight(**fields, unstructured_excess=_number(facts["unstructured_excess"])), cover
-    return Weight(**fields), cover
+    return Weight(**fields), Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])

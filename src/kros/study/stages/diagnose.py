@@ -49,14 +49,13 @@ Task = tuple[Path, Callable[[], _Result | None]]
 
 def diagnose(context: Context, found: UncertainModels) -> None:
     """Compute and save what there is to say; what cannot be said is logged, with its reason, and left out."""
-    folder, config = context.store.draft("uncertainty"), context.config.uncertainty
+    folder = context.store.draft("uncertainty")
     models = found.models
     noise = [(kind, task) for kind, uncertain in found.sets.items() for task in _noise(context, kind, uncertain)]
     tasks: list[Task] = [(folder / kind / "noise", task) for kind, task in noise]  # those that read recordings begin
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks += [
-        (folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config))
-        for kind in pair
+        (folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind])) for kind in pair
     ]
     tasks += _others(context, found.scores)
     results = context.work.run(
@@ -115,7 +114,7 @@ def _not_told_apart(name: str, error: KrosError) -> None:
     log.info("%s: variation and noise are not told apart: %s", name, error)
 
 
-def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintySettings) -> UnitResiduals:
+def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
     """Return the residuals of all covered units beside the weights of a study."""
     every = max(1, len(uncertain.freqs_hz) // _POINTS)
     freqs = uncertain.freqs_hz[::every]
@@ -128,8 +127,7 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel, config: Uncertai
         models.sample_period_s,
         unit_ids=uncertain.unit_ids,
         nominal_id=uncertain.nominal_id,
-        max_order=min(config.max_order, _ENTRY_ORDER),
-        tolerance_db=config.tolerance_db,
+        max_order=_ENTRY_ORDER,
     )
 
 
@@ -184,6 +182,5 @@ def against_others(
         unit_ids=everyone,
         nominal_id=nominal,
         outside=outside,
-        max_order=min(config.max_order, _ENTRY_ORDER),
-        tolerance_db=config.tolerance_db,
+        max_order=_ENTRY_ORDER,
     )

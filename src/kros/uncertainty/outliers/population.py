@@ -12,7 +12,7 @@ import numpy as np
 from ...core.work import Work
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors, IdentifiedModels
-from ..settings import UncertaintySettings
+from ..settings import QuantifySettings
 from .model import OutlierModel, score_outliers, scored_frequencies
 from .recorded import Recorded
 from .score import OutlierScore
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 def score_population(
-    models: IdentifiedModels, settings: UncertaintySettings, work: Work | None = None
+    models: IdentifiedModels, settings: QuantifySettings, work: Work | None = None
 ) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
@@ -46,7 +46,7 @@ def score_population(
 
 
 def score_condition(
-    factors: EpisodeFactors, models: ModelSet, settings: UncertaintySettings
+    factors: EpisodeFactors, models: ModelSet, settings: QuantifySettings
 ) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
     freqs = scored_frequencies(models.frequencies(settings.n_freqs))

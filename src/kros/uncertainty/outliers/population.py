@@ -66,10 +66,8 @@ def score_condition(
     )
     known = {score.unit: score for score in outliers.scores}
     scores = [known.get(unit) or outliers.score(unit, G) for unit, G in zip(ids, responses, strict=True)]
-    by_nominal = np.full((len(outliers.nominal_ids), len(ids)), np.nan)
-    by_nominal[:, well] = outliers.by_nominal_db
     qualified = tuple(recorded.qualified(*pair) for pair in zip(scores, evidence, strict=True))
-    return replace(outliers, scores=qualified, by_nominal_db=by_nominal), [data.n_samples for data in evidence]
+    return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
@@ -81,9 +79,7 @@ def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: fl
         "threshold": score.threshold_db,
         "outlier": score.outlier,
     }
-    row |= {
-        key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")
-    }
+    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db")}
     row |= {"status": score.status, "detectable": score.detectable_percent}
     row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
     needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}

@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))
     options = parser.parse_args()
     print("| models | form | condition | nominal rate | " + header() + " |")
-    print("|---" * (8 + len(SEVERITIES)) + "|")
+    print("|---" * (7 + len(SEVERITIES)) + "|")
     factors = [factors_of(seed, options) for seed in range(*options.seeds)]
     for kind in options.kinds:
         for condition in CONDITIONS:

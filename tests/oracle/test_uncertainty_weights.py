@@ -155,7 +155,6 @@ def test_identical_units_and_single_frequencies_get_weights() -> None:
     units = [single(0.9, 0.5)] * 3
     found = quantify(units, "additive", GRID)
     assert found.cover_max == 0
-    assert found.weight.remaining_margin == 1
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1

@@ -20,7 +20,7 @@ from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
-from .inputs import check_candidate, check_ids, check_response, check_scale, find_nominal, read_systems
+from .inputs import check_candidate, check_ids, check_response, check_scales, find_nominal, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import choose_nominals
 from .settings import FitSettings
@@ -74,7 +74,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
     units = scale_system(system, *scales)
     choices = choose_nominals(units.frequency_response(freqs))
     if isinstance(options.nominal, StateSpace):
-        check_candidate(options.nominal, system, "the nominal")
+        check_candidate(options.nominal, system)
         index, chosen = -1, options.nominal
     else:
         index = find_nominal(options.nominal, ids, choices[form].index)
@@ -105,10 +105,7 @@ def bound_responses(
     given = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
     for name, value in zip((*ids, "the nominal"), [*G, np.asarray(nominal)] if given else G, strict=False):
         check_response(name, value, G.shape[1:], freqs)
-    scales = (
-        check_scale("output", options.output_scale, G.shape[2]),
-        check_scale("input", options.input_scale, G.shape[3]),
-    )
+    scales = check_scales(options.output_scale, options.input_scale, G.shape[2:])
     units = G / scales[0][:, None] * scales[1]
     choices = choose_nominals(units)
     index = -1 if given else find_nominal(nominal, ids, choices[form].index)
@@ -184,17 +181,11 @@ def _bound_discrete(residuals: Residuals, freqs_hz: Array, dt: float, options: O
     weight, cover = fit_weight(residuals, freqs_hz, target)
     G, ratios, largest = residuals.nominal(freqs_hz), [], []
     for rows in residuals.blocks(options.fit.block):
-        E = residuals.at(freqs_hz)[rows] if len(rows) == len(residuals) else residuals.of(rows).at(freqs_hz)
+        E = residuals.of(rows).at(freqs_hz)
         ratios.append(misfit(residuals.form, G, residuals.units(freqs_hz, rows), E))
         largest.append(sigma_max(E).max(axis=0))
-    ratio = np.concatenate(ratios)
-    bound = {
-        "bound": np.max(largest, axis=0),
-        "cover": cover,
-        "weight": weight,
-        "misfit": ratio,
-        "form": residuals.form,
-    }
+    ratio, form = np.concatenate(ratios), residuals.form
+    bound = {"bound": np.max(largest, axis=0), "cover": cover, "weight": weight, "misfit": ratio, "form": form}
     if not _leaves_out(residuals.form, ratio):
         return bound
     remainder, remainder_cover = fit_weight(replace(residuals, remainder=True), freqs_hz, target)
@@ -207,8 +198,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     if unknown:
         _LOG.warning(
             "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the "
-            "misfit is "
-            "unknown there.",
+            "misfit is unknown there.",
             form.value,
             unknown,
             ratio.size,
@@ -219,8 +209,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     _LOG.log(
         logging.WARNING if largest > _WARNED else logging.INFO,
         "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an "
-        "additive "
-        "term. The additive form needs none.",
+        "additive term. The additive form needs none.",
         form.value,
         largest,
     )

@@ -203,9 +203,8 @@ def _lifted(weight: Weight, proof: _Proof) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
     lift, method = proof.bound * (1 + _MARGIN), proof.certificate.method
     if not lift > 0:
-        return replace(weight, cover_max=0.0, method=method, remaining_margin=1.0)
-    margin = 1 - proof.bound / lift
-    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=method, remaining_margin=margin)
+        return replace(weight, cover_max=0.0, method=method)
+    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=method)
 
 
 def _peaks(ratio: Array) -> Array:

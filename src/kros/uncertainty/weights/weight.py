@@ -40,8 +40,6 @@ class Weight:
         Whether the overbound of the weight as returned is within the tolerance at every frequency of the grid.
     method : Method
         How the bound between grid points is known, see `certificate`.
-    remaining_margin : float
-        One minus the largest ratio over all frequencies: by level sets a bound on it, on a grid what was found.
 
     Examples
     --------
@@ -63,7 +61,6 @@ class Weight:
     overbound_db_max: float
     within_tolerance: bool = True
     method: Method = Method.GRID
-    remaining_margin: float = float("nan")
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""

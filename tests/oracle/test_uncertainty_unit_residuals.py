@@ -23,9 +23,8 @@ def static() -> UnitResiduals:
     """Additive residuals are the deltas at every frequency; the last unit is not covered."""
     responses = np.eye(2) + np.broadcast_to(DELTAS[:, None], (4, len(FREQS), 2, 2)) + 0j
     cover = Cover(np.full((len(FREQS), 2), 0.3), np.ones((len(FREQS), 2)))
-    return unit_residuals(
-        Form.ADDITIVE, responses[0], responses, cover, FREQS, DT, unit_ids=NAMES, nominal_id="nominal", outside=["out"]
-    )
+    units = dict(zip(NAMES, responses, strict=True))
+    return unit_residuals(Form.ADDITIVE, ("nominal", responses[0]), units, cover, FREQS, DT, outside=["out"])
 
 
 def test_static_residuals() -> None:

@@ -57,8 +57,8 @@ def stack_systems(models: Any) -> StateSpace:
         kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(kinds) != 1:
             raise DimensionError(
-                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}; identify them alike, and "
-                "give at least two."
+                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}; identify them alike, "
+                "and give at least two."
             )
         n_states = max(s.n_states for s in systems)
         systems = [_padded(s, n_states) for s in systems]

@@ -212,8 +212,8 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     units = [u for u in models.facts.pooled if u in first.unit_ids]
     if len(units) < 2:
         raise IdentificationError(
-            f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed; record "
-            "more units in the condition that feeds synthesis."
+            f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed; "
+            "record more units in the condition that feeds synthesis."
         )
     nominal = choose_unit(first, units, settings)
     tasks = [partial(quantify_kind, models.models(kind), units, settings, nominal) for kind in models.kinds]

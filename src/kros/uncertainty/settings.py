@@ -55,7 +55,7 @@ class FitSettings(Settings):
     temperatures: tuple[float, ...] = Field(
         (0.1, 0.03, 0.01, 0.003), min_length=1, description="nepers, of the smoothed maxima; the last is 0.03 dB"
     )
-    steps: int = Field(15, ge=1, description="largest number of steps at one temperature")
+    steps: int = Field(10, ge=1, description="largest number of steps at one temperature")
     pull: float = Field(1e-3, gt=0, description="towards the start, nepers: small, and it makes the optimum unique")
     peak_price: float = Field(0.05, ge=0, description="of the peak of square weights, which decides among equal covers")
     gain: float = Field(0.1, gt=0, lt=1, description="of the tolerance: what a higher order of an entry has to bring")

@@ -9,7 +9,7 @@ were not made for exceeds one where it sticks out.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from .weights.weight import Weight
 Array = npt.NDArray[Any]
 
 MOST_UNITS = 200  # that are kept for a picture
+_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
 
 
@@ -82,34 +83,29 @@ class UnitResiduals:
 
 def unit_residuals(
     form: Form,
-    nominal: Array,
-    responses: Array,
+    nominal: tuple[str, Array],
+    responses: Mapping[str, Array],
     weights: Weight | Cover,
     freqs_hz: Array,
     sample_period_s: float,
-    *,
-    unit_ids: Sequence[str],
-    nominal_id: str,
     outside: Collection[str] = (),
-    max_order: int = 4,
 ) -> UnitResiduals:
-    """Return residuals of units against a nominal, of shape (unit, frequency, p, m), beside weights or a cover."""
-    inside = np.array([u not in outside for u in unit_ids], dtype=bool)
-    if len(unit_ids) != len(responses) or not inside.any():
+    """Return residuals of units, whose responses have the shape (frequency, p, m), beside weights or a cover."""
+    unit_ids, inside = tuple(responses), np.array([unit not in outside for unit in responses])
+    if not inside.any():
         raise DimensionError(
-            f"Residuals of units: need a name for each of {len(responses)} responses and at least one unit that "
-            f"is covered, found {len(unit_ids)} names, {int(inside.sum())} of them covered."
+            f"Residuals of units: needs at least one unit that is covered, found {', '.join(unit_ids)}."
         )
-    E = residual(form, nominal, responses)
+    E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
-    fitted = fit_entries(E[inside], freqs_hz, sample_period_s, max_order)
+    fitted = fit_entries(E[inside], freqs_hz, sample_period_s, _ENTRY_ORDER)
     shown = shown_rows(inside)
     return UnitResiduals(
         form=form,
-        nominal_id=nominal_id,
+        nominal_id=nominal[0],
         unit_ids=tuple(unit_ids[k] for k in shown),
-        outside=tuple(u for u in unit_ids if u in outside),
+        outside=tuple(unit for unit in unit_ids if unit in outside),
         freqs_hz=freqs_hz,
         entries=sizes[shown],
         ratio=ratio[shown],

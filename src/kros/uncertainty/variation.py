@@ -215,8 +215,8 @@ def _require(models: ModelSamples, nominal: int) -> None:
     finite = np.all([np.isfinite(part).reshape(units, -1).all(axis=1) for part in parts], axis=0)
     if not finite.all():
         raise DataError(
-            f"Variation and noise: unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not finite; "
-            "leave the unit out, or raise alpha."
+            f"Variation and noise: unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not "
+            "finite; leave the unit out, or raise alpha."
         )
     if not 0 <= nominal < units:
         raise ConfigError(f"Variation and noise: the nominal should be a row of {units} units, found {nominal}.")

@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 
 _NOISE_POINTS, _POINTS = 80, 240  # frequencies
 _MOST_UNITS = 60  # whose models are resampled
-_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 
 
 class _Result(Protocol):
@@ -120,14 +119,11 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals
     freqs = uncertain.freqs_hz[::every]
     return unit_residuals(
         uncertain.form,
-        uncertain.scaled_nominal().frequency_response(freqs),
-        models.scaled_responses(freqs, list(uncertain.unit_ids)),
+        (uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)),
+        dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True)),
         uncertain.weight,
         freqs,
         models.sample_period_s,
-        unit_ids=uncertain.unit_ids,
-        nominal_id=uncertain.nominal_id,
-        max_order=_ENTRY_ORDER,
     )
 
 
@@ -172,15 +168,5 @@ def against_others(
     everyone = [*others, *outside]
     responses = models.scaled_responses(freqs, everyone)
     cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
-    return unit_residuals(
-        form,
-        responses[row],
-        responses,
-        cover,
-        freqs,
-        models.sample_period_s,
-        unit_ids=everyone,
-        nominal_id=nominal,
-        outside=outside,
-        max_order=_ENTRY_ORDER,
-    )
+    units = dict(zip(everyone, responses, strict=True))
+    return unit_residuals(form, (nominal, responses[row]), units, cover, freqs, models.sample_period_s, outside)

@@ -300,9 +300,9 @@ def _scored(count: int) -> Array:
 class Comparison:
     """Units and their distances; units are scored against the inliers among them.
 
-    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response, changed
-    by one percent, is a residual of some level at every frequency; a level is proportional to the change to first
-    order, so what it takes to reach the bound follows in percent.
+    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
+    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
+    first order, so what it takes to reach the bound follows in percent.
     """
 
     form: Form

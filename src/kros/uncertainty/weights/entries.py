@@ -1,8 +1,8 @@
 r"""The paper's weights: a bound of every entry of the residuals by itself, `|W_ij| >= |E_ij|` (its Figure 8).
 
 The paper puts `W Delta` with a full Delta into its generalized plant. For that set the bound does not hold: it says
-nothing about `sigma_max(W^-1 E)`, which `excess` measures. kros shows these weights and designs the paper's own observer
-with them; its sets have diagonal weights (`weight`).
+nothing about `sigma_max(W^-1 E)`, which `excess` measures. kros shows these weights and designs the paper's own
+observer with them; its sets have diagonal weights (`weight`).
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def joined(freqs_hz: Array, others_hz: Array) -> Array:
 
 
 class _Fit:
-    """One fit, and again with frequencies that it missed: units that decide, the band asked for, frequencies of checks."""
+    """One fit, and again with frequencies that it missed, of the units that decide."""
 
     def __init__(self, residuals: Residuals, freqs_hz: Array, checked_hz: Array, target: Target) -> None:
         self.residuals, self.checked_hz, self.target = residuals, checked_hz, target

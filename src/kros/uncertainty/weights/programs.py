@@ -58,7 +58,7 @@ class Grid:
         return cls(targets, knots, phi, edge, nearest)
 
     def best(self, scale: Array, gamma: float) -> RationalMagnitude | None:
-        """Return the bound of the smallest ratio, from a denominator on the grid and a ratio; None where none is better."""
+        """Return the bound of the smallest ratio, from a denominator and a ratio; None where none is better."""
         best = None
         for _ in range(_STEPS):
             solution = self._solved(scale, gamma)

@@ -171,3 +171,19 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )
     assert not weight.within_tolerance
+
+
+def test_peaks_that_no_grid_point_meets_are_covered() -> None:
+    """Light resonances, continuous, a hundred points over four decades; an order in between whose best magnitude vanishes at infinity."""
+    tops = np.array([1.0, 0.93, 1.04])
+    A = np.zeros((3, 2, 2))
+    A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0, -(tops**2), -0.004 * tops
+    C = np.stack([tops[:, None] ** 2, np.zeros((3, 1))], axis=-1)
+    units = StateSpace(A, np.tile([[0.0], [1.0]], (3, 1, 1)), C, np.linspace(0.01, 0.02, 3).reshape(-1, 1, 1), 0.0)
+    model = quantify(
+        units, "additive", np.geomspace(1e-2, 1e2, 100) / (2 * np.pi), nominal=0, max_order=2, tolerance_db=60.0
+    )
+    freqs = np.geomspace(1e-2, 1e2, 20000) / (2 * np.pi)
+    response = units.frequency_response(freqs)[:, :, 0, 0]
+    allowed = np.abs(model.weight.left.frequency_response(freqs)[:, 0, 0])
+    assert (np.abs(response - response[0]) <= allowed).all()

@@ -7,8 +7,9 @@ import pytest
 
 from kros.core.lti import StateSpace
 from kros.identify.refine.metric import peak_residual_db
-from kros.uncertainty import FitSettings, quantify, residual
+from kros.uncertainty import quantify, residual
 from kros.uncertainty.forms import completion
+from kros.uncertainty.settings import FitSettings
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import cover_ratio
 from kros.uncertainty.weights.residuals import Residuals

@@ -35,7 +35,8 @@ REMOVED: tuple[tuple[str, str], ...] = (
     ),
     (
         "What the fit of a weight is made of is no longer public; use quantify.",
-        "kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover",
+        "kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover "
+        "kros.uncertainty.FitSettings",
     ),
     (
         "Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db.",

@@ -161,7 +161,7 @@ def quantify(
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
         row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
         ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of arrays of
-        responses; zero for continuous time), ``fit`` (`FitSettings`).
+        responses; zero for continuous time).
 
     Returns
     -------

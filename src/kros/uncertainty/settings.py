@@ -41,14 +41,7 @@ class QuantifySettings(UncertaintySettings):
 
 
 class FitSettings(Settings):
-    """How diagonal weights are fitted and checked; none of it bears on soundness, which the proof at the end decides.
-
-    Examples
-    --------
-    >>> from kros.uncertainty import FitSettings
-    >>> FitSettings(points=300).points
-    300
-    """
+    """How diagonal weights are fitted and checked; none of it bears on soundness, which the proof at the end decides."""
 
     points: int = Field(160, ge=8, description="frequencies of the joint fit: what is missed between them joins it")
     units: int = Field(4, ge=1, description="largest residuals of a frequency in the joint fit; the check sees all")

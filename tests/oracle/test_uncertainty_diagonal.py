@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
-import pytest
 from tests.support.residuals import of_function
 
 from kros.core import StateSpace
-from kros.uncertainty import Form, quantify
 from kros.uncertainty.weights.fit import Target, fit_weight
 from kros.uncertainty.weights.sections import Sections
 
@@ -82,24 +76,3 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
     six, _ = fit_weight(of_function(peaks), freqs, Target(DT, max_order=6))
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max
-
-
-def benchmark():
-    path = Path(__file__).parents[2] / "benchmarks" / "covers.py"
-    spec = importlib.util.spec_from_file_location("covers", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize("form", ["additive", "inverse_output_multiplicative"])
-def test_bounds_hold_by_the_means_of_the_benchmark(form: str) -> None:
-    rng = np.random.default_rng(2)
-    A = np.array([[0.9, 0.05], [-0.1, 0.7]]) * (1 + 0.01 * rng.normal(size=(4, 2, 2)))
-    B = np.array([[0.1, 0.02], [0.0, 0.3]]) * (1 + 0.05 * rng.normal(size=(4, 2, 2)))
-    units = StateSpace(A, B, np.broadcast_to(np.eye(2), A.shape), np.zeros(A.shape), DT)
-    found = quantify(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
-    covers = benchmark()
-    assert covers.independent_cover_max(found, units) <= 1 + 1e-6
-    lowered = found.weight.mapped(lambda s: StateSpace(s.A, s.B, 0.9 * s.C, 0.9 * s.D, s.dt))
-    assert covers.independent_cover_max(replace(found, weight=lowered), units) > 1

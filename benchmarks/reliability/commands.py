@@ -36,7 +36,6 @@ QUICK = (
     "evaluate.robustness=false",
     'synthesis.methods=["residual_h2"]',
     "synthesis.input_weight=3.0",
-    "uncertainty.max_order=1",
     "uncertainty.n_freqs=60",
 )
 STUDY = """name = "drives"
@@ -186,7 +185,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
     keys = (
         "identify.alpha",
         "uncertainty.n_freqs",
-        "uncertainty.max_order",
+        "uncertainty.form",
         "split.test_fraction",
         "evaluate.folds",
         "evaluate.reserve",

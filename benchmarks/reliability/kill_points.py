@@ -35,7 +35,6 @@ reader = "parquet"
 refine = false
 [uncertainty]
 n_freqs = 60
-max_order = 1
 [synthesis]
 input_weight = 3.0
 methods = ["residual_h2"]

@@ -85,7 +85,7 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
         "data": {"source": str(folder / "recordings"), "reader": "parquet"},
         "lifting": {"functions": [FUNCTIONS[plant].format(**names)]},
         "identify": {"refine": refine},
-        "uncertainty": {"n_freqs": 60, "max_order": 1},
+        "uncertainty": {"n_freqs": 60},
         "synthesis": {
             "input_weight": 3.0,
             "methods": ["worst_case_h2", "residual_h2", "estimator"] if refine else ["residual_h2", "estimator"],

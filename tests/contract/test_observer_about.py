@@ -59,7 +59,7 @@ def found(tmp_path_factory) -> tuple[Any, dict[str, Any]]:
         )
     quick: dict[str, Any] = {
         "identify": {"refine": False},
-        "uncertainty": {"n_freqs": 60, "max_order": 1},
+        "uncertainty": {"n_freqs": 60},
         "synthesis": {"methods": ["residual_h2"], "input_weight": 3.0},
         "observer": {"baselines": ["open_loop"], "deployed": "linear_edmd/residual_h2"},
         "sensor": {"angle": {"noise": 1e-4}},

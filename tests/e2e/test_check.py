@@ -29,7 +29,6 @@ refine = false
 [uncertainty]
 form = "additive"
 n_freqs = 60
-max_order = 1
 """
 
 

@@ -26,7 +26,7 @@ UNITS = ("001", "002", "003", "004")
 FAST = (
     '[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
-    "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
+    "[uncertainty]\nn_freqs = 60\n"
     '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned"]\n'
     "[evaluate]\nfolds = {folds}\nrobustness = false\n"
@@ -217,9 +217,8 @@ def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run
 
 def test_too_small_a_reserve_says_what_is_needed(kros, pendulums, tmp_path):
     path = study(tmp_path, pendulums)
-    config = load_config(path, ["evaluate.reserve=1", 'uncertainty.nominal="001"'])
+    config = load_config(path, ["evaluate.reserve=1"])
     found = run_study(config, tmp_path / "run", until=Stage.LEFT_OUT).metrics
-    assert found["next_unit"]["units"] != ["001"]
     assert found["next_unit"]["bounds"] is None
     assert found["next_unit"]["reason"] == "1 units in reserve, and a confidence of 0.95 needs 19"
     assert "left_out" not in found

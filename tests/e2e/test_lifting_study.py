@@ -31,7 +31,6 @@ refine = false
 
 [uncertainty]
 n_freqs = 100
-max_order = 1
 
 [evaluate]
 robustness = false

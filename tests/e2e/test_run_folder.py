@@ -15,17 +15,19 @@ from typing import Any
 
 import pytest
 
+from kros.core.errors import IdentificationError
 from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
 from kros.core.store import recorded_files
 from kros.study import Stage, load_config
 from kros.study import run as run_study
+from kros.study.stages import quantify as quantify_stage
 
 pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
     'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
-    "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
+    "[uncertainty]\nn_freqs = 60\n"
     '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     "[evaluate]\nrobustness = false\n"
@@ -127,7 +129,7 @@ def test_any_file_that_was_changed_is_made_again(kros, fast, run, finished, patt
 
 
 @pytest.mark.parametrize(
-    "settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.false_alarm_rate=0.01")]
+    "settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.outlier_form=additive")]
 )
 def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     for _ in range(2):
@@ -136,15 +138,19 @@ def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     assert recorded_files(run) >= {name for name in files(run) if name.startswith(("uncertainty/", "outliers/"))}
 
 
-def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished):
-    found = again(kros, fast, run, "--set", "uncertainty.nominal=nobody")
-    assert found.exit_code == 1
+def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished, monkeypatch):
+    def fails(*args, **options):
+        raise IdentificationError("two units are needed")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(quantify_stage, "quantify", fails)
+        assert again(kros, fast, run, "--set", "uncertainty.n_freqs=61").exit_code == 1
     assert results(run) == results(finished)
     assert kros("figures", run, run.parent / "figures").exit_code == 0
 
 
 def test_what_does_not_follow_from_the_study_any_more_goes(kros, fast, run):
-    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.max_order=2").exit_code == 0
+    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.n_freqs=62").exit_code == 0
     assert not any(
         name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run)
     )

@@ -18,7 +18,7 @@ from kros.observer.certificate.majorants import energy, majorants
 from kros.observer.certificate.signals import signal_bound
 from kros.synthesis import Injection
 from kros.synthesis.worst_case.arcs import Enclosure
-from kros.uncertainty.coprime.bands import band_edges
+from kros.uncertainty.band_energies import band_edges
 
 DT, N = 0.01, 600
 

@@ -7,7 +7,7 @@ import pytest
 from paper_plant import reduced_plant
 
 from kros.core.lti import StateSpace, gain
-from kros.design.methods.published import as_published, design_published, entrywise_weight
+from kros.design.methods.published import as_published, design_published, entry_weights
 from kros.design.task import DesignResult
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.plants import mixed_plant
@@ -32,7 +32,11 @@ def task():
     problem = ObserverProblem(
         nominal, np.eye(2)[[0]], wide, gain(np.eye(2), DT), np.ones(2), np.ones(2), np.array([1e-3])
     )
-    models = SimpleNamespace(systems=lambda ids: systems, output_scale=np.ones(2), input_scale=np.ones(2))
+    models = SimpleNamespace(
+        frequencies=lambda: np.geomspace(0.01, 50, 200),
+        scaled_responses=lambda freqs, ids: systems.frequency_response(freqs),
+        sample_period_s=DT,
+    )
     settings = SimpleNamespace(time_limit_s=20.0)
     return SimpleNamespace(
         name="koopman_edmd/paper",
@@ -48,7 +52,7 @@ def task():
 
 
 def test_every_entry_of_every_residual_is_below_its_weight(task):
-    weight = entrywise_weight(task).matrix()
+    weight = entry_weights(task).system
     freqs = np.geomspace(0.01, 49, 200)
     responses = population().frequency_response(freqs)
     entries = np.abs(residual("inverse_input_multiplicative", responses[1], responses)).max(axis=0)
@@ -56,7 +60,7 @@ def test_every_entry_of_every_residual_is_below_its_weight(task):
 
 
 def test_the_plant_is_the_published_one_with_noise_and_penalty(task):
-    weight = entrywise_weight(task).matrix()
+    weight = entry_weights(task).system
     problem = as_published(task.problem, weight)
     assert problem.injection is Injection.INPUT
     published = reduced_plant(problem.nominal, problem.C / 1e-3, gain(np.eye(2), DT), gain(np.eye(2), DT), weight)

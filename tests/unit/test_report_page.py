@@ -658,7 +658,7 @@ def test_results_of_the_short_way_are_plotted(uncertain: dict[str, UncertainMode
     kind = "linear_edmd"
     found = IdentifiedModels(population, facts, Lifting(STATES), None, (kind,), {kind: models(kind, "noload", 1)})
     assert len(plot(found).axes) == len(STATES) * 4
-    sets = UncertainModels(found, "001", "002", (), {kind: uncertain[kind]})
+    sets = UncertainModels(found, "001", "002", {kind: uncertain[kind]})
     assert len(plot(sets).axes) == 4
     assert len(plot(sets, entries=True).axes) == 4
     with pytest.raises(ConfigError, match="no set of kind 'koopman'"):

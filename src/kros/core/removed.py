@@ -18,8 +18,6 @@ Structures of weights to choose from are no longer part of kros; remove the key 
 Systems and responses are no longer quantified by functions of their own; use quantify, which takes systems, responses
 (form before freqs_hz) and models of kros.identify.
     kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses
-What the fit of a weight is made of is no longer public; use quantify.
-    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
 Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db.
     kros.uncertainty.magnitude_tightness
 Where a form is exact is no longer a function of its own; use misfit, which is zero there.
@@ -36,8 +34,8 @@ two-hundredth of an episode.
     calibrate.settle_s
 Steps of the design of predictors and residual-shaped observers are no longer public; use synthesize with method
 estimator or residual_h2.
-    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal
-    kros.observer.residual_models kros.observer.tune_observer kros.observer.in_sizes
+    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal kros.observer.residual_models
+    kros.observer.tune_observer kros.observer.in_sizes
 Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.
     kros.observer.EstimateKind
 Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.
@@ -104,6 +102,14 @@ Families are joined as tuples, and a lifting refuses functions that repeat; writ
     kros.lifting.concatenate
 TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).
     kros.data.TrueChannel
+How weights and outlier scores are computed is no longer set in a study; use kros.quantify, which takes nominal,
+max_order, tolerance_db and false_alarm_rate.
+    uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate
+Flagged units are no longer dropped by a study itself; name them under data.exclude.
+    uncertainty.drop_outliers
+What the fit of a weight is made of is no longer public; use quantify.
+    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
+    kros.uncertainty.FitSettings
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

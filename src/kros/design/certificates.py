@@ -32,7 +32,7 @@ from ..observer.certificate.report import ReliftRow, course, relift_report
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
-from ..uncertainty.coprime.bands import BandEnergies
+from ..uncertainty.band_energies import BandEnergies
 from .guard import guarded
 from .task import DesignResult, DesignTask
 from .validation import SHORT_SAMPLES, TrainingSet, ValidationSet, hidden_mean

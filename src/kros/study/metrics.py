@@ -154,7 +154,6 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
         "weight": {
-            "structure": model.weight.structure,
             "orders": [model.weight.left_orders, model.weight.right_orders],
             "cover_max": model.cover_max,
             "overbound_db_max": model.overbound_db_max,

@@ -8,37 +8,29 @@ import numpy as np
 
 from ...core.lti import StateSpace, gain
 from ...synthesis import Injection, ObserverProblem, mixed
-from ...uncertainty import quantify
-from ...uncertainty.weights.weight import EntrywiseWeight
+from ...uncertainty import residual
+from ...uncertainty.weights.entries import EntryWeights, fit_entries
 from ..task import DesignResult, DesignTask
 
 
 def design_published(task: DesignTask) -> DesignResult:
     """Mixed synthesis with a weight for every entry of the residual in front of a full perturbation, as in the paper's Figures 8 and 10."""
     problem = task.require_problem()
-    weight = entrywise_weight(task)
-    found = mixed(as_published(problem, weight.matrix()), time_limit_s=task.settings.time_limit_s)
-    excess = weight.unstructured_excess
+    weights = entry_weights(task)
+    found = mixed(as_published(problem, weights.system), time_limit_s=task.settings.time_limit_s)
+    excess = weights.excess
     note = f"The weights bound entries: they are exceeded {excess:.3g} times in front of a full perturbation."
     published = replace(found, method="paper", worst_case_h2=None, quadrature_error=None, notes=(*found.notes, note))
     return task.designed(published, unstructured_excess=excess)
 
 
-def entrywise_weight(task: DesignTask) -> EntrywiseWeight:
+def entry_weights(task: DesignTask) -> EntryWeights:
     """Return bounds of all entries of the residuals of the units that the study's own set covers."""
-    models = task.models
-    found = quantify(
-        models.systems(task.covered),
-        task.require_problem().form,
-        unit_ids=task.covered,
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
-        nominal=task.unit,
-        structure="entrywise",
-        max_order=task.max_order,
-    )
-    assert isinstance(found.weight, EntrywiseWeight)
-    return found.weight
+    models, units = task.models, list(task.covered)
+    freqs = models.frequencies()
+    responses = models.scaled_responses(freqs, units)
+    E = residual(task.require_problem().form, responses[units.index(task.unit)], responses)
+    return fit_entries(E, freqs, models.sample_period_s, task.max_order)
 
 
 def as_published(problem: ObserverProblem, weight: StateSpace) -> ObserverProblem:

@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace
 from ...data import EpisodeBatch
-from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
+from ...uncertainty.band_energies import BandEnergies, band_edges, cover
 from ..data import ObserverData
 from ..simulate import run_observer
 from .certificate import ReliftCertificate

@@ -136,7 +136,6 @@ def uncertainty(facts: Facts) -> Section | None:
     orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
     columns = [
         Column("model", [model_label(name) for name in entries]),
-        Column("weights", [entry["structure"] for entry in weights]),
         Column("orders, left and right", orders),
         Column("largest normalised residual", [number(w["cover_max"], 6) for w in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),

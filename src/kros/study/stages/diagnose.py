@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 
 _NOISE_POINTS, _POINTS = 80, 240  # frequencies
 _MOST_UNITS = 60  # whose models are resampled
-_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 
 
 class _Result(Protocol):
@@ -49,14 +48,13 @@ Task = tuple[Path, Callable[[], _Result | None]]
 
 def diagnose(context: Context, found: UncertainModels) -> None:
     """Compute and save what there is to say; what cannot be said is logged, with its reason, and left out."""
-    folder, config = context.store.draft("uncertainty"), context.config.uncertainty
+    folder = context.store.draft("uncertainty")
     models = found.models
     noise = [(kind, task) for kind, uncertain in found.sets.items() for task in _noise(context, kind, uncertain)]
     tasks: list[Task] = [(folder / kind / "noise", task) for kind, task in noise]  # those that read recordings begin
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks += [
-        (folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind], config))
-        for kind in pair
+        (folder / kind / "units", partial(beside_weights, models.models(kind), found.sets[kind])) for kind in pair
     ]
     tasks += _others(context, found.scores)
     results = context.work.run(
@@ -115,21 +113,17 @@ def _not_told_apart(name: str, error: KrosError) -> None:
     log.info("%s: variation and noise are not told apart: %s", name, error)
 
 
-def beside_weights(models: ModelSet, uncertain: UncertainModel, config: UncertaintySettings) -> UnitResiduals:
+def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
     """Return the residuals of all covered units beside the weights of a study."""
     every = max(1, len(uncertain.freqs_hz) // _POINTS)
     freqs = uncertain.freqs_hz[::every]
     return unit_residuals(
         uncertain.form,
-        uncertain.scaled_nominal().frequency_response(freqs),
-        models.scaled_responses(freqs, list(uncertain.unit_ids)),
+        (uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)),
+        dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True)),
         uncertain.weight,
         freqs,
         models.sample_period_s,
-        unit_ids=uncertain.unit_ids,
-        nominal_id=uncertain.nominal_id,
-        max_order=min(config.max_order, _ENTRY_ORDER),
-        tolerance_db=config.tolerance_db,
     )
 
 
@@ -174,16 +168,5 @@ def against_others(
     everyone = [*others, *outside]
     responses = models.scaled_responses(freqs, everyone)
     cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
-    return unit_residuals(
-        form,
-        responses[row],
-        responses,
-        cover,
-        freqs,
-        models.sample_period_s,
-        unit_ids=everyone,
-        nominal_id=nominal,
-        outside=outside,
-        max_order=min(config.max_order, _ENTRY_ORDER),
-        tolerance_db=config.tolerance_db,
-    )
+    units = dict(zip(everyone, responses, strict=True))
+    return unit_residuals(form, (nominal, responses[row]), units, cover, freqs, models.sample_period_s, outside)

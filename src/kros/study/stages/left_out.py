@@ -139,8 +139,6 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     observer = config.observer.model_copy(update={"deployed": None})
     changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
     changes["evaluate"] = config.evaluate.model_copy(update={"reserve": 0})
-    if config.uncertainty.nominal in held:
-        changes["uncertainty"] = config.uncertainty.model_copy(update={"nominal": None})
     return config.model_copy(update=changes)
 
 

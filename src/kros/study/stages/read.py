@@ -46,7 +46,7 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
 
 def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
     """Return the units in reserve: drawn from those of the population that the study does not name, by their places alone."""
-    n, named = config.evaluate.reserve, {config.uncertainty.nominal, *config.load.units}
+    n, named = config.evaluate.reserve, set(config.load.units)
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):

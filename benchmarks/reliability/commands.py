@@ -35,7 +35,6 @@ QUICK = (
     "identify.refine=false",
     "evaluate.robustness=false",
     'synthesis.methods=["residual_h2"]',
-    "synthesis.input_weight=3.0",
     "uncertainty.max_order=1",
     "uncertainty.n_freqs=60",
 )
@@ -198,7 +197,6 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "sensor.angle.noise",
         "sensor.angle.dropout",
         "limits.speed",
-        "observer.deployed",
         "calibrate.angle",
     )
     keys += (
@@ -209,7 +207,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "data.prepare",
         "data.source",
         "identify.kinds",
-        "load.limit",
+        "load.moment",
     )
     values = (
         "-1",

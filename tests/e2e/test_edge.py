@@ -164,7 +164,7 @@ def test_a_study_that_is_no_file(kros, tmp_path, kind):
     ("content", "word"),
     [
         ("a = " + "[" * 5000, "nested"),
-        ("[data]\nsource = 'recordings'\n[identify]\nalpha_factor = inf\n", "alpha_factor"),
+        ("[data]\nsource = 'recordings'\n[identify]\nalpha = inf\n", "alpha"),
         ("[data]\nsource = 'recordings'\n[load]\ninertia = nan\n", "inertia"),
         ('[data]\nsource = "a\\u0000b"\n', "nul"),
         ("[data]\nsource = 'recordings'\n[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []\n", "lifting"),

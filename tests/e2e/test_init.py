@@ -119,7 +119,6 @@ def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
     assert "winkel_abtrieb [rad]" in result.output
     quick = [
         "uncertainty.n_freqs=60",
-        "synthesis.input_weight=3.0",
         'synthesis.methods=["worst_case_h2"]',
         "identify.refine=false",
     ]

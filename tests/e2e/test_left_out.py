@@ -27,7 +27,7 @@ FAST = (
     '[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
     "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
-    '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
+    '[synthesis]\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned", "filtered_difference", "learned"]\n'
     "[evaluate]\nfolds = {folds}\nrobustness = false\n"
 )
@@ -160,7 +160,7 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     assert kros("simulate", tmp_path / "drives", "--units", 3, "--episodes", 2, "--seconds", 8).exit_code == 0
     config = load_config(
         study(tmp_path, tmp_path / "drives"),
-        ['data.exclude=["001003"]', "observer.deployed='learned'", "require.robust=true"],
+        ['data.exclude=["001003"]'],
     )
     fold, whole = tmp_path / "fold", tmp_path / "whole"
     run_study(config, fold, until=Stage.CALIBRATE)
@@ -174,8 +174,6 @@ def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     made = without(contexts[1], ["001002"])
     assert made.data.exclude == ("001003", "001002")
     assert made.data.source == tmp_path / "drives"
-    assert made.observer.deployed is None
-    assert not made.require.robust
 
 
 def test_units_in_reserve_take_part_in_nothing_and_bound_the_next(pendulums, run, tmp_path):

@@ -36,7 +36,6 @@ max_order = 1
 [evaluate]
 robustness = false
 [synthesis]
-input_weight = 3.0
 methods = ["worst_case_h2"]
 
 [observer]

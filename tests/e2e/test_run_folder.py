@@ -26,7 +26,7 @@ FAST = (
     'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
     "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
-    '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
+    '[synthesis]\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     "[evaluate]\nrobustness = false\n"
 )
@@ -229,9 +229,7 @@ def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
         (run / name).write_text("remember")
     crafted(run, ["notes.txt"])
     assert (
-        kros(
-            "run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha_factor=5"
-        ).exit_code
+        kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha=90").exit_code
         == 0
     )
     assert {"notes.txt", "observers/notes.txt", "left_out/0/notes.txt"} <= files(run)

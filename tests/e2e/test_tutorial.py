@@ -16,7 +16,6 @@ QUICKER = [
     "identify.refine=false",
     'synthesis.methods=["worst_case_h2"]',
     'observer.baselines=["open_loop"]',
-    "synthesis.input_weight=3.0",
 ]
 QUICKER += ["evaluate.robustness=false", "estimator.rows=20000", "uncertainty.n_freqs=60"]
 

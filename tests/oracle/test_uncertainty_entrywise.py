@@ -10,7 +10,6 @@ import pytest
 from tests.support.residuals import of_function, of_units
 
 from kros.core.lti import StateSpace, gain
-from kros.design.settings import SynthesisSettings
 from kros.design.uncertain_set import usable_problem
 from kros.uncertainty import Form, UncertainModel, quantify, residual
 from kros.uncertainty.weights.certificate import Method
@@ -112,7 +111,7 @@ def test_models_keep_their_weights_and_synthesis_refuses_them(tmp_path: Path) ->
     np.testing.assert_array_equal(
         loaded.matrix().frequency_response(GRID), model.weight.matrix().frequency_response(GRID)
     )
-    problem, reason = usable_problem(SimpleNamespace(name="models"), model, np.zeros(1), SynthesisSettings())  # type: ignore[arg-type]
+    problem, reason = usable_problem(SimpleNamespace(name="models"), model, np.zeros(1))  # type: ignore[arg-type]
     assert problem is None
     assert "entrywise" in reason
     assert "diagonal perturbation" in reason

@@ -11,5 +11,5 @@ LEARNING = (
     StageStep(Stage.CALIBRATE, calibrate.run, ("calibrate", "lifting")),
     StageStep(Stage.IDENTIFY, identify.run, ("identify", "lifting")),
     StageStep(Stage.QUANTIFY, quantify.run, ("uncertainty",)),
-    StageStep(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "estimator", "sensor", "limits", "observer", "require")),
+    StageStep(Stage.SYNTHESIZE, synthesize.run, ("synthesis", "estimator", "sensor", "observer")),
 )

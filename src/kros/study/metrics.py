@@ -52,10 +52,8 @@ def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
     }
     if context.config.sensor:
         study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
-    if limits := limits_of(context.config.limits, facts.limits, context.population.states):
-        study["limits"] = {
-            name: _limit(limit, facts.limits.get(name), name in context.config.limits) for name, limit in limits.items()
-        }
+    if limits := limits_of({}, facts.limits, context.population.states):
+        study["limits"] = {name: _limit(limit, facts.limits[name]) for name, limit in limits.items()}
     if facts.alerts:
         study["alerts"] = facts.alerts
     if Stage.IDENTIFY in done:
@@ -72,10 +70,9 @@ def _episodes(context: Context) -> dict[str, dict[str, int]]:
     return {c: {part: sum(key.condition == c for key in keys) for part, keys in parts.items()} for c in conditions}
 
 
-def _limit(limit: Limit, seen: FoundLimit | None, declared: bool) -> dict[str, Any]:
-    """Return a limit that counts, and where recordings were seen at one."""
-    entry: dict[str, Any] = limit.model_dump() | {"declared": declared}
-    return entry if seen is None else entry | {"seen": asdict(seen)}
+def _limit(limit: Limit, seen: FoundLimit) -> dict[str, Any]:
+    """Return a limit, and where recordings were seen at it."""
+    return limit.model_dump() | {"seen": asdict(seen)}
 
 
 def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
@@ -175,25 +172,15 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
 def _observers(context: Context) -> dict[str, Any]:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     entries: dict[str, Any] = {}
-    written, certified = context.store.files(), _certified(context)
+    written = context.store.files()
     for name, facts in context.observers_record["facts"].items():
-        entry = dict(facts)
+        entries[name] = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
-            entry |= {key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)}
-        entries[name] = entry | certified.get(name, {})
+            names = ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)
+            entries[name] |= {key: getattr(synthesis, key) for key in names}
     return {"observers": entries} | _deployment(context)
-
-
-def _certified(context: Context) -> dict[str, dict[str, Any]]:
-    """Return assumptions of certificates, and bounds for recorded signals in the channels' units of measure."""
-    if not context.store.holds("observers", "relift.json"):
-        return {}
-    record = load_artifact(context.store.path("observers"), "relift")[0]
-    signals, proofs = record.get("signals", {}), record.get("certificates", {})
-    bounds = {n: {"set_bound": dict(zip(s["states"], s["cover"], strict=True))} for n, s in signals.items()}
-    return {n: {"assumptions": proof.get("assumptions", [])} | bounds.get(n, {}) for n, proof in proofs.items()}
 
 
 def _deployment(context: Context) -> dict[str, Any]:

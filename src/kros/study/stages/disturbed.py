@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
-from ...design.estimators import Baseline
+from ...design.baselines import Baseline
 from ...design.task import split_name
 from ...evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
 from ...evaluate.disturb import Measured

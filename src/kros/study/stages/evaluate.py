@@ -15,7 +15,7 @@ from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
-from ...design.estimators import Baseline, make_difference, make_extended, make_learned
+from ...design.baselines import Baseline, make_difference, make_extended, make_learned
 from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
@@ -226,7 +226,7 @@ def estimation(
 ) -> list[Piece]:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
     makers, sensor = baseline_makers(context, population, keys), context.config.sensor
-    limits = sides(limits_of(context.config.limits, context.facts.limits, population.states), population.states)
+    limits = sides(limits_of({}, context.facts.limits, population.states), population.states)
     work = [
         Piece((name,), partial(evaluate_baseline, make, population, keys, units, shown, sensor, trial, limits))
         for name, make in makers.items()

@@ -28,7 +28,7 @@ from ...evaluate.next_unit import fewest_units
 from ...identify.calibrate import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
-from ..config import RequireConfig, Stage, StudyConfig
+from ..config import Stage, StudyConfig
 from ..engine.context import Context
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
@@ -125,7 +125,7 @@ def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> di
 
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
-    """Return the study on the prepared recordings of all other units, which hands nothing over and so requires nothing."""
+    """Return the study on the prepared recordings of all other units."""
     config = whole.config
     prepared = {
         "source": recordings_path(whole.store.folder).absolute(),
@@ -136,8 +136,7 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     data = config.data.model_copy(
         update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)}
     )
-    observer = config.observer.model_copy(update={"deployed": None})
-    changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
+    changes: dict[str, Any] = {"data": data}
     changes["evaluate"] = config.evaluate.model_copy(update={"reserve": 0})
     if config.uncertainty.nominal in held:
         changes["uncertainty"] = config.uncertainty.model_copy(update={"nominal": None})

@@ -11,7 +11,6 @@ from ...data.steps import parse_steps
 from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
-from ...observer.limits import limits_of
 from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ..config import StudyConfig
@@ -71,7 +70,6 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
         config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
     )
     require_measured(config.sensor, population.measured)
-    limits_of(config.limits, {}, population.states)
 
 
 def run(context: Context) -> None:

@@ -73,7 +73,7 @@ def test_a_fold_is_the_study_on_recordings_that_do_not_hold_its_units(pendulums,
     made = sorted(p.relative_to(fold / "observers") for p in (fold / "observers").glob("*/*.json"))
     assert made == sorted(p.relative_to(alone / "observers") for p in (alone / "observers").glob("*/*.json"))
     assert made
-    for name in [*made, "relift.json"]:
+    for name in [*made, "observers.json"]:
         assert (fold / "observers" / name).read_text() == (alone / "observers" / name).read_text()
 
 

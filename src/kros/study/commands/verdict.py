@@ -10,7 +10,6 @@ from xml.sax.saxutils import quoteattr
 
 from ...core.errors import ConfigError
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
-from .innovation import level_text
 
 
 class Verdict(StrEnum):
@@ -100,7 +99,8 @@ def _reasons(row: dict[str, Any]) -> list[str]:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     if row.get("level_db") is not None:
         few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
-        reasons.append(f"innovation {level_text(row)}{few if row['level_units'] < FEWEST_UNITS else ''}")
+        place = f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"
+        reasons.append(f"innovation {place}{few if row['level_units'] < FEWEST_UNITS else ''}")
     elif "missing" in row:
         reasons.append("the deployed observer has no monitor, or no sample can be judged")
     if row["left_out"]:

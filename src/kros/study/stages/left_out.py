@@ -33,16 +33,8 @@ from ..engine.context import Context
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
 from . import calibrate
-from .evaluate import (
-    TestOutcome,
-    UnitParameters,
-    band_hz,
-    error_rows,
-    estimation,
-    evaluate_observers,
-    facts_of,
-    outcomes,
-)
+from .evaluate import band_hz, estimation, facts_of, outcomes
+from .held_out import HeldOut, Outcome
 from .read import FEWEST
 
 log = logging.getLogger(__name__)
@@ -50,6 +42,7 @@ FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"
 NEXT = "next_unit"
 _MEASURES = ("error_percent", "rms")
 Rows = list[dict[str, Any]]
+UnitParameters = dict[str, dict[str, float]]
 
 
 def wanted(config: StudyConfig) -> bool:
@@ -149,15 +142,13 @@ def absent(whole: Context) -> tuple[str, ...]:
 
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
-    """Run what a fold made on the test episodes of the units it does not know."""
-    facts, population = whole.facts, whole.population.select(held)
+    """Run the observers of a fold on the test episodes of the units that took no part in it."""
+    facts, population, record = whole.facts, whole.population.select(held), context.observers_record
     units, keys = held_parameters(context, population, facts), tuple(k for k in facts.test if k.unit in held)
-    results = outcomes(context, estimation(context, population, keys, units))
-    record = context.observers_record
-    band, rows = band_hz(whole), []
-    for name, outcome in results.items():
-        if isinstance(outcome, TestOutcome):
-            rows += error_rows(name, outcome, keys, dict.fromkeys(held, "left_out"), population.states, band)
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
+    results, band, roles = outcomes(context, estimation(context, episodes)), band_hz(whole), dict.fromkeys(held, FOLDER)
+    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
+    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles, band)]
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
@@ -178,31 +169,23 @@ def held_parameters(context: Context, population: Population, facts: RecordingFa
 
 
 def next_unit(context: Context) -> dict[str, Any]:
-    """Run the deployed observer on the units in reserve; return their errors, and what these say about the next unit in every condition."""
-    config, facts = context.config.evaluate, context.facts
-    deployed = context.observers_record["deployed"]
+    """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
+    config, facts, population = context.config.evaluate, context.facts, context.population
+    deployed, evaluated = context.observers_record["deployed"], context.evaluation["rows"]
     rows, failed = reserve_rows(context, deployed)
-    evaluated: Rows = context.evaluation["rows"]
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
-    hidden = [c for c in context.population.states if c not in context.population.measured] or list(
-        context.population.states
-    )
-    content: dict[str, Any] = {
-        "reserve": len(facts.reserve),
-        "units": facts.reserve,
-        "confidence": config.confidence,
-        "observer": deployed,
+    hidden = [c for c in population.states if c not in population.measured] or list(population.states)
+    bounds = {
+        c: bounds_of(_of_condition(rows, c), _of_condition(known, c), hidden, config.confidence)
+        for c in population.conditions
     }
-    found = {
-        c: bounds_of(of_condition(rows, c), of_condition(known, c), hidden, config.confidence)
-        for c in context.population.conditions
-    }
-    content |= {"jointly": True, "condition": facts.identify_on, **found.pop(facts.identify_on), "others": found}
-    return content | {"rows": rows, "failed": failed}
+    content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence}
+    content |= {"observer": deployed, "jointly": True, "condition": facts.identify_on, **bounds.pop(facts.identify_on)}
+    return content | {"others": bounds, "rows": rows, "failed": failed}
 
 
 def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
-    """Return the deployed observer's errors on the test episodes of the units in reserve, infinite for one that cannot be calibrated, and the reasons."""
+    """Return the errors on the units in reserve, infinite where one cannot be calibrated, and the reasons."""
     whole, facts = recordings_of(context.store.folder).select(context.facts.reserve), context.facts
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
@@ -214,44 +197,39 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
             known |= held_parameters(context, whole.select([unit]), facts)
         except IdentificationError as error:
             failed[unit] = str(error)
-    keys, roles = tuple(k for k in test if k.unit in known), dict.fromkeys(facts.groups, "reserve")
-    rows: Rows = []
+    keys, rows = tuple(k for k in test if k.unit in known), Rows()
     if keys:
         observer = Observer.load(context.store.path("observers", "deployed.json"))
-        (outcome,) = evaluate_observers([observer], whole, keys, known, (), context.config.sensor)
-        rows = error_rows(deployed, outcome, keys, roles, whole.states, band_hz(context))
+        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor)
+        (outcome,) = episodes.observers([observer])
+        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"), band_hz(context))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
 
 
-def of_condition(rows: Rows, condition: str) -> Rows:
-    """Return the rows of a condition."""
+def _of_condition(rows: Rows, condition: str) -> Rows:
     return [row for row in rows if row["condition"] == condition]
 
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> dict[str, Any]:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
-    own = {(c, m): np.array([r[m] for r in known if r["channel"] == c], float) for c in channels for m in _MEASURES}
-    scale = {place: float(values.mean()) if values.size else np.nan for place, values in own.items()}
+    places = [(c, m) for c in channels for m in _MEASURES]
+    scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
     usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
     units, needed = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence)
+    reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
+    bound = None
     if not usable:
-        return {"bounds": None, "reason": "the observer has no finite error on the units that it was made from"}
-    if len(units) < needed:
-        return {
-            "bounds": None,
-            "reason": f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}",
-        }
-    errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-    bound = next_unit_bound(
-        [[errors[u, c, m] for c, m in usable] for u in units], [scale[p] for p in usable], confidence
-    )
+        reason = "the observer has no finite error on the units that it was made from"
+    elif len(units) < needed:
+        reason = f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"
+    else:
+        errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
+        of_units = [[errors[u, c, m] for c, m in usable] for u in units]
+        bound = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
     if bound is None or not np.isfinite(bound).all():
-        return {
-            "bounds": None,
-            "reason": "the observer diverges on too many of the units in reserve, or they cannot be calibrated",
-        }
+        return {"bounds": None, "reason": reason}
     values = dict(zip(usable, bound.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 

@@ -464,7 +464,7 @@ def run(count: int, seed: int) -> list[Tally]:
                 "Parquet",
                 root / "parquet",
                 PARQUET,
-                [["run", "parquet.toml", "--until", "read", *until], ["convert", "case", WRITTEN, "--workers", "1"]],
+                [["run", "parquet.toml", "--until", "read", *until]],
             ),
             (
                 "TOML",

@@ -165,23 +165,6 @@ def simulate(
 
 
 @app.command()
-def convert(
-    source: Annotated[Path, typer.Argument(metavar="SRC")],
-    out: Path,
-    reader: Annotated[str | None, _option("motor-drive-raw, parquet or csv; guessed by default.")] = None,
-    mapping: Annotated[Path | None, _option("TOML file that maps CSV columns to channels.")] = None,
-    workers: Workers = None,
-) -> None:
-    """Convert any supported recording to Parquet."""
-    from .study.commands.convert import convert_recordings
-    from .study.engine.progress import make_progress
-
-    with make_progress(False) as progress:
-        population = convert_recordings(source, out, reader, mapping, _count(workers), progress)
-    _say([f"{len(population.episodes)} episodes of {len(population.units)} units in {out}"])
-
-
-@app.command()
 def run(
     study: Annotated[Path, typer.Argument(metavar="STUDY.toml")],
     out: Annotated[Path | None, _option("Run folder; default: runs/<study> beside the study file.")] = None,

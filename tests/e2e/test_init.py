@@ -117,11 +117,7 @@ def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
     result = kros("init", folder, "--out", tmp_path / "study.toml")
     assert result.exit_code == 0, result.output
     assert "winkel_abtrieb [rad]" in result.output
-    quick = [
-        "uncertainty.n_freqs=60",
-        'synthesis.methods=["worst_case_h2"]',
-        "identify.refine=false",
-    ]
+    quick = ["uncertainty.n_freqs=60", 'synthesis.methods=["worst_case_h2"]', "identify.refine=false"]
     quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "estimator.rows=20000"]
     result = kros(
         "run",

@@ -158,10 +158,7 @@ def test_an_excluded_unit_is_nowhere(pendulums, tmp_path):
 def test_a_unit_that_is_left_out_is_calibrated_as_a_new_one(kros, tmp_path):
     """Its phase comes from its own training episodes; what the fold knows of it is the branch."""
     assert kros("simulate", tmp_path / "drives", "--units", 3, "--episodes", 2, "--seconds", 8).exit_code == 0
-    config = load_config(
-        study(tmp_path, tmp_path / "drives"),
-        ['data.exclude=["001003"]'],
-    )
+    config = load_config(study(tmp_path, tmp_path / "drives"), ['data.exclude=["001003"]'])
     fold, whole = tmp_path / "fold", tmp_path / "whole"
     run_study(config, fold, until=Stage.CALIBRATE)
     run_study(load_config(study(tmp_path, tmp_path / "drives")), whole, until=Stage.CALIBRATE)

@@ -60,8 +60,7 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
         own[0]
         < 0.2
         * percent(
-            run_observer(in_sizes(alone.method.design(alone).observer, {}), test.states[..., :1], test.inputs),
-            test,
+            run_observer(in_sizes(alone.method.design(alone).observer, {}), test.states[..., :1], test.inputs), test
         )[0]
     )
     assert "position" in found.facts["rows_fitted_to_single_steps"]

@@ -103,7 +103,7 @@ def test_models_in_a_folder_can_be_sent_to_another_process(tmp_path):
         (
             {"sensor": {"velocity": {"noise": 1e-3}}},
             "sensor: velocity should be among the states that are measured, position",
-        ),
+        )
     ],
 )
 def test_settings_of_channels_name_channels_that_they_are_for(tmp_path, section, reason):

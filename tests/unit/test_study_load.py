@@ -29,7 +29,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
         config=SimpleNamespace(load=LoadConfig(**options)),
         facts=facts,
         population=population,
-        phase_spec=None,
+        calibration=None,
         lifting=Lifting(population.states),
         identified=SimpleNamespace(
             kinds=("linear",),

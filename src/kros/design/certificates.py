@@ -141,10 +141,7 @@ def _certified_filters(
 
 
 def _facts(
-    certificate: ReliftCertificate,
-    bound: SignalBound,
-    measured: Sequence[int],
-    errors: tuple[float, float],
+    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: tuple[float, float]
 ) -> dict[str, Any]:
     """Return what the metrics say of certificates, and of the errors in training with and without measurements."""
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}

@@ -20,7 +20,7 @@ from ..uncertainty import UncertainModel, VariationAndNoise
 from .config import Stage
 from .engine.context import Context
 from .engine.store import Store
-from .stages import calibrate, left_out
+from .stages import left_out
 from .stages.load import load_metrics
 
 
@@ -83,7 +83,7 @@ def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
 
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
     facts = context.facts
-    calibration = calibrate.load(context) if Stage.CALIBRATE in done else None
+    calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
     rows = []
     for unit, group in facts.groups.items():
@@ -111,7 +111,7 @@ def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
 
 def _calibration(context: Context) -> dict[str, Any]:
     """What the phase of every unit belongs to; empty for a study without one."""
-    calibration = calibrate.load(context)
+    calibration = context.calibration
     if calibration is None:
         return {}
     spec = calibration.spec
@@ -161,11 +161,7 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
         share = noise.noise_share
-        entry["noise_share"] = {
-            "median": np.median(share),
-            "at_peak": share[place],
-            "peak_hz": noise.freqs_hz[place],
-        }
+        entry["noise_share"] = {"median": np.median(share), "at_peak": share[place], "peak_hz": noise.freqs_hz[place]}
     return entry
 
 

@@ -30,8 +30,15 @@ from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from .field import FieldRecordings
-from .recordings import check_channels, hidden_states, identify_on, load_calibration, open_data, training_keys
-from .recordings import unit_parameters
+from .recordings import (
+    check_channels,
+    hidden_states,
+    identify_on,
+    load_calibration,
+    open_data,
+    training_keys,
+    unit_parameters,
+)
 from .verdict import with_verdict
 
 Rows = list[dict[str, Any]]

@@ -17,13 +17,7 @@ import numpy as np
 
 from ...core.errors import KrosError
 from ...identify import ModelSamples, ModelSet
-from ...uncertainty import (
-    Form,
-    UncertainModel,
-    VariationAndNoise,
-    residual,
-    variation_and_noise,
-)
+from ...uncertainty import Form, UncertainModel, VariationAndNoise, residual, variation_and_noise
 from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.settings import UncertaintySettings

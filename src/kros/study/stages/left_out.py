@@ -32,7 +32,6 @@ from ..config import Stage, StudyConfig
 from ..engine.context import Context
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
-from . import calibrate
 from .evaluate import band_hz, estimation, facts_of, outcomes
 from .held_out import HeldOut, Outcome
 from .read import FEWEST
@@ -157,7 +156,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
 
 def held_parameters(context: Context, population: Population, facts: RecordingFacts) -> UnitParameters:
     """Return the lifting parameters of the units of a population that a study does not know, as `kros estimate` finds them."""
-    calibration, held = calibrate.load(context), population.unit_ids
+    calibration, held = context.calibration, population.unit_ids
     if calibration is None:
         return {unit: {} for unit in held}
     tasks = [(population.select([u]), calibration_keys(facts, u), calibration.spec) for u in held]

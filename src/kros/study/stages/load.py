@@ -24,19 +24,11 @@ from ...data.population import EpisodeKey
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import (
-    AngleLoad,
-    calibrate_load,
-    calibrate_torque,
-    known_load,
-    load_from_current,
-    load_observer,
-)
+from ...motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
 from ...motor_drive.from_current import load_accuracy
 from ...motor_drive.signals import low_passed
 from ...observer import Observer, run_observer
 from ..engine.context import Context
-from . import calibrate
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -160,7 +152,7 @@ class LoadTrial:
         if missing := [name for name in (settings.angle, settings.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
-        phases = calibrate.load(context)
+        phases = context.calibration
         usable = [u for u in facts.pooled if phases is None or u in phases.units]
         units = {u: {} if phases is None else {phases.spec.parameter: phases.units[u].phase_rad} for u in usable}
         loaded = [u for u in usable if facts.keys("train", u, settings.condition)]

@@ -14,11 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_results import files, results
 
 from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
 from kros.core.store import recorded_files
-from kros.study import Stage, load_config
+from kros.study import load_config
 from kros.study import run as run_study
 
 pytestmark = pytest.mark.usefixtures("few_figures")
@@ -30,7 +31,6 @@ FAST = (
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     "[evaluate]\nrobustness = false\n"
 )
-TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 
 
 @pytest.fixture(scope="module")
@@ -64,27 +64,6 @@ def run(finished, tmp_path) -> Path:
 
 def again(kros: Callable[..., Any], fast: Path, run: Path, *options: Any) -> Any:
     return kros("run", fast, "--out", run, "--workers", 1, "--set", "evaluate.folds=2", *options)
-
-
-def files(folder: Path) -> set[str]:
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file() or p.is_symlink()}
-
-
-def results(folder: Path) -> dict[str, Any]:
-    """Contents of all files but manifests and the store; without times."""
-    return {
-        name: timeless(json.loads((folder / name).read_text()))
-        if name.endswith(".json")
-        else (folder / name).read_bytes()
-        for name in files(folder)
-        if not name.startswith("store/") and not name.endswith("manifest.json")
-    }
-
-
-def timeless(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {k: timeless(v) for k, v in content.items() if k not in TIMES}
-    return [timeless(v) for v in content] if isinstance(content, list) else content
 
 
 def digest(run: Path, stage: str) -> str:
@@ -167,15 +146,6 @@ def test_another_study_is_refused_and_the_same_one_may_change(kros, fast, run, p
     assert results(run) == before
 
 
-def test_a_folder_that_looks_like_a_demo_is_left_alone(kros, tmp_path):
-    folder = tmp_path / "mine"
-    (folder / "thesis").mkdir(parents=True)
-    for name in ("demo.json", "thesis/chapter.tex"):
-        (folder / name).write_text('{"schema": 1}')
-    assert kros("demo", "--out", folder, "--units", 2, "--episodes", 2, "--seconds", 5).exit_code == 2
-    assert files(folder) == {"demo.json", "thesis/chapter.tex"}
-
-
 def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
     """Let the manifest claim other files of a stage, with the right digest where one is given."""
     import hashlib
@@ -253,15 +223,6 @@ def test_a_damaged_artefact_is_computed_again_and_no_other(kros, fast, run, fini
     found = again(kros, fast, run)
     assert found.exit_code == 0
     assert found.stderr.count("unchanged") >= 7
-    assert results(run) == results(finished)
-
-
-def test_what_is_gone_from_its_place_comes_from_the_store(kros, fast, run, finished):
-    shutil.rmtree(run / "models")
-    (run / "observers" / "deployed.json").write_text("{}")
-    found = again(kros, fast, run, "--set", "uncertainty.n_freqs=60")
-    assert found.exit_code == 0
-    assert "identify" in found.stderr
     assert results(run) == results(finished)
 
 
@@ -414,9 +375,3 @@ def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast,
     assert kros("run", fast, "--out", run, "--workers", 1, "--until", "quantify").exit_code == 0
     assert not [name for name in files(run) if Path(name).name.startswith(".") or name.startswith(".")]
     assert results(run)["uncertainty/choice.json"] == results(finished)["uncertainty/choice.json"]
-
-
-def test_a_script_is_not_told_twice_who_owns_a_folder(fast, run):
-    """From Python as from the command line: strings are paths."""
-    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), until=Stage.REPORT)  # type: ignore[arg-type]
-    assert found.metrics["study"]["units"] == 4

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
@@ -16,7 +15,6 @@ from kros.design.synthesize import choose_deployed
 from kros.design.task import Design
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate
-from kros.observer.certificate.report import relift_report
 from kros.synthesis import Injection, Status, Synthesis
 
 
@@ -67,12 +65,6 @@ def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
     assert found.certified
     assert not found.box
     assert "any value of phase" in found.assumptions
-
-
-def test_an_observer_without_certificate_has_no_report() -> None:
-    square = observer("square", "x**2", 0.1)
-    with pytest.raises(DimensionError, match="certify it first"):
-        relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
 
 
 def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:

@@ -1,4 +1,4 @@
-"""Baselines that are no constant correction of a model, and so have no certificate: made and run where observers are evaluated."""
+"""Baselines without a certificate, since they are no constant correction of a model; they run in the evaluation."""
 
 from __future__ import annotations
 

@@ -23,7 +23,6 @@ from ..observer import (
     run_observers,
     signal_bound,
 )
-from ..observer.certificate.report import course
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.residual.one_step import one_step_residual
 from ..observer.screen import Screen
@@ -100,7 +99,7 @@ def _certified_models(
     certified = []
     for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
         observer = observers[k]
-        bound = signal_bound(certificate, observer, batch, arrived[k], known, course(observer, batch, arrived[k]))
+        bound = signal_bound(certificate, observer, batch, arrived[k], known)
         bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
         certificate = certificate.in_sizes(observer, {})
         facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(blind[k])))
@@ -150,9 +149,7 @@ def _facts(
     facts["set_bound"] = {
         s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
     }
-    if certificate.certified:
-        return facts | {"relift_mismatch_gain": certificate.mismatch_gain}
-    return facts | {"relift_reason": certificate.reason}
+    return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:

@@ -42,7 +42,7 @@ class MeanProfile:
 
 
 def held(signal: Array, n_samples: int) -> Array:
-    """Return a signal, shape (n, ...), of so many samples: cut, or held at its last one."""
+    """Return a signal, shape (n, ...), of `n_samples` samples: cut, or held at its last one."""
     longer = len(signal) >= n_samples
     return signal[:n_samples] if longer else np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
 
@@ -65,7 +65,7 @@ def make_mean_profile(
     keys: Iterable[EpisodeKey],
     settings: BaselineSettings = DEFAULT,
 ) -> Baseline:
-    """Average the states of training episodes with the motions of some episodes, over units, once without every unit."""
+    """Average the states of training episodes that have the same motions, over units, and without each unit."""
     n = len(population.states)
     estimated = tuple(i for i in range(n) if i not in measured)
     if not population.inputs or not estimated:

@@ -1,9 +1,9 @@
 """The monitor of a deployed observer: its bound from what the innovation does on the machines of training.
 
-Of every unit the highest level over its training episodes counts, one after the other as on a machine that is not
-stopped, so that a unit is one draw however long it was recorded. The bound is what one more unit exceeds with the stated
-probability on other motions (`bound_of_peaks`). It holds for units that move as those in training did, for as long. If
-the observer was designed on the same units, new ones have larger innovations.
+Of every unit the highest level over its training episodes counts, one after the other as on a machine that does not
+stop, so that a unit is one draw however long it was recorded. The bound is what one more unit exceeds with the stated
+rate on other motions (`bound_of_peaks`). It holds for units that move as those in training did, for as long. If the
+observer was designed on the same units, new ones have larger innovations.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class MonitorSettings:
     settle: tuple[int, int] = (100, 1000)  # samples that are not judged after a start, at least and at most
     shrink: float = 0.7  # of covariances to their diagonal
     quietest: float = 0.5  # least variance of a band, share of the median
-    motions: int = 6  # of a unit, beyond which more of them add nothing to a bound
+    motions: int = 6  # of a unit; more of them add nothing to a bound
     moving: float = 0.1  # share of the RMS step of a measurement, below which a machine rests
 
 

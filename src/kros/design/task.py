@@ -81,7 +81,7 @@ class Design:
         percent, known = self.facts.get("hidden_error_percent"), "certified" if self.certified else "not certified"
         finite = percent is not None and np.isfinite(percent)
         error = f"training error {percent:.3g} %" if finite else "diverges in training"
-        return f"<Design {self.name}: {self.facts.get('order')} states beside the recorded ones, {error}, {known}>"
+        return f"<Design {self.name}: {self.facts.get('order')} states in the correction, {error}, {known}>"
 
     @property
     def certified(self) -> bool:
@@ -183,7 +183,7 @@ class DesignTask:
         return Synthesis("open_loop", controller, Status.OPTIMAL, Injection.STATE)
 
     def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
-        """Return which observer is the first on training episodes, see `validation.rank`, and its error to open loop."""
+        """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
         limit, *errors = self.training.read().percent_of_all([self.observer(self.open_loop()), *observers])
         ranks = [rank(error, limit, self.models.measured) for error in errors]
         first = min(range(len(ranks)), key=lambda i: ranks[i])

@@ -1,4 +1,4 @@
-"""Training episodes that observers are tuned and chosen on: the same ones for all, and never those that are held out."""
+"""Training episodes that observers are tuned and chosen on: the same for all, and never those that are held out."""
 
 from __future__ import annotations
 
@@ -178,7 +178,7 @@ class ValidationSet:
 
 
 def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:
-    """Return the sizes of the measured states and of the inputs, beyond which samples are implausible."""
+    """Return the sizes of the measured states and of the inputs; far larger samples are implausible."""
     states, inputs, sizes = identified.population.states, identified.population.inputs, identified.sizes
     return Seen(np.array([sizes[states[i]] for i in measured]), np.array([sizes[name] for name in inputs]))
 
@@ -191,7 +191,7 @@ def spread(keys: Sequence[T], count: int) -> list[T]:
 
 
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
-    """Return the geometric mean of values (..., n) over the states that are not measured (all, where none is hidden)."""
+    """Return the geometric mean of values (..., n) over the hidden states (all, where none is hidden)."""
     hidden = [i for i in range(values.shape[-1]) if i not in measured] or list(measured)
     return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], np.finfo(float).tiny)), axis=-1)))
 

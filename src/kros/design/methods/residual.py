@@ -1,4 +1,4 @@
-"""The residual-shaped observer: it may run rows of its own, fitted to single steps, where they promise smaller errors."""
+"""The residual-shaped observer: it may run rows fitted to single steps, where these promise smaller errors."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class ResidualH2(Method):
 
 
 def promising(task: DesignTask) -> list[ResidualModel]:
-    """Return the models that may be run, that of the smallest promised errors first; those without bounds are absent."""
+    """Return models with bounded promised errors, the smallest first."""
     models, row = task.models, task.models.index(task.unit)
     nominal = models.lifting, models.A[row], models.B[row], models.measured
     scale = models.output_scale[: models.lifting.n_states]

@@ -32,7 +32,8 @@ from .recordings import (
 )
 
 Array = npt.NDArray[np.float64]
-_BATCH, _PHASES, _SEEN = 64, 24, 20_000  # episodes, phases, samples
+_BATCH, _SAMPLES = 64, 200_000  # episodes at a time, and their samples
+_PHASES, _SEEN = 24, 20_000  # phases that are tried on some samples
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,14 @@ class FieldRecordings:
         return cls(observer, population, *_settled(units, observer, population, track, phase))
 
     def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
-        """Read episodes, some at a time."""
+        """Read episodes, long ones one by one, so that memory does not grow with their number."""
         keys = keys or self.population.episodes
         values = {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
-        for start in range(0, len(keys), _BATCH):
-            yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
+        start, count = 0, 1
+        while start < len(keys):
+            batch = arriving(self.observer, self.population, keys[start : start + count], values)
+            start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
+            yield batch
 
     def estimates(self, found: Arriving) -> tuple[Array, Array | None, Bits]:
         """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""

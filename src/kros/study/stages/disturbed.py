@@ -1,4 +1,4 @@
-"""Observers of a study on disturbed measurements: which ones, on which episodes, and what the records say about them."""
+"""Observers of a study on disturbed measurements: which ones, on which episodes, and their errors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What observers, baselines and models do on held-out episodes: errors, and trajectories of those that are displayed."""
+"""What observers, baselines and models do on held-out episodes: errors, and trajectories for figures."""
 
 from __future__ import annotations
 

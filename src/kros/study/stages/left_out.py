@@ -1,10 +1,11 @@
 """Stage: every unit estimated by observers that were made without it.
 
-The pooled units are parted into folds. For every fold the study up to its observers is made once more in a folder of its own, by the same
-stages, from the recordings of all other units; what comes out runs on the test episodes of the fold's own units in all conditions. The phase of
-such a unit comes from its own training episodes, on the branch of the fold's population, as that of any new machine.
+The pooled units are split into folds. For every fold the same stages design observers in a separate folder, from the
+recordings of all other units. These observers run on the test episodes of the fold's units in all conditions. The phase
+of such a unit comes from its training episodes, on the branch of the fold's population, as that of any new machine.
 
-Units in reserve are a fold that the study itself is made without: they meet the deployed observer alone, and bound what the next unit's errors are.
+Units in reserve are a fold that the study itself does not use: only the deployed observer runs on them, and its errors
+bound those of the next unit.
 """
 
 from __future__ import annotations
@@ -64,14 +65,14 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     parts = [list(units[fold::folds]) for fold in range(folds)]
     if len(units) - len(parts[0]) < FEWEST:
         raise ConfigError(
-            f"evaluate.folds = {folds}: leaves {len(units) - len(parts[0])} of {len(units)} units to learn from, and a population needs {FEWEST}; "
-            "ask for more folds, or record more units."
+            f"evaluate.folds = {folds}: leaves {len(units) - len(parts[0])} of {len(units)} units to learn from, and a "
+            f"population needs {FEWEST}; ask for more folds, or record more units."
         )
     return parts
 
 
 def run(context: Context) -> None:
-    """Make the study once for every fold, run the deployed observer on the units in reserve, and collect what observers do on units they do not know."""
+    """Make the study once for every fold, and run the deployed observer on the units in reserve."""
     models, wanted_folds = context.identified.models(), context.config.evaluate.folds
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], wanted_folds) if wanted_folds else []
     for surplus in context.store.runs(FOLDER):
@@ -103,7 +104,7 @@ def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
 
 
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
-    """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
+    """Make the study without some units, and run its observers on these; return the reason where it fails."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
     store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
     context = Context(without(whole, held), store, replace(whole.work, progress=progress))
@@ -155,7 +156,7 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
 
 
 def held_parameters(context: Context, population: Population, facts: RecordingFacts) -> UnitParameters:
-    """Return the lifting parameters of the units of a population that a study does not know, as `kros estimate` finds them."""
+    """Return the lifting parameters of units that took no part in a study, as `kros estimate` finds them."""
     calibration, held = context.calibration, population.unit_ids
     if calibration is None:
         return {unit: {} for unit in held}

@@ -236,9 +236,7 @@ def estimate(
     """Write the deployed observer's estimates on recordings; no hidden channels are needed."""
     from .study.commands.estimate import estimate_recordings
 
-    written = estimate_recordings(run_folder, data, out, parameter or (), track)
-    _say([f"estimates of {written.episodes} episode{'s' * (written.episodes != 1)} in {out}"])
-    _say(f"  {line}" for line in written.lines())
+    _say(estimate_recordings(run_folder, data, out, parameter or (), track))
 
 
 @export.command("c")

@@ -16,7 +16,7 @@ from kros.identify import ModelSet
 from kros.observer import Observer, run_observer
 from kros.study import load_config
 from kros.study import run as run_study
-from kros.study.commands.recordings import load_calibration, unit_parameters
+from kros.study.commands.field import load_calibration, unit_parameters
 from kros.study.config import Stage
 from kros.study.engine.context import Context
 from kros.study.engine.store import Store

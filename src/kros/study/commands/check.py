@@ -29,8 +29,9 @@ from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from .field import FieldRecordings
-from .recordings import (
+from .field import (
+    DEPLOYED,
+    FieldRecordings,
     check_channels,
     hidden_states,
     identify_on,
@@ -60,13 +61,12 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
     """Score the units of some recordings against a run that is open."""
     pattern = re.compile("outliers/([^/]+)/outlier_model.json")
     folders = [store.path("outliers", m[1]) for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
-    deployed = ("observers", "deployed.json")
-    observer = Observer.load(store.path(*deployed)) if store.holds(*deployed) else None
+    observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
     population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
     watched: Rows = []
     if observer is not None:
-        check_channels(population, observer, field_recordings=True)
+        check_channels(population, observer, hidden=False)
         hidden = any(name not in population.states for name in observer.recorded)
         if hidden or observer.monitor is not None:
             watched = monitored(FieldRecordings.open(config, store, data))

@@ -22,7 +22,7 @@ from ..engine.run_folder import open_finished
 from ..engine.store import Store
 from ..stages.load import LoadSettings
 from ..stages.read import open_source
-from .recordings import load_calibration
+from .field import load_calibration
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from ..stages.load import LoadSettings
+from ..stages.load import TrialSettings
 from ..stages.read import open_source
 from .field import load_calibration
 
@@ -59,7 +59,7 @@ def export_run(
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)
-        settings, facts = LoadSettings(), RecordingFacts.load(store.path("population"))
+        settings, facts = TrialSettings(), RecordingFacts.load(store.path("population"))
         level = settings.level(chosen.sample_period_s, facts.limits)
         load = LoadOutput(level, current=settings.current) if observer in loads else None
         return export_c(

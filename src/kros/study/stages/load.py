@@ -36,7 +36,7 @@ LOAD = "load"
 
 
 @dataclass(frozen=True)
-class LoadSettings:
+class TrialSettings:
     """How a load is estimated and judged."""
 
     condition: str = "load"  # in which it is mounted
@@ -143,12 +143,12 @@ class LoadTrial:
     dt: float
     limits: Mapping[str, FoundLimit]
     liftings: list[tuple[str, Lifting]]
-    settings: LoadSettings = field(default_factory=LoadSettings)
+    settings: TrialSettings = field(default_factory=TrialSettings)
 
     @classmethod
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
-        facts, config, settings, population = context.facts, context.config.load, LoadSettings(), context.population
+        facts, config, settings, population = context.facts, context.config.load, TrialSettings(), context.population
         if missing := [name for name in (settings.angle, settings.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")

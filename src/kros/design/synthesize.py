@@ -124,13 +124,13 @@ def synthesize(
     regression = EstimatorSettings.of(estimator or {}, "Synthesize, estimator")
     sensors = {name: Sensor.of(one, f"Synthesize, sensor.{name}") for name, one in (sensor or {}).items()}
     if method is None:
-        found = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
-        return found.designs[found.deployed]
-    kind, wanted = _named(uncertain, method, regression)
-    beside = [m for m in methods_of(options.methods, regression) if m.assumes_disturbances and m.name != wanted.name]
-    tasks, work = tasks_of(uncertain, kind, [*beside, wanted], sensors), work or Work()
+        every = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
+        return every.designs[every.deployed]
+    kind, chosen = _named(uncertain, method, regression)
+    beside = [m for m in methods_of(options.methods, regression) if m.assumes_disturbances and m.name != chosen.name]
+    tasks, work = tasks_of(uncertain, kind, [*beside, chosen], sensors), work or Work()
     designs, failed = _designed(tasks, work)
-    name = f"{kind}/{wanted.name}"
+    name = f"{kind}/{chosen.name}"
     if name in failed:
         raise SynthesisError(f"{name} could not be designed: {failed[name]}")
     return certified(tasks, designs, uncertain.models, work)[name]
@@ -174,8 +174,8 @@ def with_monitor(
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:
     """Return a method and the kind of model that it is named with, or the first one that it is for."""
     kinds = uncertain.models.kinds
-    wanted = methods_of([m.name for m in METHODS], estimator) if isinstance(method, str) else [method]
-    pairs = [(kind, m) for kind in kinds for m in suitable(wanted, kind, kinds)]
+    methods = methods_of([m.name for m in METHODS], estimator) if isinstance(method, str) else [method]
+    pairs = [(kind, m) for kind in kinds for m in suitable(methods, kind, kinds)]
     for kind, m in pairs:
         if method in (m, m.name, f"{kind}/{m.name}"):
             return kind, m
@@ -260,16 +260,16 @@ def certified(
     tasks: Sequence[DesignTask], designs: Mapping[str, Design], identified: IdentifiedModels, work: Work
 ) -> dict[str, Design]:
     """Certify observers, on every member of the uncertain set and as nonlinear ones, those of a lifting side by side."""
-    made = [(task, designs[task.name]) for task in tasks if task.name in designs]
+    pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
     groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
-    for task, design in made:
+    for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
-    linear = [partial(certificate, task, design, _assumed(task, made)) for task, design in made]
+    linear = [partial(certificate, task, design, _assumed(task, pairs)) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
     by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
     final = {}
-    for (task, _), facts in zip(made, results[len(nonlinear) :], strict=True):
+    for (task, _), facts in zip(pairs, results[len(nonlinear) :], strict=True):
         design = in_recorded_units(by_name[task.name])
         design = replace(design, facts={**design.facts, **facts})
         observer = replace(design.observer, about=about(task, identified, design))
@@ -277,9 +277,9 @@ def certified(
     return final
 
 
-def _assumed(task: DesignTask, made: Iterable[tuple[DesignTask, Design]]) -> ObserverProblem | None:
+def _assumed(task: DesignTask, pairs: Iterable[tuple[DesignTask, Design]]) -> ObserverProblem | None:
     """Return the set that all observers of a kind of model are certified for, with disturbances that a method chose."""
-    chosen = (d.problem for other, d in made if other.models.name == task.models.name and d.problem is not None)
+    chosen = (d.problem for other, d in pairs if other.models.name == task.models.name and d.problem is not None)
     return next(chosen, task.problem)
 
 

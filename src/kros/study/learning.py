@@ -42,15 +42,15 @@ def run_synthesize(context: Context) -> None:
     """Design observers by every method that the study names, with their certificates, and choose the deployed one."""
     config, draft = context.config, context.store.draft
     tables = config.synthesis, config.observer, config.estimator, config.sensor
-    found = synthesize_all(context.uncertain, *tables, work=context.work)
-    for name, design in found.designs.items():
+    designs = synthesize_all(context.uncertain, *tables, work=context.work)
+    for name, design in designs.designs.items():
         observer = replace(design.observer, about={**design.observer.about, "study": config.name})
         observer.save(draft("observers", f"{name}.json"))
         design.synthesis.save(draft("synthesis", name))
         if design.certificate is not None:
             design.certificate.save(draft("observers", "relift", name))
-    copyfile(draft("observers", f"{found.deployed}.json"), draft("observers", "deployed.json"))
-    content = {"names": list(found.designs), "deployed": found.deployed, "facts": found.facts}
+    copyfile(draft("observers", f"{designs.deployed}.json"), draft("observers", "deployed.json"))
+    content = {"names": list(designs.designs), "deployed": designs.deployed, "facts": designs.facts}
     save_artifact(draft("observers"), "observers", content)
 
 

@@ -136,13 +136,13 @@ def monitored(recordings: FieldRecordings) -> Rows:
     for unit, condition, keys in population.groups():
         counts: dict[str, dict[str, int]] = {}
         judged, samples = Judged(), 0
-        for found in recordings.batches(keys):
-            samples += int(found.batch.lengths.sum())
-            recordings.count_status(found, counts)
+        for arrived in recordings.batches(keys):
+            samples += int(arrived.batch.lengths.sum())
+            recordings.count_status(arrived, counts)
             if monitor is not None:
-                values = found.parameters(observer, list(range(len(found.batch.keys))))
-                nu, good = run_innovations(observer, found.y, found.u, values, monitor.settle)
-                judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(found.batch.lengths)]
+                values = arrived.parameters(observer, list(range(len(arrived.batch.keys))))
+                nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
+                judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
         level = highest_level(monitor, judged, condition)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "outlier": outlier, "level_db": level}

@@ -41,13 +41,13 @@ def estimate_recordings(
         recordings = FieldRecordings.open(config, store, data, given, track)
         counts: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
-            for found in recordings.batches():
-                estimates, followed, status = recordings.estimates(found)
+            for arrived in recordings.batches():
+                estimates, followed, status = recordings.estimates(arrived)
                 estimates /= recorded_factors(recordings.observer, recordings.observer.recorded)
                 columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
-                for i, key in enumerate(found.batch.keys):
-                    write(key, columns[: found.batch.lengths[i], i])
-                recordings.count_status(found, counts, status)
+                for i, key in enumerate(arrived.batch.keys):
+                    write(key, columns[: arrived.batch.lengths[i], i])
+                recordings.count_status(arrived, counts, status)
     count = len(recordings.population.episodes)
     return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
 

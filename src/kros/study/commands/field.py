@@ -221,9 +221,9 @@ class FieldRecordings:
             if seen < _SEEN:
                 chosen, seen = [*chosen, key], seen + len(self.population.read(key))
         values = self.values[unit]
-        found = arriving(self.observer, self.population, tuple(chosen), {unit: values}, _SEEN)
+        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, _SEEN)
         step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
-        signals = (self.observer, found.y, found.u, found.batch.lengths, known, name)
+        signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
         coarse = least_innovation(*signals, np.arange(_PHASES) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
@@ -237,30 +237,30 @@ class FieldRecordings:
             start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
             yield batch
 
-    def estimates(self, found: Arriving) -> tuple[Array, Array | None, Bits]:
+    def estimates(self, arrived: Arriving) -> tuple[Array, Array | None, Bits]:
         """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
-        observer, n, units = self.observer, len(self.observer.recorded), found.batch.units
-        estimates, status = np.empty((*found.y.shape[:2], n)), sample_status(observer, found.y, found.u)
+        observer, n, units = self.observer, len(self.observer.recorded), arrived.batch.units
+        estimates, status = np.empty((*arrived.y.shape[:2], n)), sample_status(observer, arrived.y, arrived.u)
         rows = [i for i, unit in enumerate(units) if unit in self.followed]
         others = [i for i in range(len(units)) if i not in rows]
         if others:
-            parameters = found.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], parameters)
+            parameters = arrived.parameters(observer, others)
+            x, status[:, others] = run_with_status(observer, arrived.y[:, others], arrived.u[:, others], parameters)
             estimates[:, others] = x[..., :n]
         if self.name is None:
             return estimates, None, status
-        followed = np.tile(found.batch.parameters[self.name], (len(found.y), 1))
+        followed = np.tile(arrived.batch.parameters[self.name], (len(arrived.y), 1))
         if rows:
-            parameters = found.parameters(observer, rows)
-            tracked = track_parameter(observer, found.y[:, rows], found.u[:, rows], parameters, self.name)
+            parameters = arrived.parameters(observer, rows)
+            tracked = track_parameter(observer, arrived.y[:, rows], arrived.u[:, rows], parameters, self.name)
             estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
             status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
         return estimates, followed, status
 
-    def count_status(self, found: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
+    def count_status(self, arrived: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
         """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
-        status = sample_status(self.observer, found.y, found.u) if status is None else status
-        for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
+        status = sample_status(self.observer, arrived.y, arrived.u) if status is None else status
+        for i, (unit, length) in enumerate(zip(arrived.batch.units, arrived.batch.lengths, strict=True)):
             of_unit = counts.setdefault(unit, {})
             for bit in SampleStatus:
                 if number := int(np.count_nonzero(status[:length, i] & bit)):

@@ -49,8 +49,8 @@ class Trial:
     def errors_of_observers(self, observers: Sequence[Observer]) -> list[Array]:
         """Return the errors of observers that can run side by side, each of shape (1 + disturbance, episode, n)."""
 
-        def run(given: Measured, u: Array) -> Array:
-            return run_observers(observers, given.y, u, observers[0].own(given.parameters))
+        def run(measured: Measured, u: Array) -> Array:
+            return run_observers(observers, measured.y, u, observers[0].own(measured.parameters))
 
         return list(self.episodes().errors(run, len(observers)))
 
@@ -59,8 +59,8 @@ class Trial:
         episodes = self.episodes()
         keys = episodes.batch.keys
 
-        def run(given: Measured, u: Array) -> list[Array]:
-            return [baseline.estimate(keys * (given.y.shape[1] // len(keys)), given.y, u, given.parameters)]
+        def run(measured: Measured, u: Array) -> list[Array]:
+            return [baseline.estimate(keys * (measured.y.shape[1] // len(keys)), measured.y, u, measured.parameters)]
 
         return np.asarray(episodes.errors(run)[0])
 
@@ -68,7 +68,7 @@ class Trial:
         """Return what the records say."""
         episodes, states = self.episodes(), self.population.states
         rows = [
-            robustness_rows(name, found, episodes, states, estimated) for name, (found, estimated) in errors.items()
+            robustness_rows(name, error, episodes, states, estimated) for name, (error, estimated) in errors.items()
         ]
         seconds = self.samples * self.population.sample_period_s
         units = list(dict.fromkeys(k.unit for k in self.keys))

@@ -86,19 +86,19 @@ def run(context: Context) -> None:
 
 def results(context: Context) -> dict[str, Any]:
     """Return what the stage adds to the metrics."""
-    asked = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
-    return {name: load_artifact(context.store.path(name), name)[0] for name, n in asked.items() if n}
+    parts = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
+    return {name: load_artifact(context.store.path(name), name)[0] for name, n in parts.items() if n}
 
 
 def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
     """Make the study once for every fold."""
-    found = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
+    results = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
     content = {
         "folds": folds,
         "errors": "empirical",  # of these units: folds share what they learn from, so nothing follows for the next one
-        "failed": {str(number): fold["failed"] for number, fold in enumerate(found) if "failed" in fold},
-        "rows": [{"fold": number, **row} for number, fold in enumerate(found) for row in fold.get("rows", [])],
-        "observers": facts_of_folds([fold.get("observers", {}) for fold in found]),
+        "failed": {str(number): fold["failed"] for number, fold in enumerate(results) if "failed" in fold},
+        "rows": [{"fold": number, **row} for number, fold in enumerate(results) for row in fold.get("rows", [])],
+        "observers": facts_of_folds([fold.get("observers", {}) for fold in results]),
     }
     save_artifact(context.store.draft(FOLDER), KIND, content)
 
@@ -162,10 +162,8 @@ def held_parameters(context: Context, population: Population, facts: RecordingFa
         return {unit: {} for unit in held}
     tasks = [(population.select([u]), calibration_keys(facts, u), calibration.spec) for u in held]
     segments = context.work.map("calibrate", segments_of, tasks)
-    return {
-        u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad}
-        for u, found in zip(held, segments, strict=True)
-    }
+    phases = {u: calibration.calibrate(part, u).phase_rad for u, part in zip(held, segments, strict=True)}
+    return {unit: {calibration.spec.parameter: phase} for unit, phase in phases.items()}
 
 
 def next_unit(context: Context) -> dict[str, Any]:
@@ -234,15 +232,15 @@ def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: floa
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 
 
-def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+def facts_of_folds(folds: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     """Return what all folds together say about every observer."""
     facts = {}
-    for name in dict.fromkeys(name for fold in found for name in fold):
-        entries = [fold[name] for fold in found if name in fold]
-        made = [e for e in entries if e.get("status") != "failed"]
-        observers = [e for e in made if "relift_certified" in e]
+    for name in dict.fromkeys(name for fold in folds for name in fold):
+        entries = [fold[name] for fold in folds if name in fold]
+        designed = [e for e in entries if e.get("status") != "failed"]
+        observers = [e for e in designed if "relift_certified" in e]
         facts[name] = {
-            "made": len(made),
+            "made": len(designed),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
             "robust": sum(is_robust(e) for e in observers) if observers else None,

@@ -54,8 +54,8 @@ class TrialSettings:
 
     def limit(self, limits: Mapping[str, FoundLimit]) -> float | None:
         """Return the largest current, where recordings reach a limit."""
-        found = limits.get(self.current)
-        ends = [abs(end) for end in (found.lower, found.upper) if end is not None] if found else []
+        reached = limits.get(self.current)
+        ends = [abs(end) for end in (reached.lower, reached.upper) if end is not None] if reached else []
         return max(ends, default=None)
 
 

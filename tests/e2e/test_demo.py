@@ -7,6 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from kros.core.work import Work
+from kros.evaluate import Kind
 from kros.identify import ModelSet
 from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
 from kros.study.engine.context import Context
@@ -211,3 +212,20 @@ def test_resampled_models_surround_the_stored_ones(demo, name):
     np.testing.assert_allclose(samples.estimate.B, models.B[rows], atol=1e-9)
     middle, spread = samples.samples.A.mean(axis=1), samples.samples.A.std(axis=1)
     assert np.median(np.abs(middle - samples.estimate.A) / spread) < 0.5  # three episodes: single entries may be skewed
+
+
+def test_every_disturbance_is_told_for_the_observers_of_the_kind_that_is_handed_over(metrics):
+    rows = metrics["robustness"]
+    kind = metrics["study"]["deployed"].rpartition("/")[0]
+    observers = {r["observer"] for r in rows}
+    made = {n for n, o in metrics["observers"].items() if o.get("status") != "failed" and n.startswith(f"{kind}/")}
+    assert observers == made | {"filtered_difference", "learned"} | (
+        {"koopman/ekf"} if "koopman/ekf" in metrics["observers"] else set()
+    )
+    assert {r["disturbance"] for r in rows} == {"none", *(k.value for k in Kind)}
+    assert {r["condition"] for r in rows} == {metrics["study"]["identify_on"]}
+    for row in rows:
+        mean, worst = row["error_percent"]["mean"], row["error_percent"]["worst"]
+        assert (mean is None) == (worst is None)
+        assert mean is None or 0 < mean <= worst
+    assert {r["channel"] for r in rows if r["observer"] == "filtered_difference"} == {"velocity"}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pytest
@@ -10,6 +10,8 @@ import pytest
 import kros
 from kros.core.errors import ConfigError, DataError, DimensionError, SynthesisError
 from kros.data import Population
+from kros.design.methods.gains import OpenLoop
+from kros.design.methods.robust import WorstCaseH2
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
 from kros.plants import PLANTS
@@ -44,6 +46,23 @@ def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Populatio
     assert estimate["velocity"] == np.asarray(estimate)[running.states.index("velocity")]
     assert design.name == "linear_edmd/kalman_tuned"
     assert design.facts["hidden_error_percent"] > 0
+
+
+class Refusing(OpenLoop):
+    """A method that is for no kind of model."""
+
+    def refusal(self, kind: str, kinds: Collection[str]) -> str:
+        return "it never is"
+
+
+def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
+    white = WorstCaseH2(corners=(None,), noises=((0.0, 0.0),), orders=(1,))
+    design = kros.synthesize(uncertain, white, methods=())
+    assert design.name == "linear_edmd/worst_case_h2"
+    assert design.facts["input_weight_hz"] is None
+    assert 0 < design.lower_bound <= design.facts["worst_case_h2"]  # type: ignore[operator]
+    with pytest.raises(ConfigError, match="it is not for these kinds of models"):
+        kros.synthesize(uncertain, Refusing(), methods=())
 
 
 def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainModels) -> None:

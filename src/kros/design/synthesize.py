@@ -237,7 +237,7 @@ def _designed(tasks: Sequence[DesignTask], work: Work) -> tuple[dict[str, Design
     designs: dict[str, Design] = {}
     failed: dict[str, str] = {}
     places = {method.name: place for place, method in enumerate(METHODS)}
-    order = sorted(tasks, key=lambda task: -places[task.method.name])
+    order = sorted(tasks, key=lambda task: -places.get(task.method.name, len(places)))
     results = dict(zip((task.name for task in order), work.map("synthesize", _design, order), strict=True))
     for task in tasks:
         result = results[task.name]

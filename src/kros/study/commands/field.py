@@ -32,7 +32,6 @@ Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
 DEPLOYED = ("observers", "deployed.json")
 _BATCH, _SAMPLES = 64, 200_000  # episodes at a time, and their samples
-_PHASES, _SEEN = 24, 20_000  # phases that are tried on some samples
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
@@ -214,17 +213,17 @@ class FieldRecordings:
             followed.add(unit)
         return replace(self, values=values, sources=sources, followed=frozenset(followed), name=name or None)
 
-    def _start(self, unit: str, name: str) -> float:
+    def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
         chosen, seen = list[EpisodeKey](), 0
         for key in self.population.keys(unit)[:_BATCH]:
-            if seen < _SEEN:
+            if seen < samples:
                 chosen, seen = [*chosen, key], seen + len(self.population.read(key))
         values = self.values[unit]
-        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, _SEEN)
-        step, known = 2 * np.pi / _PHASES, {**self.observer.parameters, **values}
+        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, samples)
+        step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
-        coarse = least_innovation(*signals, np.arange(_PHASES) * step)
+        coarse = least_innovation(*signals, np.arange(phases) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
     def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -26,9 +27,19 @@ from ..engine.context import Context
 from .resampling import resampling
 
 log = logging.getLogger(__name__)
-_NOISE_POINTS, _POINTS = 80, 240  # frequencies of figures
-_MOST_UNITS = 60  # whose models are resampled
-_ENTRY_ORDER = 3  # of fits to single entries, which decide nothing
+
+
+@dataclass(frozen=True)
+class DiagnosticSettings:
+    """Extent of what is computed for the report alone."""
+
+    noise_points: int = 80  # frequencies at which variation and noise are compared
+    points: int = 240  # frequencies of residuals
+    units: int = 60  # at most, whose models are resampled
+    entry_order: int = 3  # of fits to single entries, which decide nothing
+
+
+DEFAULT = DiagnosticSettings()
 
 
 class _Result(Protocol):
@@ -68,7 +79,7 @@ def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
 def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], VariationAndNoise]]:
     """Compare variation and noise over some units, the nominal one among them; not with single episodes."""
     units = uncertain.unit_ids
-    some = np.linspace(0, len(units) - 1, min(_MOST_UNITS, len(units))).round().astype(int)
+    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
     models = context.identified.models(name)
     try:
@@ -83,7 +94,7 @@ def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[C
 def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> VariationAndNoise:
     return variation_and_noise(
         samples(),
-        freqs_hz=models.frequencies(_NOISE_POINTS),
+        freqs_hz=models.frequencies(DEFAULT.noise_points),
         sample_period_s=models.sample_period_s,
         form=form,
         nominal=nominal,
@@ -94,7 +105,7 @@ def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal:
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
     """Return the residuals of all covered units beside the weights of a study."""
-    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // _POINTS)]
+    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // DEFAULT.points)]
     return unit_residuals(
         uncertain.form,
         uncertain.scaled_nominal().frequency_response(freqs),
@@ -104,7 +115,7 @@ def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals
         models.sample_period_s,
         unit_ids=uncertain.unit_ids,
         nominal_id=uncertain.nominal_id,
-        max_order=_ENTRY_ORDER,
+        max_order=DEFAULT.entry_order,
     )
 
 
@@ -121,7 +132,7 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
     others = [u for u, s in zip(sets[0].unit_ids, sets[0].status, strict=True) if s == "ok" and u not in outside]
     if len(others) < 2:
         return []
-    responses = sets[0].scaled_responses(sets[0].frequencies(_POINTS), others)
+    responses = sets[0].scaled_responses(sets[0].frequencies(DEFAULT.points), others)
     nominal = others[choose_nominal(responses, form).index]
     places = (context.store.draft("outliers", identified.place(m.name, condition), "others") for m in sets)
     work = (partial(against_others, m, others, outside, nominal, form) for m in sets)
@@ -130,7 +141,7 @@ def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
 
 def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, form: Form) -> UnitResiduals:
     """Return the residuals of all units beside the smallest diagonal cover of `others` at every frequency."""
-    freqs, row = models.frequencies(_POINTS), others.index(nominal)
+    freqs, row = models.frequencies(DEFAULT.points), others.index(nominal)
     everyone = [*others, *outside]
     responses = models.scaled_responses(freqs, everyone)
     return unit_residuals(
@@ -143,5 +154,5 @@ def against_others(models: ModelSet, others: list[str], outside: list[str], nomi
         unit_ids=everyone,
         nominal_id=nominal,
         outside=outside,
-        max_order=_ENTRY_ORDER,
+        max_order=DEFAULT.entry_order,
     )

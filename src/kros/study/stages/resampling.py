@@ -6,7 +6,7 @@ refined models and their information --> one step from them, for the episodes dr
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -24,23 +24,21 @@ from ...identify.refine.episodes import episode_normals
 from ...identify.refine.model import TrainingData
 from ..engine.context import Context
 
-DRAWS = 60
 
-
-def resampling(context: Context, name: str, units: list[str]) -> Callable[[], ModelSamples]:
+def resampling(context: Context, name: str, units: list[str], draws: int = 60) -> Callable[[], ModelSamples]:
     """Return work that computes models of resampled training episodes in the condition that feeds synthesis."""
     models = context.identified.models(name)
     if models.alpha is None:
-        return partial(_Refined.of(context, models).samples, tuple(models.index(u) for u in units))
-    return partial(_edmd_samples, models, *episode_factor(context, models, units), units)
+        return partial(_Refined.of(context, models).samples, [models.index(u) for u in units], draws)
+    return partial(_edmd_samples, models, *episode_factor(context, models, units), units, draws)
 
 
-def _edmd_samples(models: ModelSet, factor: Factor, counts: list[int], units: list[str]) -> ModelSamples:
+def _edmd_samples(models: ModelSet, factor: Factor, counts: list[int], units: list[str], draws: int) -> ModelSamples:
     """Return EDMD models of drawn episodes, in the recordings' units."""
     assert models.alpha is not None
     ones = Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
     ranges = models.ranges if models.alpha_in_ranges else ones
-    triangles, weights = ranges.triangles(factor.R), episode_weights(counts, DRAWS, 0)
+    triangles, weights = ranges.triangles(factor.R), episode_weights(counts, draws, 0)
     return _restored(bootstrap_edmd(triangles, models.lifting.n_lifted, models.alpha, weights, units), ranges)
 
 
@@ -88,14 +86,12 @@ class _Refined:
         matrices = ranges.normalise(KoopmanMatrices(models.A, models.B))
         return cls(matrices, context.identified.refined[models.name].divided_by(ranges), data, ranges, counts)
 
-    def samples(self, rows: Sequence[int]) -> ModelSamples:
+    def samples(self, rows: list[int], draws: int) -> ModelSamples:
         """Return samples of some of the units, in the recordings' units of measure."""
         normal = episode_normals(self.models, self.refinement, self.data, RefineOptions())
-        weights, T, H = episode_weights(self.counts, DRAWS, 0), self.refinement.whitening, self.refinement.information
+        weights, T, H = episode_weights(self.counts, draws, 0), self.refinement.whitening, self.refinement.information
         drawn = _restored(bootstrap_refined(self.models, T, H, normal, weights, list(self.data.keys)), self.ranges)
-        chosen = list(rows)
-        some = (KoopmanMatrices(m.A[chosen], m.B[chosen]) for m in (drawn.estimate, drawn.samples))
-        estimate, samples = some
+        estimate, samples = (KoopmanMatrices(m.A[rows], m.B[rows]) for m in (drawn.estimate, drawn.samples))
         return replace(drawn, unit_ids=tuple(drawn.unit_ids[k] for k in rows), estimate=estimate, samples=samples)
 
 

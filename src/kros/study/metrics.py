@@ -11,10 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
-from ..data.flat_tops import FoundLimit
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
-from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
 from .config import Stage
@@ -37,42 +35,33 @@ def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
 
 
 def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
-    facts = context.facts
+    facts, population, sensor = context.facts, context.population, context.config.sensor
+    parts = {"train": facts.train, "held_out": facts.test}
     study: dict[str, Any] = {
         "units": len(facts.pooled),
-        "conditions": context.population.conditions,
+        "conditions": population.conditions,
         "identify_on": facts.identify_on,
-        "sample_period_s": context.population.sample_period_s,
-        "channels": {c.name: c.unit for c in context.population.channels},
-        "measured": [c.name for c in context.population.channels if c.measured],
-        "inputs": list(context.population.inputs),
-        "episodes": _episodes(context),
+        "sample_period_s": population.sample_period_s,
+        "channels": {c.name: c.unit for c in population.channels},
+        "measured": [c.name for c in population.channels if c.measured],
+        "inputs": list(population.inputs),
+        "episodes": {
+            condition: {part: sum(key.condition == condition for key in keys) for part, keys in parts.items()}
+            for condition in population.conditions
+        },
         "resolution": facts.resolution,
         "dropped": facts.dropped,
     }
-    if context.config.sensor:
-        study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
-    if limits := limits_of({}, facts.limits, context.population.states):
-        study["limits"] = {name: _limit(limit, facts.limits[name]) for name, limit in limits.items()}
-    if facts.alerts:
-        study["alerts"] = facts.alerts
+    limits = {s: facts.limits[s] for s in population.states if s in facts.limits}
+    optional = {
+        "sensor": {name: one.model_dump(exclude_none=True) for name, one in sensor.items()},
+        "limits": {s: {"lower": one.lower, "upper": one.upper, "seen": asdict(one)} for s, one in limits.items()},
+        "alerts": facts.alerts,
+    }
+    study |= {name: value for name, value in optional.items() if value}
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
-    if Stage.SYNTHESIZE in done:
-        study["deployed"] = context.observers_record["deployed"]
-    return study
-
-
-def _episodes(context: Context) -> dict[str, dict[str, int]]:
-    """Count episodes by condition, those for training and those held out."""
-    parts = {"train": context.facts.train, "held_out": context.facts.test}
-    conditions = context.population.conditions
-    return {c: {part: sum(key.condition == c for key in keys) for part, keys in parts.items()} for c in conditions}
-
-
-def _limit(limit: Limit, seen: FoundLimit) -> dict[str, Any]:
-    """Return a limit, and where recordings were seen at it."""
-    return limit.model_dump() | {"seen": asdict(seen)}
+    return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
 
 
 def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
@@ -82,30 +71,22 @@ def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
 
 
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
-    facts = context.facts
+    facts, rows = context.facts, list[dict[str, Any]]()
     calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
-    rows = []
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: dict[str, Any] = {
-            "unit": unit,
-            "group": group,
-            "conditions": list(dict.fromkeys(k.condition for k in keys)),
-        }
-        status = "ok"
+        row: dict[str, Any] = {"unit": unit, "group": group}
+        row |= {"conditions": list(dict.fromkeys(k.condition for k in keys)), "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
-            row |= {
-                "phase_rad": phase.phase_rad if phase else None,
-                "concentration": phase.concentration if phase else None,
-            }
-            status = status if phase else "not calibrated"
+            row |= {name: getattr(phase, name, None) for name in ("phase_rad", "concentration")}
+            row |= {} if phase else {"status": "not calibrated"}
         if models is not None and unit in models.unit_ids:
-            status = models.status[models.index(unit)]
-        elif models is not None and status == "ok":
-            status = f"not identified, no recordings in {facts.identify_on}"
-        rows.append(row | {"status": status})
+            row["status"] = models.status[models.index(unit)]
+        elif models is not None and row["status"] == "ok":
+            row["status"] = f"not identified, no recordings in {facts.identify_on}"
+        rows.append(row)
     return rows
 
 

@@ -152,15 +152,13 @@ def simulate(
     episodes: Annotated[int, typer.Option(min=1, max=1000)] = 10,
     seconds: Annotated[float, typer.Option(min=5)] = 20.0,
     seed: Seed = 0,
-    spread: Annotated[float, _option("Manufacturing spread; 1 is 5 to 15 % on every parameter.", min=0)] = 1.0,
-    loop: Annotated[str, _option("Velocity loop: stiff or soft.")] = "stiff",
     outlier: Annotated[bool, _option("Add one badly assembled unit.", "--outlier")] = False,
     format_: Annotated[str, _option("parquet or raw, the paper's layout.", "--format")] = "parquet",
 ) -> None:
     """Simulate a population with known truth."""
     from .study.commands.demo import Simulation, simulate_to
 
-    simulate_to(out, Simulation(units, episodes, seconds, seed, spread, outlier, plant, loop, format_))
+    simulate_to(out, Simulation(units, episodes, seconds, seed, outlier=outlier, plant=plant, format=format_))
     _say([f"recordings in {out}"])
 
 

@@ -151,7 +151,7 @@ class Gaps:
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Change over to the fallback in the next states (batch, n), and move levels, ramps and offsets on; x as `fill` left it."""
-        bank, some = self.bank, missing.any(axis=1)
+        bank, some = self.bank, np.asarray(missing.any(axis=1))
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = np.where(missing, self.held, last[:, self.measured])
         offset = bank.forget * (last - x[:, self.fallback])

@@ -259,7 +259,7 @@ def _design(task: DesignTask) -> Design | str:
 def certified(
     tasks: Sequence[DesignTask], designs: Mapping[str, Design], identified: IdentifiedModels, work: Work
 ) -> dict[str, Design]:
-    """Certify observers, on every member of the uncertain set and as nonlinear ones, those of a lifting side by side."""
+    """Certify observers on every member of the uncertain set and as nonlinear ones, a lifting side by side."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
     groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
     for task, design in pairs:

@@ -11,9 +11,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
-from ..core.loading import loader
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting

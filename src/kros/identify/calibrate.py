@@ -7,9 +7,9 @@ import logging
 import numpy as np
 
 from ..core.errors import IdentificationError
+from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
-from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts
 from .calibration import PhaseCalibration, PhaseSpec, Segment, UnitPhase, find_segments, resolve_branches, unit_phase
 
@@ -43,7 +43,7 @@ def _mark(facts: RecordingFacts, task: Task) -> str | None:
     """Return what the segments of a task follow from."""
     population, keys, spec = task
     samples = facts.marks(keys)
-    return None if samples is None else mark_of(population.columns, population.sample_period_s, spec, keys, samples)
+    return None if samples is None else digest_of(population.columns, population.sample_period_s, spec, keys, samples)
 
 
 def segments_of(task: Task) -> list[Segment]:

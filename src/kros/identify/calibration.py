@@ -26,9 +26,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import IdentificationError
-from ..core.loading import loader
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]

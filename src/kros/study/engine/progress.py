@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
 
-from ...core.work import Progress, Silent
+from ...core.work import Progress
 
 
-class Lines:
+class Lines(Progress):
     """One line a finished stage, and one every ten seconds while a stage advances."""
 
     def __init__(self, every_s: float = 10.0) -> None:
@@ -41,7 +41,7 @@ class Lines:
             sys.stderr.flush()
 
 
-class Bars:
+class Bars(Progress):
     """A bar for what is running, a line for what is done."""
 
     def __init__(self, display: Any) -> None:
@@ -76,7 +76,7 @@ def _finished(stage: str, seconds: float, skipped: bool) -> str:
 def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     """Return the progress listener that fits where standard error goes; bars would hide questions."""
     if quiet or asks:
-        yield Silent()
+        yield Progress()
     elif not sys.stderr.isatty():
         yield Lines()
     else:

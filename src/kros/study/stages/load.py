@@ -1,8 +1,8 @@
 """Load torque in a study: calibrated where a load of known size is mounted, judged on held-out episodes of other units.
 
 Needs ``[load] moment``. Observers with a load as a state are made of both liftings, the linear one for comparison.
-Beside them is the paper's estimate, the error of the recorded current in observers of the unloaded machine. The declared
-load is the truth for the other units as well: it is meant for loads that are alike.
+Beside them is the paper's estimate, the error of the recorded current in observers of the unloaded machine. The
+declared load is the truth for the other units as well: it is meant for loads that are alike.
 """
 
 from __future__ import annotations

@@ -50,8 +50,8 @@ def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
         raise ConfigError(
-            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} of them named by the study, "
-            f"and a population needs at least {FEWEST}; reserve fewer, or record more units."
+            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
+            f"a population needs at least {FEWEST}; reserve fewer, or record more units."
         )
     return draw_reserve(free, n)
 

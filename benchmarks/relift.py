@@ -26,8 +26,8 @@ from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch
 from kros.data.readers.parquet import read_parquet
-from kros.design.methods.design import design
-from kros.design.synthesize import tasks_of
+from kros.design.methods import methods_of
+from kros.design.synthesize import _design, tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
 from kros.observer.certificate.report import relift_report
 from kros.observer.residual.one_step import one_step_residual
@@ -103,13 +103,13 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
             tasks = [
                 task
                 for kind in KINDS
-                for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.estimator)
+                for task in tasks_of(context.uncertain, kind, methods_of(wanted, config.estimator))
             ]
             made = []
-            for task, product in zip(tasks, context.work.map("synthesize", design, tasks), strict=True):
-                if product.observer is not None:
+            for task, product in zip(tasks, context.work.map("synthesize", _design, tasks), strict=True):
+                if not isinstance(product, str):
                     product.observer.save(run / "observers" / f"{task.name}.json")
-                made.append([task.name, product.facts.get("reason")])
+                made.append([task.name, product if isinstance(product, str) else None])
         write_json(run / "observers" / "made.json", made)
     return run
 

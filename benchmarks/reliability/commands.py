@@ -35,7 +35,6 @@ QUICK = (
     "identify.refine=false",
     "evaluate.robustness=false",
     'synthesis.methods=["residual_h2"]',
-    "synthesis.input_weight=3.0",
     "uncertainty.n_freqs=60",
 )
 STUDY = """name = "drives"
@@ -197,7 +196,6 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "sensor.angle.noise",
         "sensor.angle.dropout",
         "limits.speed",
-        "observer.deployed",
         "calibrate.angle",
     )
     keys += (
@@ -208,7 +206,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "data.prepare",
         "data.source",
         "identify.kinds",
-        "load.limit",
+        "load.moment",
     )
     values = (
         "-1",
@@ -465,7 +463,7 @@ def run(count: int, seed: int) -> list[Tally]:
                 "Parquet",
                 root / "parquet",
                 PARQUET,
-                [["run", "parquet.toml", "--until", "read", *until], ["convert", "case", WRITTEN, "--workers", "1"]],
+                [["run", "parquet.toml", "--until", "read", *until]],
             ),
             (
                 "TOML",

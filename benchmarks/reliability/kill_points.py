@@ -36,7 +36,6 @@ refine = false
 [uncertainty]
 n_freqs = 60
 [synthesis]
-input_weight = 3.0
 methods = ["residual_h2"]
 [observer]
 baselines = ["open_loop", "kalman_tuned"]

@@ -87,7 +87,6 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
         "identify": {"refine": refine},
         "uncertainty": {"n_freqs": 60},
         "synthesis": {
-            "input_weight": 3.0,
             "methods": ["worst_case_h2", "residual_h2", "estimator"] if refine else ["residual_h2", "estimator"],
         },
         "sensor": {"position": {"noise": NOISE[plant] * factors.get("position", 1.0)}},

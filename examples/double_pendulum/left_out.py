@@ -22,7 +22,7 @@ import numpy as np
 import kros
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read, split_episodes
-from kros.design.estimators import make_difference, make_extended, make_learned
+from kros.design.baselines import make_difference, make_extended, make_learned
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet

@@ -146,23 +146,6 @@ def test_a_name_of_the_study_with_other_recordings_is_refused(kros, run, tmp_pat
     assert "--same-unit" in refused.stderr
 
 
-def test_rows_of_metrics_say_as_much(run) -> None:
-    rows = json.loads((run / "metrics.json").read_text())["outliers"]
-    assert {
-        "unit",
-        "condition",
-        "score",
-        "outlier",
-        "status",
-        "detectable",
-        "detectable_db",
-        "needed_s",
-        "needed_episodes",
-    } <= set(rows[0])
-    assert {r["episodes"] for r in rows} == {10}
-    assert all(r["outlier"] == (r["status"] == "outlier") for r in rows)
-
-
 def test_a_batch_of_unequal_recordings(kros, tmp_path) -> None:
     """A third of the units was recorded in two of ten episodes: none is flagged for that, and none blinds the others."""
     data = {u: [episode(drive(s), 400, s, e) for e in range(10 if s < 8 else 2)] for u, s in BATCH.items()}

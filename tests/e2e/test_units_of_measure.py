@@ -50,7 +50,7 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "lifting": {"functions": [f"tanh({1 / factors[1]!r}*velocity)"]},
         "identify": {"refine": False, "alpha": alpha},
         "uncertainty": {"n_freqs": 50},
-        "synthesis": {"input_weight": 3.0, "methods": ["worst_case_h2", "residual_h2", "estimator"]},
+        "synthesis": {"methods": ["worst_case_h2", "residual_h2", "estimator"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
         "estimator": {"rows": 10000},
         "evaluate": {"robustness": False},

@@ -9,7 +9,7 @@ import pytest
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.data.population import EpisodeKey
-from kros.design.estimators import Baseline
+from kros.design.baselines import Baseline
 from kros.lifting import Lifting
 from kros.observer import (
     ExtendedKalman,

@@ -24,9 +24,6 @@ Where a form is exact is no longer a function of its own; use misfit, which is z
     kros.uncertainty.completion kros.uncertainty.existence
 The nominals of all forms are no longer one function; use choose_nominal for each form.
     kros.uncertainty.choose_nominals
-Margins of stability and the largest residual of identification are no longer settings; identify.alpha_factor keeps
-models away from the edge.
-    identify.margin identify.largest_residual
 Parameters of a lifting are not named; a formula that reads phase has one for every unit, remove the key parameters.
     lifting.parameters
 What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is a
@@ -110,6 +107,24 @@ Flagged units are no longer dropped by a study itself; name them under data.excl
 What the fit of a weight is made of is no longer public; use quantify.
     kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
     kros.uncertainty.FitSettings
+Margins of stability, the largest residual of identification and the factor of alpha are no longer settings; remove the
+keys, or set identify.alpha to a number.
+    identify.margin identify.largest_residual identify.alpha_factor
+The spectrum of the inputs, the penalty on corrections and the time limit are no longer settings of a study; remove the
+keys, and use kros.design.methods for a method with other options.
+    synthesis.input_weight synthesis.penalty synthesis.time_limit_s
+Limits of states are no longer declared; remove the table limits, kros detects limits that recordings reach.
+    limits
+The deployed observer is no longer named in a study; remove the key deployed, and use kros export c --observer.
+    observer.deployed
+The rate of false alarms of the monitor is no longer a setting of a study; remove the key, it is 0.02.
+    observer.false_alarm_rate
+Names of condition, angle and current, limit and time constant of a load are no longer settings; remove the keys, name
+the condition load and the states position and current.
+    load.condition load.angle load.current load.limit load.level_s
+Requirements are no longer part of a study; remove the table require, and read certificates and outliers in
+metrics.json.
+    require require.robust require.no_outliers
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

@@ -57,8 +57,7 @@ def _limit(limit: Mapping[str, Any] | None) -> str:
         return ""
     ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
     seen = (limit.get("seen") or {}).get("units")
-    text = f"{ends}, {'declared' if limit['declared'] else 'estimated'}"
-    return f"{text}, reached by {some_of(seen, 3)}" if seen else text
+    return f"{ends}, estimated, reached by {some_of(seen, 3)}" if seen else f"{ends}, estimated"
 
 
 def calibration(facts: Facts) -> Section | None:

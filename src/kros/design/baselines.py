@@ -1,4 +1,4 @@
-"""Baselines that are no constant correction of a model, and so have no certificate: made and run where observers are evaluated."""
+"""Baselines without a certificate, since they are no constant correction of a model; they run in the evaluation."""
 
 from __future__ import annotations
 
@@ -32,12 +32,23 @@ from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, Array]
-_LEVELS = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of process noise that the extended filter tries, for either shape
-_EXTENDED_SAMPLES = 2_000
-_REGRESSORS = 600  # of the learned estimator, at most
-_MOMENTS = 2.5e7  # numbers that its moments of all units, conditions and states may take, 200 MB
-_LEAST = 0.1  # of a state's largest value: what it hardly moves in counts for no more than this
-_WORK = 2e9  # samples times regressors that it is trained on, some seconds: no clock decides, so that every run finds the same
+
+
+@dataclass(frozen=True)
+class BaselineSettings:
+    """How baselines are tuned and trained."""
+
+    levels: tuple[float, ...] = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of the extended filter's process noise
+    extended_samples: int = 2_000  # of an episode, on which these are compared
+    regressors: int = 600  # of the learned estimator, at most
+    moments: float = 2.5e7  # numbers in its moments of all units, conditions and states, 200 MB
+    least: float = 0.1  # share of a state's largest value, for which a state that hardly moves counts
+    work: float = 2e9  # samples times regressors of its training; no clock decides, so that every run is the same
+    profile_samples: int = 5_000_000  # of the mean profile, at most, once every unit and condition has been read
+    same_motion: float = 0.01  # RMS difference of inputs of the same motion, share of the largest input
+
+
+DEFAULT = BaselineSettings()
 
 
 class Estimator(Protocol):
@@ -65,20 +76,18 @@ class Baseline:
         return self.estimate(batch.keys, batch.measurements(self.measured), batch.inputs, parameters)
 
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
-        """Estimate episodes from measurements and inputs of any origin, shape (n_samples, batch, q) and (..., m); not finite where one is missing."""
-        pieces: dict[str, list[int]] = {}
+        """Estimate episodes from measurements and inputs, shape (n_samples, batch, q) and (..., m), NaN where lost."""
+        units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
-            pieces.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
-        samples = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u)
-        found: Array | None = None
-        for name, rows in pieces.items():
-            own = {k: v[rows] for k, v in parameters.items()}
-            run, mine = partial(self._piece, self.by_unit[name]), samples.of(rows)
-            part = restarted(run, mine, own) if self.restarts else run(mine.y, mine.u, own)
-            found = np.empty((*y.shape[:2], part.shape[-1])) if found is None else found
-            found[:, rows] = part
-        assert found is not None
-        return found if self.limits is None else np.clip(found, *self.limits)
+            units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
+        samples, estimate = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), np.empty(0)
+        for unit, rows in units.items():
+            values = {k: v[rows] for k, v in parameters.items()}
+            run, some = partial(self._piece, self.by_unit[unit]), samples.of(rows)
+            part = restarted(run, some, values) if self.restarts else run(some.y, some.u, values)
+            estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
+            estimate[:, rows] = part
+        return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
     def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
         return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
@@ -87,31 +96,30 @@ class Baseline:
 def restarted(
     run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]
 ) -> Array:
-    """Run a batch, and every member once more from each sample at which it starts again to the next; shape (n_samples, batch, n)."""
+    """Run a batch, every member again from each sample at which it starts again to the next; (n_samples, batch, n)."""
     n_samples, batch = samples.starts.shape
-    found = run(samples.y, samples.u, parameters)
+    estimate = run(samples.y, samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
-        own = np.flatnonzero(samples.starts[begin])
-        again = samples.starts[begin + 1 :, own]
+        members = np.flatnonzero(samples.starts[begin])
+        again = samples.starts[begin + 1 :, members]
         lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
         rows = slice(begin, int(np.max(lasts)) + 1)
-        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[own] for name, v in parameters.items()}
-        found[begin + 1 : rows.stop, own] = run(samples.y[rows, own], samples.u[rows, own], part)[1:]
-    return found
+        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
+        estimate[begin + 1 : rows.stop, members] = run(samples.y[rows, members], samples.u[rows, members], part)[1:]
+    return estimate
 
 
-def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
-    """Tune the extended Kalman filter of a nominal model: process noise over eight decades, of two shapes, all run side by side."""
+def make_extended(
+    training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
+) -> Baseline:
+    """Tune the extended Kalman filter of a nominal model: process noise of two shapes, all run side by side."""
     data, lifting, n = training.read(), models.lifting, models.lifting.n_states
-    row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
-    batch = data.batch
+    row, C, R, batch = models.index(unit), list(models.measured), np.diag(noise**2), data.batch
     residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
-    pooled = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2), RESIDUAL: pooled}
+    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2)}
+    shapes[RESIDUAL] = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
     sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
-    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in _LEVELS]
-    start = start_covariance(models.output_scale[:n], R, models.measured)
-    values = {name: float(v[row]) for name, v in models.parameters.items()}
+    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in settings.levels]
     filters = ExtendedKalman(
         lifting,
         models.A[row],
@@ -120,85 +128,73 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         models.recorded_inputs,
         np.stack([Q for *_, Q in tried]),
         R,
-        start,
-        values,
+        start_covariance(models.output_scale[:n], R, models.measured),
+        {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
-    short = data.first(_EXTENDED_SAMPLES)
+    short = data.first(settings.extended_samples)
     percents = [
         error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
         for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)
     ]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
-    limit = np.full(n, 100.0)
-    ranks = [rank(p, limit, models.measured) for p in bounded]
+    ranks = [rank(p, np.full(n, 100.0), models.measured) for p in bounded]
     first = min(range(len(tried)), key=lambda i: ranks[i])
     if not np.isfinite(bounded[first]).all():
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
-    shape_name, level, Q = tried[first]
-    facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape_name}
-    return Baseline(
-        {"": replace(filters, Q=Q)}, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen
-    )
+    shape, level, Q = tried[first]
+    facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape}
+    tuned = {"": replace(filters, Q=Q)}
+    return Baseline(tuned, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen)
 
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale."""
     population, data = training.population, training.read()
-    states, y, lengths = data.batch.states, data.measurements(measured), data.batch.lengths
-    pairs = followed(data.batch, measured)
+    batch, y, period = data.batch, data.measurements(measured), training.population.sample_period_s
+    pairs = followed(batch, measured)
     if not pairs:
+        states = ", ".join(population.states)
         raise ConfigError(
-            f"Filtered difference: no state of {', '.join(population.states)} follows the rate of a measured one; record the rate."
+            f"Filtered difference: no state of {states} follows the rate of a measured one; record the rate."
         )
-    estimated = [state for _, state in pairs]
-    truth = states[..., estimated]
-    best: tuple[float, FilteredDifference] | None = None
-    for cutoff in cutoffs_hz(population.sample_period_s):
-        trial = FilteredDifference(len(population.states), pairs, float(cutoff), population.sample_period_s).scaled_to(
-            data.batch, measured
-        )
-        error = float(error_percent(trial.run(y, data.batch.inputs)[..., estimated], truth, lengths).mean())
-        if best is None or error < best[0]:
-            best = (error, trial)
-    assert best is not None
-    return Baseline(
-        {"": best[1]},
-        measured,
-        tuple(estimated),
-        {"status": "tuned", "cutoff_hz": best[1].cutoff_hz},
-        seen=training.seen,
-    )
+    estimated = tuple(state for _, state in pairs)
+    truth, tried = batch.states[..., estimated], list[tuple[float, FilteredDifference]]()
+    for cutoff in cutoffs_hz(period):
+        trial = FilteredDifference(len(population.states), pairs, float(cutoff), period).scaled_to(batch, measured)
+        error = error_percent(trial.run(y, batch.inputs)[..., estimated], truth, batch.lengths)
+        tried.append((float(error.mean()), trial))
+    best = min(tried, key=lambda pair: pair[0])[1]
+    facts = {"status": "tuned", "cutoff_hz": best.cutoff_hz}
+    return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
 
 
-def make_learned(training: TrainingSet, lifting: Lifting, measured: tuple[int, ...]) -> Baseline:
+def make_learned(
+    training: TrainingSet, lifting: Lifting, measured: tuple[int, ...], settings: BaselineSettings = DEFAULT
+) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     few = training.first_of_units().read()
     y, u = hold_missing(few.measurements(measured)), few.batch.inputs
     features = Features.of(lifting, measured, y, u)
     groups, lengths = len({(key.unit, key.condition) for key in training.keys}), list[int]()
     channels = features.channels(y[:1], u[:1], few.parameters).shape[-1]
-    most = min(_REGRESSORS, (_MOMENTS / (groups * max(1, lifting.n_states - len(measured)))) ** 0.5)
+    hidden = max(1, lifting.n_states - len(measured))
+    most = min(settings.regressors, (settings.moments / (groups * hidden)) ** 0.5)
     features = replace(features, taps=max(1, min(features.taps, int(most / channels))))
     regressors = channels * features.taps
 
     def episodes() -> Iterator[EpisodeBatch]:
         for number, part in enumerate(training.one_by_one()):
-            if number >= groups and sum(lengths) * regressors > _WORK:
+            if number >= groups and sum(lengths) * regressors > settings.work:
                 return
             lengths.append(len(part.batch.states))
             yield part.batch
 
-    moments = Moments.of(features, episodes(), _LEAST * np.abs(few.batch.states).max(axis=(0, 1)))
+    moments = Moments.of(features, episodes(), settings.least * np.abs(few.batch.states).max(axis=(0, 1)))
     choices = moments.choose()
     estimators: dict[str, Learned] = {unit: moments.estimator([unit], choices) for unit in moments.units}
-    facts = {
-        "status": "trained",
-        "episodes": len(lengths),
-        "episodes_recorded": len(training.keys),
-        "left_out": "the unit under test",
-    }
+    facts = {"status": "trained", "episodes": len(lengths), "episodes_recorded": len(training.keys)}
+    facts |= {"left_out": "the unit under test"}
     facts["chosen"] = {lifting.states[i]: asdict(choice) for i, choice in zip(moments.estimated, choices, strict=True)}
-    return Baseline(
-        estimators | {"": moments.estimator((), choices)}, measured, moments.estimated, facts, seen=training.seen
-    )
+    estimators[""] = moments.estimator((), choices)
+    return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)

@@ -79,7 +79,7 @@ def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, 
             own = in_sizes(made, {})
             found[task.method] = lambda b, o=own: run_observer(o, b.measurements(o.measured), b.inputs, b.parameters)  # type: ignore[misc]
     models = uncertain.models
-    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.lifting, models.models().measured)
+    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.models().measured)
     return found | {"learned": lambda b: learned.run(b, b.parameters)}
 
 

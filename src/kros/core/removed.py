@@ -136,9 +136,9 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "kros.data.Split kros.data.check_population",
     ),
     (
-        "Certificates for any pattern of lost measurements are no longer part of kros; use kros.observer.dropout_bound for "
-        "losses at a rate.",
-        "kros.observer.Dropped",
+        "Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded for "
+        "any pattern of losses, and the report's figure of lost measurements.",
+        "kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound",
     ),
     (
         "The function run_study is no longer part of kros; use kros.run, which takes a study too.",

@@ -19,12 +19,6 @@ _SIGNALS = {
     "set_bound_percent": "bound_percent",
     "set_outside": "outside",
 }
-_LOSSES = {
-    "dropout_rate": "rate",
-    "dropout_certified": "certified",
-    "dropout_mean_square_gain": "mean_square_gain",
-    "dropout_reason": "reason",
-}
 
 
 def about(
@@ -61,9 +55,8 @@ def about(
                 "lag_rad": calibration.lag_rad,
             }
         }
-    for key, names in (("recorded_signals", _SIGNALS), ("losses", _LOSSES)):
-        own = {name: facts[fact] for fact, name in names.items() if fact in facts}
-        found |= {key: own} if own else {}
+    signals = {name: facts[fact] for fact, name in _SIGNALS.items() if fact in facts}
+    found |= {"recorded_signals": signals} if signals else {}
     content: dict[str, Any] = plain(found)
     return content
 

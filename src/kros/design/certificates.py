@@ -14,15 +14,12 @@ import numpy.typing as npt
 from ..core.artifacts import save_artifact
 from ..lifting import Lifting
 from ..observer import (
-    DropoutBound,
     Guard,
     Observer,
     ReliftCertificate,
     ReliftScales,
     ReliftStatus,
-    Sensor,
     SignalBound,
-    dropout_bound,
     relift_certificate,
     run_observer,
     run_observers,
@@ -61,14 +58,12 @@ class Running:
     dropout_percent: float
     signals: SignalBound | None = None
     measured: tuple[int, ...] = ()
-    dropout: DropoutBound | None = None
     guard: Guard | None = None
 
     @property
     def certified(self) -> bool:
-        """Whether it is certified as it runs, for any machine, for the recorded signals of all units, and in mean square for losses that are declared."""
-        proven = self.dropout is None or self.dropout.gain is not None
-        return self.certificate.certified and proven and (self.signals is None or self.signals.certified)
+        """Whether it is certified as it runs, for any machine, and for the recorded signals of all units."""
+        return self.certificate.certified and (self.signals is None or self.signals.certified)
 
     def facts(self) -> dict[str, Any]:
         """Return what goes into the metrics."""
@@ -81,14 +76,6 @@ class Running:
         }
         if self.signals is not None:
             facts |= self.signals.facts(self.measured)
-        if self.dropout is not None:
-            lost = self.dropout
-            facts |= {
-                "dropout_rate": lost.rate,
-                "dropout_certified": lost.gain is not None,
-                "dropout_mean_square_gain": lost.gain,
-            }
-            facts |= {"dropout_reason": lost.reason} if lost.reason else {}
         if not found.certified:
             return facts | {"relift_reason": found.reason}
         return facts | {
@@ -157,8 +144,6 @@ def running_of(
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
     dropout = dropout_error_percent(observers, data)
-    rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
-    lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]
     known: dict[bytes, BandEnergies] = {}
     rows, bounds = [], []
     for o, c, x in zip(observers, certificates, arrived, strict=True):
@@ -167,8 +152,8 @@ def running_of(
         bounds.append(signal_bound(c, o, batch, x, known, seen))
     bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, guards, strict=True)
-    return [Running(o.name, c, r, float(h), float(d), b, o.measured, p, g) for o, c, r, h, d, b, p, g in found]
+    found = zip(observers, certificates, rows, hidden, dropout, bounds, guards, strict=True)
+    return [Running(o.name, c, r, float(h), float(d), b, o.measured, g) for o, c, r, h, d, b, g in found]
 
 
 def running_filters(

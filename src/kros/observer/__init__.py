@@ -16,7 +16,6 @@ from .baselines.difference import FilteredDifference
 from .baselines.extended_kalman import ExtendedKalman
 from .certificate.certificate import ReliftCertificate, relift_certificate
 from .certificate.error import ReliftScales
-from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
 from .certificate.status import ReliftStatus
 from .estimator.build import identify_estimator
@@ -35,7 +34,6 @@ from .simulate import run_observer, run_observers, run_with_status
 from .tracking import Tracked, track_parameter
 
 __all__ = [
-    "DropoutBound",
     "Estimate",
     "EstimatorSettings",
     "ExtendedKalman",
@@ -55,7 +53,6 @@ __all__ = [
     "Sensor",
     "SignalBound",
     "Tracked",
-    "dropout_bound",
     "identify_estimator",
     "relift_certificate",
     "run_observer",

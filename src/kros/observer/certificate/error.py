@@ -204,8 +204,6 @@ def error_system(
     scales: ReliftScales | None = None,
     box: Box | None = None,
     parameters: Box | None = None,
-    *,
-    arrives: npt.ArrayLike = True,
 ) -> ErrorSystem:
     """Return the error dynamics of an observer as it runs, its delay and limits included."""
     scales = scales or ReliftScales.ones(observer)
@@ -253,7 +251,6 @@ def error_system(
 
     e, after = predicted(of.xi(0, h), 0)
     nu = e[list(observer.measured)] + of.w(n, q, scales.noise)
-    nu[~np.broadcast_to(np.asarray(arrives, dtype=bool), (q,))] = 0.0
     v = K.C @ of.xi(h, order) + K.D @ nu
     for k, i in enumerate(cuts, n_p - len(cuts)):
         q_rows[k], channels[k], rest[k] = _WIDER / 2 * v[i], f"limit of correction {i}", 1.0

@@ -54,9 +54,9 @@ def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None
     held = _gram(_Exact.of(root))
     for A, B in corners:
         n, width = A.shape[1], B.shape[1]
-        moved = [_gram(_Exact.of(root) @ _Exact.of(step)) for step in np.split(np.hstack([A, B]), len(A) // n)]
-        shift = max(part.shift for part in (*moved, held, out, level))
-        F = -sum(part.at(shift) for part in moved) - out.at(shift)
+        moved = _gram(_Exact.of(root) @ _Exact.of(np.hstack([A, B])))
+        shift = max(part.shift for part in (moved, held, out, level))
+        F = -moved.at(shift) - out.at(shift)
         F[:n, :n] += held.at(shift)
         F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
         if not _positive(F):

@@ -264,7 +264,7 @@ def baseline_makers(
     if "mean_profile" in asked:
         makers["mean_profile"] = partial(make_mean_profile, whole, first.measured, population, keys)
     if "learned" in asked:
-        makers["learned"] = partial(make_learned, whole, context.lifting, first.measured)
+        makers["learned"] = partial(make_learned, whole, first.measured)
     return makers
 
 

@@ -50,7 +50,7 @@ from kros.evaluate import true_errors  # noqa: E402
 from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibrate import segments_of  # noqa: E402
 from kros.observer import EstimatorSettings, Sensor, run_observer  # noqa: E402
-from kros.observer.limits import Limit  # noqa: E402
+from kros.observer.sensor import Limit  # noqa: E402
 from kros.plants import PLANTS  # noqa: E402
 from kros.uncertainty.quantify import UncertainModels  # noqa: E402
 

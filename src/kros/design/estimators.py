@@ -22,8 +22,7 @@ from ..observer.baselines.extended_kalman import start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
-from ..observer.samples import Screened
-from ..observer.screen import Screen
+from ..observer.screen import Screen, Screened
 from ..observer.sensor import delay_of
 from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank

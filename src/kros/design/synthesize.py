@@ -25,8 +25,7 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Observer, ReliftCertificate, Sensor
-from ..observer.limits import Limit, Limits, limits_of
-from ..observer.sensor import Sensors, require_measured
+from ..observer.sensor import Limit, Limits, Sensors, limits_of, require_measured
 from ..observer.units import in_sizes
 from ..synthesis import ObserverProblem, Synthesis
 from ..uncertainty.quantify import UncertainModels

@@ -14,8 +14,7 @@ from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Observer, Runtime
-from ..observer.limits import Limits, sides
-from ..observer.sensor import Sensors, delay_of
+from ..observer.sensor import Limits, Sensors, delay_of, sides
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .settings import SynthesisSettings
 from .validation import TrainingSet, rank

@@ -7,7 +7,7 @@ all liftings, models and observers, compiled once on a machine. Where there is n
 from __future__ import annotations
 
 from .compiler import COMPILERS, find_compiler
-from .filtering import all_pole, filtered, recursion
+from .filtering import recursion
 from .library import Library, formulas, library
 from .tape import Tape, tape_of
 
@@ -15,8 +15,6 @@ __all__ = [
     "COMPILERS",
     "Library",
     "Tape",
-    "all_pole",
-    "filtered",
     "find_compiler",
     "formulas",
     "library",

@@ -60,7 +60,6 @@ typedef struct {
     const double *into;       /* (n, width) */
     const double *low;        /* (observers, n + order): bounds beyond which a machine waits for a start; none */
     const double *high;
-    const double *origin;     /* (n, batch): what states are relative to; none */
     uint8_t *waiting;         /* (observers, batch), moved on */
     uint8_t *restart;         /* (observers, batch): whether a machine ever waited */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
@@ -115,33 +114,6 @@ typedef struct {
     const int32_t *slope;     /* (slopes, 3): lifted function, state, register */
     double *states;           /* (samples, filters, n, batch) */
 } kalman_job;
-
-/* Signals, samples last, through 1 / (q + a1 + a2 / q), at rest before: held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]. */
-typedef struct {
-    whole signals;
-    whole samples;
-    whole every;
-    const double *poles;      /* (2): a1 and a2 */
-    const double *x;          /* (signals, samples) */
-    const double *rest;       /* (signals): x before */
-    double *now;              /* (signals, samples / every): held at every so many samples */
-    double *before;           /* one sample before them; none */
-} filter_job;
-
-/* Monitors of machines that start together: mean squares of the bands of innovations; see kros.observer.monitor. */
-typedef struct {
-    whole machines;
-    whole samples;
-    whole q;
-    whole bands;
-    const double *nu;         /* (samples, machines, q) */
-    const uint8_t *judged;    /* (samples, machines): the others hold what was */
-    const double *filters;    /* (bands, 3) */
-    const double *size;       /* (q): what innovations are divided by */
-    const double *gains;      /* (2): share that the first sample replaces, and the last one */
-    const double *largest;    /* (1): sizes beyond which more says nothing, and what is not a number counts as */
-    double *squares;          /* (machines, q, bands, samples) */
-} monitor_job;
 
 /* Errors of estimates and their spectra by Welch's method: see kros.evaluate.errors. */
 typedef struct {
@@ -314,9 +286,8 @@ static whole guarded(const relift_job *s, whole o, whole n, const vec *next, who
     memset(within, 1, sizeof within);
     for (whole i = 0; s->low && i < rows; i++) {
         const double low = s->low[o * rows + i], high = s->high[o * rows + i];
-        const double *origin = s->origin && i < n ? s->origin + i * s->batch + first : NULL;
         for (whole b = 0; b < lanes; b++) {
-            const double x = LANES(next + i * MOST)[b] + (origin ? origin[b] : 0.0);
+            const double x = LANES(next + i * MOST)[b];
             within[b] &= (uint8_t)(x >= low) & (uint8_t)(x <= high);
         }
     }
@@ -620,89 +591,6 @@ int kros_kalman(const formulas *f, const kalman_job *s)
         }
     }
     free(reg), free(P), free(L), free(F), free(FP), free(next), free(older), free(nu), free(drive), free(lifted), free(S);
-    return failed;
-}
-
-#define TILE 64
-
-/* A signal's samples into, and out of, its place in a tile. */
-static void load(double *to, const double *from, whole count)
-{
-    for (whole i = 0; i < count; i++) to[i * WIDE * MOST] = from[i];
-}
-
-static void store(double *to, const double *from, whole count)
-{
-    for (whole i = 0; i < count; i++) to[i] = from[i * WIDE * MOST];
-}
-
-int kros_filter(const filter_job *s)
-{
-    const whole samples = s->samples, kept = (samples + s->every - 1) / s->every;
-    const double a1 = s->poles[0], a2 = s->poles[1], sum = 1.0 + a1 + a2;
-    vec *in = vectors(TILE), *out = vectors(TILE), *earlier = vectors(TILE); /* a tile of samples, so that memory is read and written in rows */
-    const int failed = !in || !out || !earlier;
-    for (whole first = 0; first < s->signals && !failed; first += WIDE * MOST) {
-        const whole lanes = s->signals - first < WIDE * MOST ? s->signals - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
-        vec rest[MOST] = {{0}}, x[MOST] = {{0}}, y1[MOST] = {{0}}, y2[MOST] = {{0}}; /* differences from what was at rest, which may be far larger */
-        gather(rest, s->rest + first, 1, lanes);
-        for (whole k = 0, done = 0; k < samples; k += TILE) {
-            const whole length = samples - k < TILE ? samples - k : TILE;
-            whole count = 0;
-            for (whole b = 0; b < lanes; b++) load(LANES(in) + b, s->x + (first + b) * samples + k, length);
-            for (whole i = 0; i < length; i++) {
-                const int wanted = (k + i) % s->every == 0;
-                for (whole v = 0; v < w; v++) {
-                    const vec y = x[v] - a2 * y2[v] - a1 * y1[v], held = rest[v] / sum;
-                    if (wanted) out[count * MOST + v] = y + held, earlier[count * MOST + v] = y1[v] + held;
-                    y2[v] = y1[v], y1[v] = y, x[v] = in[i * MOST + v] - rest[v];
-                }
-                count += wanted;
-            }
-            for (whole b = 0; b < lanes; b++) {
-                store(s->now + (first + b) * kept + done, LANES(out) + b, count);
-                if (s->before) store(s->before + (first + b) * kept + done, LANES(earlier) + b, count);
-            }
-            done += count;
-        }
-    }
-    free(in), free(out), free(earlier);
-    return failed;
-}
-
-int kros_monitor(const monitor_job *s)
-{
-    const whole samples = s->samples, signals = s->machines * s->q;
-    vec *out = vectors(TILE);
-    for (whole i = 0; i < signals && out; i++)
-        for (whole first = 0; first < s->bands; first += WIDE) { /* bands side by side */
-            const whole lanes = s->bands - first < WIDE ? s->bands - first : WIDE;
-            vec b = {0}, a1 = {0}, a2 = {0}, one = {0}, two = {0}, p = {0};
-            for (whole l = 0; l < lanes; l++) {
-                const double *filter = s->filters + 3 * (first + l);
-                b[l] = filter[0], a1[l] = filter[1], a2[l] = filter[2];
-            }
-            const uint8_t *judged = s->judged + i / s->q;
-            const double *nu = s->nu + i, size = s->size[i % s->q], most = s->largest[0];
-            double gain = s->gains[0];
-            for (whole k = 0; k < samples; k += TILE) {
-                const whole length = samples - k < TILE ? samples - k : TILE;
-                for (whole j = 0; j < length; j++) {
-                    if (judged[(k + j) * s->machines]) {
-                        const double of = nu[(k + j) * signals] / size;
-                        const vec v = b * (!(of < most) ? most : of < -most ? -most : of), band = v + one;
-                        one = two - a1 * band, two = -v - a2 * band;
-                        p += gain * (band * band - p);
-                        gain /= 1.0 + gain;
-                        gain = gain > s->gains[1] ? gain : s->gains[1];
-                    }
-                    out[j * MOST] = p;
-                }
-                for (whole l = 0; l < lanes; l++) store(s->squares + (i * s->bands + first + l) * samples + k, LANES(out) + l, length);
-            }
-        }
-    const int failed = !out;
-    free(out);
     return failed;
 }
 

@@ -22,13 +22,11 @@ from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
 from .filter_bank import FilterBank
-from .guard import Guard
 from .monitor import Monitor
 from .observer import Observer
 from .running import Estimate, RunningObserver
-from .runtime import Runtime, Seen
-from .samples import SampleStatus
-from .screen import sample_status
+from .runtime import Guard, Runtime, Seen
+from .screen import SampleStatus, sample_status
 from .sensor import Sensor
 from .simulate import run_observer, run_observers, run_with_status
 from .tracking import Tracked, track_parameter

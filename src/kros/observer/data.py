@@ -28,9 +28,8 @@ from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .filter_bank import FilterBank
-from .guard import Guard
 from .monitor import Monitor
-from .runtime import Runtime, Seen
+from .runtime import Guard, Runtime, Seen
 from .sensor import Sensors, require_measured
 
 Array = npt.NDArray[np.float64]
@@ -184,21 +183,17 @@ class ObserverData:
     def initial(
         self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
     ) -> Array:
-        """Return the first estimate: the first measurement, other states zero or as the filter bank starts; shape (..., n)."""
+        """Return the first estimate, (..., n): the first measurement, other states zero or as the filter bank starts, within limits."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y
-        if self.bank is None:
-            return x
-        values = self.values(parameters)
-        inputs = (
-            np.zeros((*y.shape[:-1], len(self.inputs)))
-            if u is None
-            else np.broadcast_to(u, (*y.shape[:-1], len(self.inputs)))
-        )
-        lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
-        return np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+        if self.bank is not None:
+            inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))
+            values = self.values(parameters)
+            lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
+            x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+        return self.runtime.relifted(x)
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""

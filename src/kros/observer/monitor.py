@@ -17,14 +17,13 @@ all that the monitor remembers is held.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
-from ..loops import all_pole, library
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -127,15 +126,6 @@ class Monitor:
         if not np.isfinite(list(self.bounds.values())).all():
             raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
 
-    def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Self:
-        """Read what `content` returned."""
-        return cls(**content)
-
     def times(self, y: Array) -> Self:
         """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
         return replace(self, size=self.size * y)
@@ -152,43 +142,20 @@ class Monitor:
         Returns
         -------
         ndarray, shape (n_samples, batch, q, bands)
-            Perhaps a view with the samples innermost in memory.
         """
-        if (loops := library()) is not None:
-            samples, machines, q = innovation.shape
-            course = np.empty((machines, q, len(self.filters), samples))
-            job = {
-                "machines": machines,
-                "samples": samples,
-                "q": q,
-                "bands": len(self.filters),
-                "nu": innovation,
-                "judged": judged,
-            }
-            job |= {
-                "filters": self.filters,
-                "size": self.size,
-                "gains": (max(self.first, self.forget), self.forget),
-                "largest": (LARGEST,),
-            }
-            loops.call("kros_monitor", ("monitor_job", job | {"squares": course}))
-            return np.moveaxis(course, -1, 0)
+        from scipy.signal import lfilter
+
         scaled = innovation / self.size
         scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
-        found = np.zeros((*innovation.shape, len(self.filters)))
+        squares = np.zeros((*innovation.shape, len(self.filters)))
         for machine in range(innovation.shape[1]):
-            taken = np.flatnonzero(judged[:, machine])
-            if not len(taken):
-                continue
-            own = scaled[taken, machine].T
-            bands = np.stack([b * _apart(all_pole(own, a1, a2)) for b, a1, a2 in self.filters], axis=1)
-            squares = np.moveaxis(self._remembered(bands**2), -1, 0)
-            if len(taken) == len(judged) - taken[0]:
-                found[taken[0] :, machine] = squares
-                continue
-            latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
-            found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
-        return found
+            rows = np.flatnonzero(judged[:, machine])
+            if len(rows):
+                bands = [lfilter([b, 0, -b], [1, a1, a2], scaled[rows, machine], axis=0) for b, a1, a2 in self.filters]
+                means = self._remembered(np.stack(bands, axis=-1) ** 2)
+                latest = np.searchsorted(rows, np.arange(len(judged)), side="right")
+                squares[:, machine] = np.concatenate([np.zeros((1, *means.shape[1:])), means])[latest]
+        return squares
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of every episode, of a machine that has them one after the other.
@@ -206,14 +173,17 @@ class Monitor:
         return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
 
     def _remembered(self, squares: Array) -> Array:
-        """Return the means of squares, shape (..., n_samples), after every sample."""
-        first, count = max(self.first, self.forget), squares.shape[-1]
-        falling = min(count, max(0, int(np.ceil(1 / self.forget - 1 / first))))  # samples until the gain stays as it is
-        begun = np.cumsum(squares[..., :falling], axis=-1) / (1 / first + np.arange(falling))
-        rest = self.forget * squares[..., falling:]
-        if 0 < falling < count:
-            rest[..., 0] += (1 - self.forget) * begun[..., -1]
-        return np.concatenate([begun, all_pole(rest, self.forget - 1.0)], axis=-1)
+        """Return the means of squares, shape (n_samples, q, bands), after every sample."""
+        from scipy.signal import lfilter
+
+        first, keep = max(self.first, self.forget), 1 - self.forget
+        falling = min(len(squares), int(np.ceil(1 / self.forget - 1 / first)))  # until the gain stays as it is
+        begun = np.cumsum(squares[:falling], axis=0) / (1 / first + np.arange(falling))[:, None, None]
+        if falling == len(squares):
+            return begun
+        last = keep * begun[-1:] if falling else np.zeros((1, *squares.shape[1:]))
+        rest, _ = lfilter([self.forget], [1, -keep], squares[falling:], axis=0, zi=last)
+        return np.concatenate([begun, rest])
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
         """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
@@ -246,13 +216,6 @@ class Monitor:
     def product(self, condition: str | None) -> float:
         """Return the product that a machine in a condition may have."""
         return float(10 ** (self.bound(condition) * WEIGHT / 10))
-
-
-def _apart(signal: Array) -> Array:
-    """Return every sample minus that two before."""
-    return np.asarray(
-        signal - np.concatenate([np.zeros((*signal.shape[:-1], 2)), signal], axis=-1)[..., : signal.shape[-1]]
-    )
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:

@@ -26,9 +26,8 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .data import ObserverData
-from .guard import Restarts
 from .screen import screened
-from .simulate import run_observer
+from .simulate import run_observer, stepped
 from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
@@ -91,15 +90,16 @@ class PhaseLockedLoop:
         for array in (self._s, self._s_c, self._power, self._weight):
             array[slice(None) if machines is None else machines] = 0.0
 
-    def step(self, steps: Steps, y: Array, u: Array, missing: Flags | None = None) -> Array:
+    def step(self, steps: Steps, y: Array, u: Array) -> Array:
         """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
-        x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C].copy()
+        x, psi = steps.x.copy(), self._s[:, self._C].copy()
+        nu = np.where(np.isfinite(y), steps.innovation(y), 0.0)
         slopes, by_value = (
             steps.lifting.slopes(x, values)[..., :n],
             steps.lifting.parameter_slopes(x, values, self.name),
         )
-        steps.step(y, u, missing)
+        steps.step(y, u)
         if self.observer.bank is not None:  # measurements take the place of estimates
             self._s[:, self._C] = 0.0
         lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
@@ -108,7 +108,7 @@ class PhaseLockedLoop:
         self._power += self.forget * (np.sum((psi / self._sizes) ** 2, axis=-1) - self._power)
         self._weight += self.forget * (1.0 - self._weight)  # over the mean of psi^2 so far
         pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
-        usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting[0]
+        usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting
         seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=usable)
         return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
 
@@ -177,23 +177,9 @@ def track_parameter(
     batch = np.shape(y)[1]
     loop = PhaseLockedLoop(observer, name, batch, settle_s)
     samples, values = screened(observer, y, u), observer.values(parameters, (batch,))
-    y, u, starts = samples.y, samples.u, samples.starts
     values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
-    steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
-    estimates, followed = np.empty((*y.shape[:2], observer.lifting.n_states)), np.empty(y.shape[:2])
-    restarts, restarted = Restarts(observer.guard, batch), np.zeros(y.shape[:2], dtype=bool)
-    steps.begin(y[0])
-    steps.begin(y[0], starts[0], u[0])
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for k in range(len(y)):
-            estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
-            anew = starts[k] | (steps.waiting[0] & samples.complete[k])
-            if k and anew.any():  # the parameter stays
-                steps.begin(y[k], anew, u[k])
-                loop.begin(anew)
-            values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
-            restarted[k] = restarts.after(steps.waiting[0])
-    return Tracked(estimates, followed, restarted)
+    run = stepped(observer, samples, values, loop)
+    return Tracked(observer.runtime.clip_estimate(run.estimates), run.followed, run.status > 0)
 
 
 def least_innovation(

@@ -16,8 +16,7 @@ from ..core.settings import Settings
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from ..observer import EstimatorSettings
-from ..observer.limits import Limit
-from ..observer.sensor import Sensor
+from ..observer.sensor import Limit, Sensor
 from ..uncertainty.settings import UncertaintySettings
 
 

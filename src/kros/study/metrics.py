@@ -14,7 +14,7 @@ from ..core.artifacts import load_artifact, plain, read_json
 from ..data.flat_tops import FoundLimit
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
-from ..observer.limits import Limit, limits_of
+from ..observer.sensor import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
 from .config import Stage

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...observer import Recordings, identify_estimator
-from ...observer.limits import sides
+from ...observer.sensor import sides
 from ...synthesis import Status, Synthesis
 from ..task import DesignResult, DesignTask
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer, run_observer, track_parameter
-from ...observer.recorded import recorded_factors
+from ...observer.units import recorded_factors
 from .compiled import CompiledObserver
 
 Array = npt.NDArray[np.float64]

@@ -13,14 +13,13 @@ from ...core.errors import ConfigError
 from ...lifting.c_code import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.guard import bounds
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
-from ...observer.origin import FAR, OriginShift
-from ...observer.recorded import recorded_channel, recorded_factors
-from ...observer.samples import LONGEST
-from ...observer.screen import Bounds, Screen
+from ...observer.runtime import bounds
+from ...observer.screen import LONGEST, Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
+from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
+from .origin import FAR, OriginShift
 from .realise import Realised
 
 Array = npt.NDArray[np.float64]
@@ -86,7 +85,7 @@ class Source:
         n, q, m, K = lifting.n_states, len(o.measured), len(o.inputs), o.controller
         functions, widened = lifting.n_lifted - n, o.B.shape[1]
         screen = Screen.of(o)
-        limited = run.limited
+        limited = run.correction is not None or bool(run.relift and run.limits().keys() & {"lower", "upper"})
         x_names, y_names = (*o.recorded,), [lifting.states[i] for i in o.measured]
         factors = self.factors()
         return {

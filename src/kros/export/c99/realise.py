@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer
-from ...observer.origin import OriginShift, find_shift
+from .origin import OriginShift, find_shift
 
 Array = npt.NDArray[np.float64]
 _ALIKE = 1e4  # condition of the modes, by which rounding grows

@@ -19,7 +19,7 @@ from ...core.artifacts import write_bytes
 from ...core.errors import ConfigError
 from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer
-from ...observer.recorded import recorded_channel
+from ...observer.units import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files

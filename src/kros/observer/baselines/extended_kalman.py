@@ -24,7 +24,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError
 from ...lifting import Lifting
 from ...loops import Library, formulas, library, tape_of
-from ..samples import require_samples
+from ..screen import require_samples
 
 Array = npt.NDArray[np.float64]
 

@@ -114,7 +114,7 @@ class Course:
 def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
     """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
-    states = observer.runtime.within(batch.states)
+    states = observer.runtime.clip_estimate(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
     due = states[np.maximum(np.arange(len(states)) - late, 0)][..., at]
     y = (
@@ -129,7 +129,7 @@ def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None 
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - due[:-1]
     noise[:late] = 0.0
     omega = held_residual(observer, states, inputs, values)
-    start = observer.runtime.relifted(observer.initial(taken[0], values))
+    start = observer.initial(taken[0], values)
     return Course(
         omega,
         noise,

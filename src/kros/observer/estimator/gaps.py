@@ -98,12 +98,12 @@ def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSet
 def alternatives(observer: Observer, y: Array, u: Array, parameters: dict[str, Array]) -> tuple[Array, Array, Array]:
     """Return what the filters and the fallback estimate under losses, (n_samples, batch, n) each, and the level (n_samples, batch)."""
     n, batch = len(observer.recorded), y.shape[1]
-    steps = Steps([observer], batch, observer.values(observer.own(parameters), (batch,)))
+    steps = Steps(observer, batch, observer.values(observer.own(parameters), (batch,)))
     steps.begin(y[0], u=u[0])
     main, fallback, level = np.zeros((len(y), batch, n)), np.zeros((len(y), batch, n)), np.zeros((len(y), batch))
-    main[0] = fallback[0] = steps.x[0, :, :n]
+    main[0] = fallback[0] = steps.x[:, :n]
     for k in range(len(y) - 1):
-        main[k + 1], fallback[k + 1], level[k + 1] = steps.alternatives(y[k], u[k], ~np.isfinite(y[k]))
+        main[k + 1], fallback[k + 1], level[k + 1] = steps.alternatives(y[k], u[k])
     return main, fallback, level
 
 

@@ -15,8 +15,7 @@ from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
 from ...evaluate.arriving import Arriving, arriving
 from ...observer import Observer, run_with_status, track_parameter
-from ...observer.samples import Bits, SampleStatus
-from ...observer.screen import sample_status
+from ...observer.screen import Bits, SampleStatus, sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig
 from ..engine.store import Store

@@ -24,10 +24,8 @@ from ...evaluate.errors import ErrorSummary, summarise_all
 from ...evaluate.sensor import as_shown
 from ...identify import ModelSet, free_run
 from ...identify.presets import gearbox_band_hz
-from ...observer import Observer
-from ...observer.limits import limits_of, sides
-from ...observer.sensor import Sensors
-from ...observer.simulate import run_some_at_a_time
+from ...observer import Observer, run_observers
+from ...observer.sensor import Sensors, limits_of, sides
 from ..engine.context import Context
 from .disturbed import Trial, alike, make_trial, run_disturbed
 from .load import run_load
@@ -72,7 +70,9 @@ def evaluate_observers(
 
     def run(batch: EpisodeBatch) -> Iterator[Array]:
         y, parameters = batch.measurements(first.measured), batch.parameters if first.lifting.parameters else None
-        return run_some_at_a_time(observers, y, batch.inputs, parameters, max(1, _NUMBERS // batch.states.size))
+        count = max(1, _NUMBERS // batch.states.size)  # estimates of all of them may fill a memory
+        groups = (observers[i : i + count] for i in range(0, len(observers), count))
+        return (run_observers(group, y, batch.inputs, parameters) for group in groups)
 
     return _outcomes(run, population, keys, units, shown, sensor)
 

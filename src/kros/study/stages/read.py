@@ -11,9 +11,8 @@ from ...data.steps import parse_steps
 from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
-from ...observer.limits import limits_of
 from ...observer.residual.one_step import FEWEST_SAMPLES
-from ...observer.sensor import require_measured
+from ...observer.sensor import limits_of, require_measured
 from ..config import StudyConfig
 from ..engine.context import Context
 

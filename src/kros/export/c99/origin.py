@@ -1,36 +1,34 @@
 r"""A moving origin: the direction in which a machine can be moved without its observer noticing.
 
-After a thousand turns the steps of single precision are coarser than an encoder's, and those of double precision show in ``sin(100 position)`` and in
-differences of large numbers. Where all signals can be moved together,
+After a thousand turns the steps of single precision are coarser than an encoder's. Where all signals can be moved
+together,
 
 .. math:: (A_s - I)\, s_x + B\, s_u = 0, \qquad s_y = 1,
 
 and the lifted functions repeat with a period P, an observer may run on ``x - o s_x``, ``y - o`` and ``u - o s_u`` with an origin o that is a multiple of
 P: the same estimates, of small numbers. There are such directions for nearly every model, since there are more signals than equations; the smallest
-one is taken. Python and generated code of either precision run so.
+one is taken. Generated code of either precision runs so; double precision in Python does without.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..lifting import Lifting
-from .data import ObserverData
+from ...lifting import Lifting
+from ...observer.data import ObserverData
 
 Array = npt.NDArray[np.float64]
 Long = npt.NDArray[np.longdouble]
-Rows = slice | npt.NDArray[np.bool_]
 FAR = 1024  # periods from the origin, as far as double precision goes
 _EXACT, _NOTHING = 1e-11, 1e-13
 _SAME = 1e-18  # nothing, in extended precision
 _WHOLE = 0.01  # from a whole number, what is taken for one
 _ROUNDS = 4  # each leaves a share of what the one before left that double precision's rounding is
-_NEAR = 16.0  # whatever the unit of measure: nothing is looked for below
 _MOST = 64  # periods of the first function until all others repeat
 
 
@@ -109,68 +107,3 @@ def _common(rates: list[Any]) -> float | None:
         if np.abs(ratios * count - np.round(ratios * count)).max() < 1e-9:
             return float(2 * np.pi / min(rates) * count)
     return None
-
-
-class Origins:
-    """Origins of machines that run side by side in double precision; `at`, shape (batch,), is None while nobody has moved away."""
-
-    def __init__(self, observer: ObserverData, batch: int) -> None:
-        self._observer, self._place = observer, observer.measured[0] if len(observer.measured) == 1 else None
-        self._batch, self._alone = batch, batch == 1
-        self.at: Array | None = None
-
-    @cached_property
-    def shift(self) -> OriginShift | None:
-        """How the signals move; None where they cannot."""
-        return find_shift(self._observer)
-
-    @property
-    def states(self) -> Array:
-        """What is added to the states, shape (batch, n)."""
-        assert self.at is not None
-        assert self.shift is not None
-        return np.asarray(self.at[:, None] * self.shift.states)
-
-    def beyond(self, values: Array) -> bool:
-        """Whether some values of the measured state, whose rest of infinity or NaN does not count, are further from zero than an origin may be."""
-        if self._place is None or not len(values):
-            return False
-        with np.errstate(invalid="ignore"):
-            size = np.abs(values)
-            return (
-                bool((size > _NEAR).any()) and self.shift is not None and bool((size > FAR * self.shift.period).any())
-            )
-
-    def of(self, values: Array) -> Array:
-        """Return the multiples of the period next to values; zero where these are near, or not finite."""
-        assert self.shift is not None
-        period = self.shift.period
-        far = np.isfinite(values) & (np.abs(values) > FAR * period)
-        return np.where(far, period * np.floor(np.where(far, values, 0.0) / period + 0.5), 0.0)
-
-    def put(self, values: Array, rows: Rows = slice(None)) -> None:
-        """Put the origins of machines that start next to values of the measured state, shape (batch,)."""
-        if self.at is None and not self.beyond(values[rows]):
-            return
-        at = np.zeros(self._batch) if self.at is None else self.at.copy()
-        at[rows] = self.of(values)[rows]
-        self.at = at
-
-    def follow(self, x: Array) -> None:
-        """Move origins along with states relative to them, shape (observer, batch, n), which change."""
-        if self._place is None or (self._alone and -_NEAR < x.item(0, 0, self._place) < _NEAR):
-            return
-        here = x[0, :, self._place]
-        if self.beyond(here):
-            assert self.shift is not None
-            moved = self.of(here)
-            x -= moved[:, None] * self.shift.states
-            self.at = moved if self.at is None else self.at + moved
-
-    def take_off(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Return measurements and inputs, shape (..., batch, channels), relative to the origins."""
-        if self.at is None:
-            return y, u
-        assert self.shift is not None
-        at, shift = self.at[:, None], self.shift
-        return y - at, (u - at * shift.whole) - at * shift.rest

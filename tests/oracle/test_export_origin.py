@@ -1,4 +1,4 @@
-"""Observers far from zero: a moving origin changes nothing but rounding, against extended precision and generated code."""
+"""Generated code far from zero: a moving origin changes nothing but rounding, against extended precision and Python."""
 
 from dataclasses import replace
 
@@ -7,9 +7,9 @@ import pytest
 from machines import LIMITS, apart, drive, in_python, samples
 
 from kros.export import CompiledObserver, export_c
+from kros.export.c99.origin import find_shift
 from kros.loops import find_compiler
-from kros.observer import run_observer, step
-from kros.observer.origin import Origins, find_shift
+from kros.observer import run_observer
 from kros.observer.runtime import Runtime
 
 TURN = 2 * np.pi
@@ -75,36 +75,24 @@ def test_the_direction_leaves_the_model_where_it_is(kind):
     assert shift.states[0] == 1.0
 
 
+@needs_compiler
 @pytest.mark.parametrize("kind", ["lifted", "linear"])
-def test_as_exact_as_in_the_first_turn(kind, monkeypatch):
+def test_generated_code_is_as_exact_as_in_the_first_turn(kind, tmp_path):
     observer = cancelling(KINDS[kind]())
     y, u = far_away(1000)
     exact = in_extended_precision(observer, y, u)
-
-    def off():
-        found = run_observer(observer, y, u)[..., : len(observer.recorded)] - exact
-        return float(
-            (np.sqrt(np.mean(found**2, axis=(0, 1))) / np.std(np.asarray(exact[:, 1], dtype=float), axis=0)).max()
-        )
-
-    with_origin = off()
-    monkeypatch.setattr(Origins, "beyond", lambda self, values: False)
-    assert with_origin < 1e-10
-    assert off() > 10 * with_origin
+    compiled = CompiledObserver.build(export_c(observer, tmp_path / "c", "drive"))
+    assert apart(compiled.run(y[:, 0], u[:, 0])[0][:-1], np.asarray(exact[1:, 0], dtype=float)) < 1e-10
 
 
 @needs_compiler
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_machine_that_turns_on_and_on(kind, tmp_path, monkeypatch):
-    """Batches, sample by sample, without a compiler and in C, with samples that are lost."""
+def test_a_machine_that_turns_on_and_on(kind, tmp_path):
+    """Batches, sample by sample and in C, with samples that are lost."""
     observer = KINDS[kind]()
     y, u = far_away(900, 1500, on=100)
     u[700:720], y[900, 1], y[1200:1250] = np.nan, np.nan, np.nan
     batch = run_observer(observer, y, u)[..., : len(observer.recorded)]
-    monkeypatch.setattr(step, "library", lambda: None)
-    np.testing.assert_allclose(
-        run_observer(observer, y[:800], u[:800])[..., : batch.shape[2]], batch[:800], rtol=0, atol=1e-8
-    )
     builds = {p: CompiledObserver.build(export_c(observer, tmp_path / p, "drive", p)) for p in ("double", "float")}
     for machine in range(2):
         one, _ = in_python(observer, y[:, machine], u[:, machine])
@@ -113,14 +101,6 @@ def test_a_machine_that_turns_on_and_on(kind, tmp_path, monkeypatch):
             assert apart(compiled.run(y[:, machine], u[:, machine])[0], one) < (1e-9 if precision == "double" else 1e-4)
 
 
-def test_nothing_moves_within_reach():
-    observer = unbound(drive())
-    origins = Origins(observer, 2)
-    origins.put(np.array([60.0, -60.0]))
-    assert origins.at is None
-    origins.put(np.array([6000.0, np.nan]))
-    assert abs(origins.at[0] - 6000) < np.pi / 100
-    assert origins.at[1] == 0
+def test_what_has_no_direction_has_no_origin():
     assert find_shift(unbound(drive(("position**2",)))) is None
-    assert Origins(unbound(drive(("position**2",))), 1).beyond(np.array([6000.0])) is False
     assert find_shift(unbound(drive(), runtime=Runtime(delay=3))) is not None

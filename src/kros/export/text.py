@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from ..core.errors import ConfigError
 
@@ -61,3 +62,11 @@ def require_identifier(name: str, what: str = "name") -> str:
             f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
         )
     return name
+
+
+def rendered(package: str, files: Mapping[str, str], context: Mapping[str, Any]) -> dict[str, str]:
+    """Return the text of every file, by its name and that of its template in a package."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
+    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in files.items()}

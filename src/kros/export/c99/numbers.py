@@ -15,7 +15,7 @@ from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
 from ...observer.runtime import bounds
-from ...observer.screen import LONGEST, Bounds, Screen
+from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
@@ -81,13 +81,25 @@ class Source:
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
-        o, lifting, run = self.observer, self.observer.lifting, self.observer.runtime
-        n, q, m, K = lifting.n_states, len(o.measured), len(o.inputs), o.controller
-        functions, widened = lifting.n_lifted - n, o.B.shape[1]
-        screen = Screen.of(o)
-        limited = run.correction is not None or bool(run.relift and run.limits().keys() & {"lower", "upper"})
-        x_names, y_names = (*o.recorded,), [lifting.states[i] for i in o.measured]
-        factors = self.factors()
+        parts = (self.names(), self.sizes(), self.linear(), self.limits(), self.origin())
+        context = {key: value for part in parts for key, value in part.items()}
+        formulas, write = self.observer.lifting.formulas, Precision().literal
+        return context | {
+            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
+            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas],
+            "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
+            "monitor": self.monitor(),
+            "guard": self.guard(),
+            "bank": self.bank(),
+            "tracked": self.tracked(),
+            "load": self.load_torque(),
+            "sample_period_s": write(self.observer.sample_period_s),
+        }
+
+    def names(self) -> dict[str, Any]:
+        """Return names and units of measure."""
+        o, factors = self.observer, self.factors()
+        measured = [o.lifting.states[i] for i in o.measured]
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -97,67 +109,111 @@ class Source:
             "zero": self.precision.literal(0.0),
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
-            "measured": plain_names(lifting.states[i] for i in o.measured),
+            "measured": plain_names(measured),
             "inputs": plain_names(o.inputs),
-            "parameters": lifting.parameters,
+            "parameters": o.lifting.parameters,
             "signals": self.signals(),
-            "x_factor": self.literals([1 / factors[s] for s in x_names]),
-            "y_factor": self.literals([factors[s] for s in y_names]),
+            "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
+            "y_factor": self.literals([factors[s] for s in measured]),
             "u_factor": self.literals([factors[s] for s in o.inputs]),
+        }
+
+    def sizes(self) -> dict[str, Any]:
+        """Return numbers of states, channels and samples."""
+        o, lifting, window = self.observer, self.observer.lifting, self.observer.lifting.window
+        return {
             "at": o.measured,
-            "n": n,
+            "n": lifting.n_states,
             "recorded": len(o.recorded),
-            "q": q,
-            "m": m,
-            "functions": functions,
-            "widened": widened,
-            "order": K.n_states,
-            "delay": run.delay,
+            "q": len(o.measured),
+            "m": len(o.inputs),
+            "functions": lifting.n_lifted - lifting.n_states,
+            "widened": o.B.shape[1],
+            "order": o.controller.n_states,
+            "delay": o.runtime.delay,
             "longest": LONGEST,
-            "limited": limited,
-            "clips_estimate": run.lower is not None or run.upper is not None,
-            "relifts": run.relift,
-            "clips_correction": run.correction is not None,
             "width": o.into.shape[1],
-            "history": len(lifting.window.earlier),
-            "window_shift": [int(i) for i in lifting.window.shift] if lifting.history else [],
-            "window_present": [int(i) for i in lifting.window.present] if lifting.history else [],
+            "history": len(window.earlier),
+            "window_shift": [int(i) for i in window.shift] if lifting.history else [],
+            "window_present": [int(i) for i in window.present] if lifting.history else [],
+        }
+
+    def linear(self) -> dict[str, Any]:
+        """Return the model and the correction, zeros left out."""
+        o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
+        limited, write = self.limited, self.precision.literal
+        found = {
             "model": self.sums(self.realised.model),
-            "less": [
-                (j, i, None if factor == 1 else self.precision.literal(factor)) for j, i, factor in self.realised.less
-            ],
             "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
             "into": self.sums(o.into[:n]) if limited else [],
             "controller": self.sums(np.hstack([K.A, K.B])),
+        }
+        return found | {
+            "operations": sum(len(row) for rows in found.values() for row in rows),
+            "less": [(j, i, None if factor == 1 else write(factor)) for j, i, factor in self.realised.less],
             "filter_gain": self.sums(o.filter_gain),
-            "monitor": self.monitor(),
-            "guard": self.guard(),
+        }
+
+    @property
+    def limited(self) -> bool:
+        """Whether a step meets limits."""
+        run = self.observer.runtime
+        return run.correction is not None or bool(run.relift and run.limits().keys() & {"lower", "upper"})
+
+    def limits(self) -> dict[str, Any]:
+        """Return limits and default parameters."""
+        o, run, n, screen = (
+            self.observer,
+            self.observer.runtime,
+            self.observer.lifting.n_states,
+            Screen.of(self.observer),
+        )
+        largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
+        return {
+            "limited": self.limited,
+            "clips_estimate": run.lower is not None or run.upper is not None,
+            "relifts": run.relift,
+            "clips_correction": run.correction is not None,
             "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
             "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
             "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
+            "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": self.bounds(screen.measured),
             "u_bounds": self.bounds(screen.inputs),
-            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in lifting.parameters])),
-            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
-            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
-            "bank": self.bank(),
-            "tracked": self.tracked(),
-            "load": self.load_torque(),
-            "shift": self.shift,
-            "shift_states": None if self.shift is None else self.wide(self.shift.states),
-            "shift_whole": None if self.shift is None else self.wide(self.shift.whole),
-            "shift_rest": None if self.shift is None else self.wide(self.shift.rest),
-            "relative_inputs": self.relative_inputs(),
-            "shift_others": []
-            if self.shift is None
-            else [i for i in range(len(o.recorded)) if i != o.measured[0] and self.shift.states[i] != 0],
-            "far": None
-            if self.shift is None
-            else self.precision.literal((FAR_SINGLE if self.precision.type == "float" else FAR) * self.shift.period),
-            "period": None if self.shift is None else Precision().literal(self.shift.period),
-            "recorded_period": None if self.shift is None else abs(self.shift.period / factors[y_names[0]]),
-            "sample_period_s": Precision().literal(o.sample_period_s),
+            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
+
+    @property
+    def measured(self) -> list[str]:
+        """Names of the measured states."""
+        return [self.observer.lifting.states[i] for i in self.observer.measured]
+
+    def origin(self) -> dict[str, Any]:
+        """Return how the origin moves; nothing where it cannot."""
+        keys = ("shift_states", "shift_whole", "shift_rest", "far", "period", "recorded_period")
+        shift, o, write = self.shift, self.observer, Precision().literal
+        if shift is None:
+            return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
+        far = (FAR_SINGLE if self.precision.type == "float" else FAR) * shift.period
+        return {
+            "shift": shift,
+            "shift_states": self.wide(shift.states),
+            "shift_whole": self.wide(shift.whole),
+            "shift_rest": self.wide(shift.rest),
+            "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
+            "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
+            "far": self.precision.literal(far),
+            "period": write(shift.period),
+            "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
+        }
+
+    def relative_input(self, j: int) -> str:
+        """Return an input relative to the origin: an exact difference first, and nothing that is zero."""
+        assert self.shift is not None
+        whole, text = float(self.shift.whole[j]), f"s->held[{j}]"
+        if whole != 0:
+            text += " - s->origin" if whole == 1 else f" - ({Precision().literal(whole)} * s->origin)"
+        return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
 
     def factors(self) -> dict[str, float]:
         """Return by what the recordings of channels are multiplied, by name; a load torque is in the unit of its current."""
@@ -178,18 +234,6 @@ class Source:
     def literals(self, factors: Sequence[float]) -> list[str]:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
-
-    def relative_inputs(self) -> list[str]:
-        """Return the inputs relative to the origin: an exact difference first, and nothing that is zero, which a processor without doubles pays for."""
-        if self.shift is None:
-            return []
-        found = []
-        for j, (whole, rest) in enumerate(zip(self.shift.whole, self.shift.rest, strict=True)):
-            text = f"s->held[{j}]"
-            if whole != 0:
-                text = f"{text} - {'s->origin' if whole == 1 else f'({Precision().literal(float(whole))} * s->origin)'}"
-            found.append(text if rest == 0 else f"({text}) - s->moved_u[{j}]")
-        return found
 
     def tracked(self) -> dict[str, Any] | None:
         """Return what a phase-locked loop consists of: the observer's linear part, and slopes of lifted functions by states and parameter."""
@@ -339,17 +383,15 @@ class Source:
 
     def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
         """Return the bounds of every channel in double precision, and in single precision between which a sample is good as it is."""
-        rows, most = zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True), float(np.finfo(float).max)
-        found = []
-        for row in rows:
+        most, single = float(np.finfo(float).max), float(np.finfo(np.float32).max)
+        rows = []
+        for row in zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True):
             lower, upper, least, furthest = (float(np.clip(v, -most, most)) for v in row)
             wide = {"lower": lower, "upper": upper, "least": least, "most": furthest}
-            inner = np.clip([max(lower, least), min(upper, furthest)], *(np.finfo(np.float32).max * np.array([-1, 1])))
+            inner = {"low": max(lower, least, -single), "high": min(upper, furthest, single)}
             texts = {name: Precision().literal(v) for name, v in wide.items()}
-            found.append(
-                texts | {name: Precision("float").literal(v) for name, v in zip(("low", "high"), inner, strict=True)}
-            )
-        return found
+            rows.append(texts | {name: Precision("float").literal(v) for name, v in inner.items()})
+        return rows
 
 
 def _uncorrected(observer: Observer) -> Array:

@@ -62,9 +62,7 @@ def export_run(
         limit = np.inf if config.load.limit is None else config.load.limit
         level = AngleLoad(config.load.level_s, chosen.sample_period_s, limit=limit)
         load = LoadOutput(level, current=config.load.current) if observer in loads else None
-        return export_c(
-            chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen), on_board=True
-        )
+        return export_c(chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen))
 
 
 def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut | None:

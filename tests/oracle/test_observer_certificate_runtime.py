@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from adversary import attack, attack_running
 from batches import batch_of
+from frozen import compared, frozen_response
 
 from kros.core.lti import StateSpace, gain
 from kros.evaluate.sensor import as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, Runtime, Sensor, relift_certificate, run_observer
 from kros.observer.certificate.error import error_system, state_sizes
-from kros.observer.certificate.report import frozen_response, relift_report
 from kros.synthesis import Injection
 
 DT = 0.01
@@ -57,10 +57,10 @@ def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(
 ) -> None:
     """Start, chain of predictions and correction filter: the equations are the code, to rounding."""
     late_one = observer(functions, delay=delay, upper=np.array([np.inf, 9.0, np.inf]) if delay == 1 else None)
-    found = relift_certificate(late_one, mismatch=False)
+    found = relift_certificate(late_one)
     x, u = recordings(late_one)
     estimates = run_observer(late_one, late(x, delay), u)
-    rows = relift_report(found, late_one, batch_of(x, u, DT), estimates)
+    rows = compared(found, late_one, batch_of(x, u, DT), estimates)
     assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
     assert all(row.holds for row in rows)
 
@@ -68,14 +68,14 @@ def test_without_slopes_the_frozen_response_is_the_error_of_a_late_observer(
 @pytest.mark.parametrize("delay", [0, 2])
 def test_what_a_sensor_shows_beside_the_states_drives_the_frozen_response(delay: int) -> None:
     noisy = observer(delay=delay)
-    found = relift_certificate(noisy, mismatch=False)
+    found = relift_certificate(noisy)
     x, u = recordings(noisy)
     sensor = {"a": Sensor(noise=5.0, bias=2.0, resolution=0.1, delay_samples=delay)}
     batch = as_shown(batch_of(x, u, DT), sensor, ("a", "b", "c"))
-    rows = relift_report(found, noisy, batch)
+    rows = compared(found, noisy, batch)
     assert [row.frozen for row in rows] == pytest.approx([row.error for row in rows], rel=1e-9)
     assert all(row.holds for row in rows)
-    without = relift_report(found, noisy, batch_of(x, u, DT), run_observer(noisy, batch.measurements((0,)), u))
+    without = compared(found, noisy, batch_of(x, u, DT), run_observer(noisy, batch.measurements((0,)), u))
     assert not all(row.frozen == pytest.approx(row.error, rel=1e-3) for row in without)
 
 
@@ -125,7 +125,7 @@ def test_a_frozen_response_starts_at_the_first_error() -> None:
         xi = xi @ system.A.T + w[k] @ system.B[:, :3].T
         expected.append(xi @ system.C.T)
     for one in (system, replace(system, start=None)):
-        np.testing.assert_allclose(frozen_response(one, w, first)[0], expected, rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(frozen_response(one, w, first), expected, rtol=1e-12, atol=1e-14)
 
 
 RUNTIMES = {
@@ -150,7 +150,7 @@ def test_bounds_hold_for_the_observer_as_it_runs(what: str) -> None:
     assert found.certified, found.reason
     x, u = recordings(o)
     estimates = run_observer(o, late(x, o.runtime.delay), u)
-    rows = relift_report(found, o, batch_of(x, u, DT), estimates)
+    rows = compared(found, o, batch_of(x, u, DT), estimates)
     assert all(row.holds for row in rows)
     free = run_observer(replace(o, runtime=Runtime(delay=o.runtime.delay)), late(x, o.runtime.delay), u)
     assert (what == "delay") == np.array_equal(free, estimates)

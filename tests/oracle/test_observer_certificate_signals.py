@@ -129,7 +129,7 @@ def test_bounds_hold_for_every_unit_and_are_close(case: str, noise: float) -> No
     y = x[np.maximum(np.arange(N) - delay, 0)] + noise * np.random.default_rng(1).standard_normal(x.shape)
     batch = batch_of(x, u, DT, units=["1", "1", "2", "2", "3", "3"])
     batch = replace(batch, shown=y) if noise or delay else batch
-    found = signal_bound(relift_certificate(o, mismatch=False), o, batch)
+    found = signal_bound(relift_certificate(o), o, batch)
     assert found.certified, found.reason
     assert found.errors.shape == (3, 3)
     assert ((found.ratios >= 1) & (found.ratios <= close)).all()
@@ -141,7 +141,7 @@ def test_bounds_hold_for_every_unit_and_are_close(case: str, noise: float) -> No
 def test_bounds_hold_for_other_signals_of_the_same_energies(case: str) -> None:
     """All-pass filters change the course of a residual and none of its energies; a machine is driven by what comes out, for longer."""
     o, (x, u) = observer(CASES[case][0]), recordings()
-    found = signal_bound(relift_certificate(o, mismatch=False), o, batch_of(x, u, DT, units=[str(i) for i in range(6)]))
+    found = signal_bound(relift_certificate(o), o, batch_of(x, u, DT, units=[str(i) for i in range(6)]))
     estimates = run_observer(o, x[..., :1], u)
     lift, A, B = o.lifting, o.A[:3], o.B[:3]
     omega = x[1:] - lift.lift(x[:-1]) @ A.T - u[:-1] @ B.T

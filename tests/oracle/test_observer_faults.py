@@ -329,7 +329,7 @@ def test_certificates_say_what_they_assume_of_a_delay_and_limits(what):
     plain = relift_certificate(observer())
     assert "every measurement arrives" in plain.assumptions
     assert "no measurement and no input is refused as implausible" in plain.assumptions
-    found = relift_certificate(observer(runtime=DECLARED[what]), mismatch=False)
+    found = relift_certificate(observer(runtime=DECLARED[what]))
     assert found.certified
     assert any(what in text for text in found.assumptions)
     assert not any(what in text for text in plain.assumptions)

@@ -16,7 +16,6 @@ from kros.design.certificates import Running, certify
 from kros.design.synthesize import choose_deployed, robust_of
 from kros.lifting import Lifting
 from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, signal_bound
-from kros.observer.certificate.report import relift_report
 from kros.synthesis import Injection
 
 
@@ -68,12 +67,6 @@ def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
     assert "any value of phase" in found.assumptions
 
 
-def test_an_observer_without_certificate_has_no_report() -> None:
-    square = observer("square", "x**2", 0.1)
-    with pytest.raises(DimensionError, match="certify it first"):
-        relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
-
-
 def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:
     residual = np.array([[[3.0, 0.1], [-4.0, 0.1]], [[0.0, -0.1], [0.0, 0.1]]])  # unit, sample, state
     found = ReliftScales.typical([2.0, 5.0], residual, [0.3, 0.4, 0.5])
@@ -96,11 +89,11 @@ def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -
     assert certificate.certified
     assert not refused.certified
     running = [
-        Running("koopman/open_loop", certificate, [], 3.0, 5.0),
-        Running("koopman/kalman_tuned", certificate, [], 2.0, 5.0),
-        Running("koopman/residual_h2", certificate, [], 1.0, float("inf")),
-        Running("linear/residual_h2", certificate, [], float("inf"), 5.0),
-        Running("koopman/worst_case_h2", refused, [], 0.5, 5.0),
+        Running("koopman/open_loop", certificate, 3.0, 5.0),
+        Running("koopman/kalman_tuned", certificate, 2.0, 5.0),
+        Running("koopman/residual_h2", certificate, 1.0, float("inf")),
+        Running("linear/residual_h2", certificate, float("inf"), 5.0),
+        Running("koopman/worst_case_h2", refused, 0.5, 5.0),
     ]
     made = [r.name for r in running]
     assert choose_deployed(None, made, running) == "koopman/kalman_tuned"

@@ -25,7 +25,6 @@ from ..observer import (
     run_observers,
     signal_bound,
 )
-from ..observer.certificate.report import ReliftRow, course, relift_report
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.residual.one_step import one_step_residual
 from ..observer.units import factors
@@ -53,7 +52,6 @@ class Running:
 
     name: str
     certificate: ReliftCertificate
-    rows: list[ReliftRow]
     hidden_percent: float
     dropout_percent: float
     signals: SignalBound | None = None
@@ -78,10 +76,7 @@ class Running:
             facts |= self.signals.facts(self.measured)
         if not found.certified:
             return facts | {"relift_reason": found.reason}
-        return facts | {
-            "relift_mismatch_gain": found.mismatch_gain,
-            "relift_bound_worst": max((r.bound for r in self.rows), default=None),
-        }
+        return facts
 
 
 def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
@@ -145,15 +140,13 @@ def running_of(
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
     dropout = dropout_error_percent(observers, data)
     known: dict[bytes, BandEnergies] = {}
-    rows, bounds = [], []
+    bounds = []
     for o, c, x in zip(observers, certificates, arrived, strict=True):
-        seen = course(o, batch, x)
-        rows.append(relift_report(c, o, batch, x, seen) if c.certified else [])
-        bounds.append(signal_bound(c, o, batch, x, known, seen))
+        bounds.append(signal_bound(c, o, batch, x, known))
     bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
     certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    found = zip(observers, certificates, rows, hidden, dropout, bounds, guards, strict=True)
-    return [Running(o.name, c, r, float(h), float(d), b, o.measured, g) for o, c, r, h, d, b, g in found]
+    found = zip(observers, certificates, hidden, dropout, bounds, guards, strict=True)
+    return [Running(o.name, c, float(h), float(d), b, o.measured, g) for o, c, h, d, b, g in found]
 
 
 def running_filters(
@@ -179,7 +172,7 @@ def running_filters(
     by = factors(observer, {})[0]
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
     certificate = replace(certificate, scales=scales)
-    return Running(observer.name, certificate, [], hidden, dropout, bound.in_sizes(by[:n]), measured)
+    return Running(observer.name, certificate, hidden, dropout, bound.in_sizes(by[:n]), measured)
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
@@ -222,10 +215,9 @@ def certify(observer: Observer, scales: ReliftScales, task: DesignTask) -> Relif
 
 
 def save_running(folder: Path, found: Sequence[Running]) -> None:
-    """Write certificates and rows below the folder of the observers."""
-    rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
-    notes = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
-    signals = {r.name: r.signals.as_dict() for r in found if r.signals is not None}
-    save_artifact(folder, "relift", {"rows": rows, "certificates": notes, "signals": signals})
+    """Write certificates and bounds below the folder of the observers."""
+    notes = {r.name: {"assumptions": r.certificate.assumptions} for r in found}
+    signals = {r.name: r.signals for r in found if r.signals is not None}
+    save_artifact(folder, "relift", {"certificates": notes, "signals": signals})
     for running in found:
         running.certificate.save(folder / "relift" / running.name)

@@ -14,10 +14,9 @@ Examples
 from ..core.removed import refusing
 from .baselines.difference import FilteredDifference
 from .baselines.extended_kalman import ExtendedKalman
-from .certificate.certificate import ReliftCertificate, relift_certificate
+from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.signals import SignalBound, signal_bound
-from .certificate.status import ReliftStatus
 from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings

@@ -184,25 +184,20 @@ class Runtime:
                 )
 
     def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it: nothing that is as by default, null for what is infinite."""
+        """Return what an observer's file holds of it: nothing that is as by default."""
         content: dict[str, Any] = {"delay": int(self.delay)} if self.delay else {}
         content |= {} if self.relift else {"relift": False}
-        return content | {name: _nulls(limit) for name, limit in self.limits().items()}
+        return content | self.limits()
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
-        """Read what `content` returned."""
+        """Read what `content` returned; null stands for what is infinite."""
         values = dict(content)
         for name in _ARRAYS:
             if values.get(name) is not None:
                 none = -np.inf if name.endswith("lower") else np.inf
                 values[name] = np.array([none if limit is None else limit for limit in values[name]], dtype=float)
         return cls(**values)
-
-
-def _nulls(limit: Array) -> list[float | None]:
-    """JSON has no infinity: null stands for it."""
-    return [float(value) if np.isfinite(value) else None for value in limit]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,9 @@ With a Lyapunov matrix ``P = R' R`` the gain gamma is proven when
 for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers stand in for corners: then p is
 an input and q an output.)
 
-In the coordinates in which ``P = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
-is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by a Cholesky factorisation in floating
-point of what is left without all that rounding can do; where that is not enough, by elimination of integers.
+The decision is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by
+a Cholesky factorisation in floating point of what is left without all that rounding can do; where that is not enough,
+by elimination of integers.
 
 References
 ----------
@@ -31,17 +31,6 @@ Integers = npt.NDArray[Any]
 Corners = Sequence[tuple[Array, Array]]
 _BITS = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted
 _ROUNDING = 8.0  # times what a factorisation may be off, with a factor of five to spare
-
-
-def margin(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
-    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where ``P = R'R`` is the identity."""
-    worst = 0.0
-    for A, B in corners:
-        top = root @ np.hstack([_right_divide(A, root), B / gain])
-        direct = np.zeros((len(C), B.shape[1])) if D is None else D / gain
-        bottom = np.hstack([_right_divide(C, root), direct])
-        worst = max(worst, float(np.linalg.norm(np.vstack([top, bottom]), 2)))
-    return 1 - worst**2
 
 
 def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
@@ -126,9 +115,3 @@ def _eliminated(M: Integers) -> bool:
         M[k + 1 :, k + 1 :] = (M[k, k] * M[k + 1 :, k + 1 :] - np.outer(M[k + 1 :, k], M[k, k + 1 :])) // pivot
         pivot = M[k, k]
     return True
-
-
-def _right_divide(matrix: Array, R: Array) -> Array:
-    from scipy.linalg import solve_triangular
-
-    return np.asarray(solve_triangular(R, matrix.T, trans="T").T)

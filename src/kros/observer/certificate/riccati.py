@@ -28,10 +28,6 @@ from .multipliers import best_multipliers
 
 Array = npt.NDArray[np.float64]
 _GRID = 200
-_LOG_RANGE = (
-    -5.0,
-    20.0,
-)  # of what is above the least multiplier; closer to it, a peak between frequencies of the grid would break the proof
 _NOTHING = 1e-12
 _STEPS = (1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0)
 _SPARE = 0.25  # share of the distance to one that the extra output may take
@@ -43,12 +39,11 @@ _DOUBLINGS = 60
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A gain, not proven yet, with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers where there are any, shape (n_p,)."""
+    """A gain, not proven yet, with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers, shape (n_p,)."""
 
     gain: float
     root: Array
-    how: str
-    multipliers: Array | None = None
+    multipliers: Array
 
 
 def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
@@ -58,18 +53,13 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
     multipliers, least = frequency_bound(system)
     if not np.isfinite(least):
         return
-    how = (
-        "Riccati equation with a multiplier for every slope"
-        if len(multipliers)
-        else "Riccati equation of the bounded-real lemma"
-    )
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
     least = max(least, _NOTHING * size, np.finfo(float).tiny)  # where nothing arrives, any small gain will do
     for factor in _STEPS:
         # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
-            yield Proposal(least * factor, R, how, multipliers * factor)
+            yield Proposal(least * factor, R, multipliers * factor)
 
 
 def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
@@ -78,8 +68,6 @@ def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
     if not width or not np.any(system.C) or not np.any(np.hstack([system.B.ravel(), system.D.ravel()])):
         return np.ones(width), hinf_norm(_plain(system))
     H = _responses(system)
-    if width == 1:
-        return _single(H)
     found = best_multipliers(H, width)
     return (np.ones(width), np.inf) if found is None else (found, float(np.sqrt(_level(H, found))))
 
@@ -166,22 +154,3 @@ def _level(H: Array, multipliers: Array) -> float:
         return np.inf
     schur = F[:, width:, width:] + F[:, width:, :width] @ np.linalg.solve(rest, F[:, :width, width:])
     return float(np.linalg.eigvalsh(schur)[:, -1].max())
-
-
-def _single(H: Array) -> tuple[Array, float]:
-    """One slope: the best multiplier by a search over its logarithm above the least that is possible."""
-    from scipy.optimize import minimize_scalar
-
-    small = 1 - np.abs(H[:, 0, 0]) ** 2
-    if small.min() <= 0:
-        return np.ones(1), np.inf
-    lowest = float(np.max(np.sum(np.abs(H[:, 1:, 0]) ** 2, axis=1) / small))
-    if lowest == 0.0:  # the slope does not reach the output
-        return np.ones(1), float(np.linalg.norm(H[:, 1:, 1:], 2, axis=(1, 2)).max())
-    found = minimize_scalar(
-        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])),
-        bounds=_LOG_RANGE,
-        method="bounded",
-        options={"xatol": 1e-2},
-    )
-    return np.array([lowest * (1 + np.exp(found.x))]), float(np.sqrt(found.fun))

@@ -25,10 +25,10 @@ from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
 from ..data import ObserverData
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
+from .course import Course, course
 from .error import ErrorSystem, error_system
 from .majorants import energy, majorants
-from .report import Course, course
-from .search import quick_gain
+from .search import proven_gain
 
 Array = npt.NDArray[np.float64]
 _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
@@ -131,18 +131,6 @@ class SignalBound:
         return replace(
             self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")}
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for a record; what is infinite is None."""
-        arrays = {name: _finite(getattr(self, name)) for name in ("cover", "bounds", "errors", "movement", "sizes")}
-        return {
-            "states": self.states,
-            "units": self.units,
-            **arrays,
-            "reason": self.reason,
-            "outside": self.outside,
-            "within_limits": self.within,
-        }
 
 
 def signal_bound(
@@ -273,7 +261,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
         for others in _OTHERS:
             weight = np.full((len(rest.C), 1), others)
             weight[j] = 1.0
-            found[j] = quick_gain(replace(rest, C=weight * rest.C))
+            found[j] = proven_gain(replace(rest, C=weight * rest.C))
             if np.isfinite(found[j]):
                 break
     return found * top
@@ -321,9 +309,3 @@ def _energies(signal: Array, batch: EpisodeBatch, known: dict[bytes, BandEnergie
     if known is not None:
         known[key] = found
     return found
-
-
-def _finite(values: Array) -> Any:
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return plain.tolist()

@@ -13,7 +13,7 @@ from ..loops import library
 Array = npt.NDArray[np.float64]
 START = 50  # samples in which an observer finds out what it does not know at first
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
-_TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache, five times as fast as all at once
+_TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache
 _TURNED = 256  # samples of all signals that are put in order at once: they stay in the cache
 
 
@@ -99,7 +99,7 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
 def _of_squares(
     squares: Array, spectra: Array, largest: Array, lengths: npt.NDArray[np.int64], dt: float
 ) -> ErrorSummary:
-    """The summary of sums of squares of the start and the whole, shape (2, batch, n), and largest values, shape (batch, n)."""
+    """The summary of sums of squares of start and whole, (2, batch, n), and largest values, (batch, n)."""
     first, whole = squares
     rest = np.maximum(whole - first, 0.0)
     counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
@@ -140,7 +140,7 @@ def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> 
 
 
 def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero; arguments as in `summarise`.
+    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero.
 
     Examples
     --------
@@ -167,7 +167,7 @@ def _percent(rms: Array, largest: Array) -> Array:
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
-    """Return Welch's estimate of the error's power spectral density: Hann windows, half overlapping, each without its mean.
+    """Return Welch's estimate of the error's power spectral density: half overlapping Hann windows.
 
     Parameters
     ----------

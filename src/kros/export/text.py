@@ -1,4 +1,4 @@
-"""Names from recordings and files as they stand in what is generated: comments of C, CMake, Markdown and XML, and identifiers of C."""
+"""Names from recordings as they stand in generated text: comments, Markdown, XML, identifiers of C."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _C_WORDS = re.compile(
 def plain(text: object) -> str:
     """Return a text of which nothing is more than text in C, CMake, Markdown and XML.
 
-    Letters, digits, blanks and ``_-.,:;+()[]%/^=@°·²³`` stay, ``*`` becomes ``·``, anything else ``_``: so no comment ends, no line is continued, no
-    trigraph, quote, tag or change of the writing direction is left.
+    Letters, digits, blanks and ``_-.,:;+()[]%/^=@°·²³`` stay, ``*`` becomes ``·``, anything else ``_``: so no comment
+    ends, no line is continued, no trigraph, quote, tag or change of the writing direction is left.
 
     Examples
     --------
@@ -44,7 +44,8 @@ def plain_names(names: Iterable[str]) -> list[str]:
     shown = [plain(name) for name in names]
     if len(set(shown)) < len(names):
         raise ConfigError(
-            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels by letters and digits."
+            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels "
+            "by letters and digits."
         )
     return shown
 
@@ -59,7 +60,8 @@ def require_identifier(name: str, what: str = "name") -> str:
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name, flags=re.ASCII) or _C_WORDS.fullmatch(name):
         raise ConfigError(
-            f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
+            f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that "
+            "begins with a letter, and no word of C."
         )
     return name
 

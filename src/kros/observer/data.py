@@ -7,9 +7,10 @@
            K: x^c+ = A^c x^c + B^c nu  ◄── nu = y - y_hat ──(+)◄── y
               y^c  = C^c x^c + D^c nu
 
-The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer is a
-one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier estimates and inputs too;
-before the start these are taken to equal the first ones. Where it has input functions, u stands for the lifted inputs.
+The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer
+is a one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier
+estimates and inputs too; before the start these are taken to equal the first ones. Where it has input functions, u
+stands for the lifted inputs.
 """
 
 from __future__ import annotations
@@ -59,17 +60,20 @@ class ObserverData:
     runtime : Runtime
         Delay of the measurement, limits, and the gain of filtered estimates.
     seen : Seen, optional
-        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none by default.
+        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none
+        by default.
     sensor : mapping of str to Sensor
         What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
     monitor : Monitor, optional
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
     bank : FilterBank, optional
-        Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the correction is zero.
+        Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the
+        correction is zero.
     guard : Guard, optional
         Bounds of its states beyond which it starts again; by default it does so where one is not finite.
     about : mapping of str to JSON values
-        What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
+        What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes
+        with it.
 
     Raises
     ------
@@ -101,14 +105,16 @@ class ObserverData:
         object.__setattr__(self, "injection", member(Injection, self.injection, f"Observer {self.name}: the injection"))
         if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
             raise DimensionError(
-                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "
+                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and "
+                f"{len(self.lifting.input_functions)} functions of them need as many "
                 f"columns of B, found {self.B.shape[1]}."
             )
         width = self.B.shape[1] if self.injection is Injection.INPUT else self.A.shape[0]
         K, n = self.controller, self.lifting.n_states
         if (K.n_inputs, K.n_outputs) != (len(self.measured), width):
             raise DimensionError(
-                f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
+                f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} "
+                f"corrections ({self.injection.value} injection), "
                 f"found {K.n_inputs} to {K.n_outputs}."
             )
         self.runtime.require_fit(self.name, n, width, len(self.inputs))
@@ -117,12 +123,14 @@ class ObserverData:
             len(self.inputs),
         ):
             raise DimensionError(
-                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
+                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many "
+                "sizes seen in training, found "
                 f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
             )
         if self.monitor is not None and len(self.monitor.size) != len(self.measured):
             raise DimensionError(
-                f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of {len(self.monitor.size)}."
+                f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of "
+                f"{len(self.monitor.size)}."
             )
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.bank is not None:
@@ -141,7 +149,8 @@ class ObserverData:
         states, own = ", ".join(self.recorded), f" + {self.internal} internal" if self.internal else ""
         functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
         y = ", ".join(self.lifting.states[i] for i in self.measured)
-        return f"<Observer {self.name}: {states}{own}{functions} from {y}; correction of order {self.controller.n_states}, {self.sample_period_s:g} s>"
+        correction = f"correction of order {self.controller.n_states}, {self.sample_period_s:g} s"
+        return f"<Observer {self.name}: {states}{own}{functions} from {y}; {correction}>"
 
     @property
     def internal(self) -> int:
@@ -155,11 +164,12 @@ class ObserverData:
 
     @property
     def filter_gain(self) -> Array:
-        """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
+        """Gain of the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
 
         It follows from the correction: the direct correction of the next estimate is that of this one, carried
-        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
-        states of the correction and slopes of lifted functions are left out. A filter bank takes the measurement.
+        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is
+        its filter, exactly; states of the correction and slopes of lifted functions are left out. A filter bank takes
+        the measurement.
         """
         n = self.lifting.n_states
         if self.bank is not None:
@@ -183,7 +193,7 @@ class ObserverData:
     def initial(
         self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
     ) -> Array:
-        """Return the first estimate, (..., n): the first measurement, other states zero or as the filter bank starts, within limits."""
+        """Return the first estimate, (..., n): measurements, and others zero or as a bank starts, within limits."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
@@ -202,7 +212,7 @@ class ObserverData:
     def values(
         self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
     ) -> dict[str, Any]:
-        """Return the lifting's parameters: those that are given, the observer's own for the others; each broadcasts to `shape` where that is given.
+        """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`.
 
         Raises
         ------
@@ -222,7 +232,8 @@ class ObserverData:
         for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
             if names:
                 raise ConfigError(
-                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting has "
+                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its "
+                    "lifting has "
                     f"{', '.join(known) or 'no parameters'}."
                 )
         for name in known if shape is not None else ():

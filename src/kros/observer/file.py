@@ -169,7 +169,8 @@ def read_observer(path: Path) -> ObserverData:
     content = read_json(path)
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") != SCHEMA:
         raise DataError(
-            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this version of kros."
+            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this "
+            "version of kros."
         )
     if not check_checksum(content, path):
         log.warning("The observer of %s carries no checksum: it was edited.", path)

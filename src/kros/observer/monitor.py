@@ -1,17 +1,19 @@
 r"""The monitor: whether a machine still moves as the population does, by the level of the innovation over octaves.
 
-The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and the mean square of each band is
-remembered, :math:`p \leftarrow p + g\,(b^2 - p)`, with a gain :math:`g \leftarrow \max(g / (1 + g), g_\infty)`: it is the mean of all samples so far, and
-an exponential one from :math:`1/g_\infty` samples on. The machine is outside the population's envelope while
+The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and
+the mean square of each band is remembered, :math:`p \leftarrow p + g\,(b^2 - p)`, with a gain :math:`g \leftarrow
+\max(g / (1 + g), g_\infty)`: it is the mean of all samples so far, and an exponential one from :math:`1/g_\infty`
+samples on. The machine is outside the population's envelope while
 
 .. math:: \prod_{c,b} \max(p_{cb} / \ell_{cb},\ 0.01)^{k_{cb}} > 1,
 
-that is while a weighted mean of the bands' levels in decibels exceeds its bound. The weights are whole numbers that sum to `WEIGHT`: those of the mean
-that differs least from good machine to good machine (`design.monitor`). What differs in one band alone averages out: on simulated drives such a mean found
-badly assembled ones four times as often as a threshold for every band. A product needs no logarithm on the machine.
+that is while a weighted mean of the bands' levels in decibels exceeds its bound. The weights are whole numbers that sum
+to `WEIGHT`: those of the mean that differs least from good machine to good machine (`design.monitor`). What differs in
+one band alone averages out: on simulated drives such a mean found badly assembled ones four times as often as a
+threshold for every band. A product needs no logarithm on the machine.
 
-A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or its start: while they go by,
-all that the monitor remembers is held.
+A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or
+its start: while they go by, all that the monitor remembers is held.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class Monitor:
     false_alarm_rate : float
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
     bounds : mapping of str to float
-        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it may be told in which it is.
+        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it
+        may be told in which it is.
     units : int
         Machines that the bound was found on.
     hours : float
@@ -106,7 +109,8 @@ class Monitor:
             or not bands
         ):
             raise DataError(
-                f"Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit together, found "
+                "Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit "
+                "together, found "
                 f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
             )
         if (
@@ -117,11 +121,13 @@ class Monitor:
             or self.settle < 0
         ):
             raise DataError(
-                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle at least 0."
+                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle "
+                "at least 0."
             )
         if np.any(self.weights != np.round(self.weights)) or np.any(self.weights < 0) or self.weights.sum() != WEIGHT:
             raise DataError(
-                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found {self.weights}."
+                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found "
+                f"{self.weights}."
             )
         if not np.isfinite(list(self.bounds.values())).all():
             raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
@@ -186,7 +192,7 @@ class Monitor:
         return np.concatenate([begun, rest])
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
-        """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
+        """Return the level over the bound in dB, (...), of mean squares (..., q, bands), in a condition or any."""
         return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(
             condition
         )
@@ -209,7 +215,8 @@ class Monitor:
         """
         if condition is not None and condition not in self.bounds:
             raise ConfigError(
-                f"Monitor of an observer: the condition {condition!r} is unknown; known are {', '.join(self.bounds) or 'none'}."
+                f"Monitor of an observer: the condition {condition!r} is unknown; known are "
+                f"{', '.join(self.bounds) or 'none'}."
             )
         return 0.0 if condition is None else float(self.bounds[condition])
 
@@ -219,7 +226,7 @@ class Monitor:
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
-    """Return band-pass filters of the second order an octave apart, shape (count, 3); the highest is centred at half of the Nyquist frequency."""
+    """Return band-pass filters of order two, (count, 3), an octave apart, from half the Nyquist frequency down."""
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
     alpha = np.sin(w) / (2 * quality)
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
@@ -234,7 +241,7 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
-    """Return which samples are judged, shape (n_samples, batch), as a running observer does it; status (n_samples, batch)."""
+    """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
     judged, bad = np.zeros(status.shape, dtype=bool), status != 0
     events = bad | starts | ~moving
     for machine, own in enumerate(judged.T):

@@ -97,7 +97,7 @@ class RunningObserver:
 
     @property
     def parameters(self) -> MutableMapping[str, float]:
-        """The machine's lifting parameters; a name that the lifting does not have is refused, and a value that is not finite."""
+        """The machine's lifting parameters; an unknown name, or a value that is not finite, is refused."""
         return self._parameters
 
     @parameters.setter
@@ -107,7 +107,7 @@ class RunningObserver:
         self._steps.values = self._parameters.data
 
     def track(self, name: str, settle_s: float | None = None) -> None:
-        """Let one of the parameters follow the machine from now on; see `PhaseLockedLoop`, and `parameters` for its value.
+        """Let one of the parameters follow the machine from now on (`PhaseLockedLoop`).
 
         Raises
         ------
@@ -123,12 +123,12 @@ class RunningObserver:
 
     @property
     def level_db(self) -> float | None:
-        """Level of the innovation over the bound of the population in dB; above zero the machine is outside, None without a monitor."""
+        """Level of the innovation over its bound in dB, above zero outside; None without a monitor."""
         return None if self._watch is None else self._watch.level_db
 
     @property
     def condition(self) -> str | None:
-        """Recorded condition that the machine is in, whose bound its innovation is held against; None for that of all conditions.
+        """Recorded condition that the machine is in, by whose bound it is judged; None for any.
 
         Raises
         ------
@@ -175,7 +175,7 @@ class RunningObserver:
         return self._forward(self._steps.x)
 
     def filter(self, y: npt.ArrayLike) -> Estimate:
-        """Return the estimate of the state at k from what arrived up to k, y of shape (q,), NaN where a measurement is missing; nothing moves on."""
+        """Return the estimate for k from what arrived up to k, y (q,), NaN where missing; nothing moves on."""
         o = self.observer
         if len(self._inputs) < o.runtime.delay:
             return self.estimate
@@ -248,7 +248,8 @@ class RunningObserver:
         array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(
-                f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape ({len(names)},), "
+                f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape "
+                f"({len(names)},), "
                 f"found shape {array.shape}."
             )
         return array

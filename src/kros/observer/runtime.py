@@ -1,4 +1,4 @@
-"""Delay of measurements, limits, the guard, and the largest sizes seen in training: data of the machine that an observer runs on."""
+"""Delay, limits, guard and ranges: data of the machine that an observer runs on."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ class Runtime:
         return [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
 
     def binds(self, x: Array, y_c: Array | None) -> bool:
-        """Whether an estimate, (n,), meets a limit, or a correction, (width,), exceeds one; None where corrections have none."""
+        """Whether an estimate, (n,), meets a limit, or a correction, (width,), exceeds one."""
         low = self.lower is not None and bool(np.any(x <= self.lower))
         high = self.upper is not None and bool(np.any(x >= self.upper))
         beyond = self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction))
@@ -259,7 +259,8 @@ class Guard:
         shapes = (self.lower.shape, self.upper.shape, self.correction.shape)
         if shapes != ((n,), (n,), (order,)):
             raise DimensionError(
-                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes {shapes}."
+                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes "
+                f"{shapes}."
             )
 
 

@@ -9,13 +9,15 @@ A sample is judged by itself, before the observer sees it:
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
-The range is the largest size seen in training, or that of the declared limits; without either a sample has none. An input with declared limits has
-none either: however large a command is, the machine gets the limit. So nothing that is far from anything possible enters a state, linear or
-lifted, and what is left of a fault is what the model misses while it lasts.
+The range is the largest size seen in training, or that of the declared limits; without either a sample has none. An
+input with declared limits has none either: however large a command is, the machine gets the limit. So nothing that is
+far from anything possible enters a state, linear or lifted, and what is left of a fault is what the model misses while
+it lasts.
 
-Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest, and the observer starts
-again at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
-does to an observer that watches tracking errors grows with every sample, and a start costs no more than a start. Parameters stay.
+Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest,
+and the observer starts again at the first sample at which there are both. It does so, too, after an input was held for
+more than a few samples: what a held reference does to an observer that watches tracking errors grows with every sample,
+and a start costs no more than a start. Parameters stay.
 """
 
 from __future__ import annotations
@@ -52,11 +54,14 @@ class SampleStatus(IntFlag):
     INVALID_INPUT
         An input is not finite. The last good value stood for it.
     LIMIT
-        A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is declared.
+        A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is
+        declared.
     UNCERTIFIED
-        Outside what the observer is certified for: the innovation is beyond the envelope of the population (see `monitor`).
+        Outside what the observer is certified for: the innovation is beyond the envelope of the population (see
+        `monitor`).
     RESTARTED
-        The estimate left its bounds, as it may while samples are lost: the observer waits for a good sample to start at, or that start has not settled yet.
+        The estimate left its bounds, as it may while samples are lost: the observer waits for a good sample to start
+        at, or that start has not settled yet.
 
     Examples
     --------
@@ -115,7 +120,8 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
     """Refuse measurements and inputs that do not fit together, or to an observer."""
     if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2] or not len(y):
         raise DimensionError(
-            f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a last "
+            f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a "
+            "last "
             "axis for their channels and at least one sample."
         )
     if u.shape[2] != len(inputs):
@@ -139,7 +145,7 @@ class Bounds:
 
     @classmethod
     def of_measurements(cls, lower: Array | None, upper: Array | None, seen: Array | None, count: int) -> Bounds:
-        """Return the bounds that follow from declared limits of the states and sizes seen in training, where there are any."""
+        """Return the bounds from declared limits and sizes seen in training, where there are any."""
         low, high, size = _declared(lower, upper, seen, count)
         sides = [np.where(np.isfinite(side), np.abs(side), size) for side in (low, high)]
         far = np.minimum(BEYOND * np.maximum(*sides), _ANY)
@@ -153,7 +159,7 @@ class Bounds:
         return cls(low, high, np.where(np.isfinite(low), -_ANY, -far), np.where(np.isfinite(high), _ANY, far))
 
     def pass_all(self, values: Array) -> bool:
-        """Whether all samples, shape (..., channels), are good as they are; a comparison with what is no number is false."""
+        """Whether all samples, shape (..., channels), are good as they are."""
         low, high = np.maximum(self.lower, self.least), np.minimum(self.upper, self.most)
         channels = (values[..., i] for i in range(len(low)))
         return all(
@@ -162,7 +168,7 @@ class Bounds:
         )
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
-        """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
+        """Return samples within limits, which are plausible, and which were beyond a limit or their range."""
         plausible = (values >= self.least) & (values <= self.most)
         within = np.clip(values, self.lower, self.upper)
         return within, plausible, np.isfinite(values) & (~plausible | (within != values))
@@ -194,14 +200,14 @@ class Screen:
 
     @classmethod
     def sized(cls, seen: Seen | None, q: int, m: int, limits: Runtime | None = None, at: Sequence[int] = ()) -> Screen:
-        """Return the screen of an estimator with sizes seen in training, and limits of its states where these are declared."""
+        """Return the screen for sizes seen in training, and limits where these are declared."""
         limits, sizes = limits or Runtime(), (None, None) if seen is None else (seen.measured, seen.inputs)
         lower, upper = (None if side is None else side[list(at)] for side in (limits.lower, limits.upper))
         measured = Bounds.of_measurements(lower, upper, sizes[0], q)
         return cls(measured, Bounds.of_inputs(limits.input_lower, limits.input_upper, sizes[1], m))
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
-        """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m) as they arrive; `held` is known before the first."""
+        """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
         before = Held.nothing(*u.shape[1:]) if held is None else held
         if self.measured.pass_all(y) and self.inputs.pass_all(u):
             return _as_they_are(y, u, before)
@@ -221,7 +227,7 @@ class Screen:
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch); `run_with_status` adds those of the observer.
+    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch).
 
     Examples
     --------
@@ -254,7 +260,7 @@ def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:
-    """Return the complete samples, shape (n_samples, batch), that are the first ones after some input was lost, and whether one is due at the end."""
+    """Return the first complete samples after some input was lost, and whether one is due at the end."""
     count = np.arange(1, len(lost) + 1)[:, None]
     lost_at = np.maximum.accumulate(np.where(lost, count, np.where(stale, 0, -1)), axis=0)
     complete_at = np.maximum.accumulate(np.where(complete, count, -1), axis=0)

@@ -1,12 +1,13 @@
-r"""What is declared of a machine, its sensors and the limits of its states: the same for design, certificates, rivals and evaluation.
+r"""What is declared of a machine: its sensors and the limits of its states.
 
 What arrives at sample k of a measured channel y is
 
 .. math:: y_k = Q\bigl(y(t_k - (d + j\,\xi_k)\,\Delta t) + b + \sigma\,\eta_k\bigr),
 
-or nothing with probability p: ``noise`` :math:`\sigma`, ``bias`` b, ``delay_samples`` d, ``jitter_samples`` j, ``dropout`` p, Q rounding to multiples of
-``resolution``, :math:`\xi` and :math:`\eta` white and Gaussian of variance one. It is beside what the recordings already hold.
-Limits of states, such as the current's, are declared or found in the recordings.
+or nothing with probability p: ``noise`` :math:`\sigma`, ``bias`` b, ``delay_samples`` d, ``jitter_samples`` j,
+``dropout`` p, Q rounding to multiples of ``resolution``, :math:`\xi` and :math:`\eta` white and Gaussian of variance
+one. It is beside what the recordings already hold. Limits of states, such as the current's, are declared or found in
+the recordings.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Sensor(Settings):
     dropout: float = Field(0.0, ge=0, lt=1, description="probability that a sample is lost, independently of others")
 
     def variance(self, step: float = 0.0) -> float:
-        """Return the variance of what disturbs a sample at random: noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
+        """Return the variance of noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
         return self.noise**2 + (self.resolution or 0.0) ** 2 / 12 + (self.jitter_samples * step) ** 2
 
     def in_unit(self, size: float) -> Sensor:
@@ -67,7 +68,8 @@ def require_measured(sensor: Sensors, measured: Sequence[str]) -> None:
     delays = {name: sensor.get(name, Sensor()).delay_samples for name in measured}
     if len(set(delays.values())) > 1:
         raise ConfigError(
-            f"sensor: delay_samples should be the same for all measured states, found {delays}; hold back those that arrive early, and declare that."
+            f"sensor: delay_samples should be the same for all measured states, found {delays}; hold back those that "
+            "arrive early, and declare that."
         )
 
 
@@ -82,7 +84,7 @@ def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
 
 
 class Limit(Settings):
-    """Limits of one state in its unit of measure; written as ``0.35`` for both sides, ``[-0.2, 0.35]``, ``{upper = 0.35}``, or false for none."""
+    """Limits of one state: ``0.35`` for both sides, ``[-0.2, 0.35]``, ``{upper = 0.35}``, or false for none."""
 
     lower: float | None = Field(None, description="least value in the state's unit of measure")
     upper: float | None = Field(None, description="largest value")

@@ -71,7 +71,7 @@ def run_observer(
 def run_with_status(
     observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
 ) -> tuple[Array, Bits]:
-    """Run an observer as `run_observer` does, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
+    """Run an observer, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
 
     Bits that samples have by themselves, and `RESTARTED`.
 
@@ -165,7 +165,7 @@ def run_innovations(
 
 
 def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None) -> tuple[Array, Bits]:
-    """Run observers on screened samples: estimates (observer, n_samples, batch, n), and the bit RESTARTED (n_samples, batch)."""
+    """Return estimates (observer, n_samples, batch, n), and the bit RESTARTED (n_samples, batch)."""
     (n_samples, batch), observer = samples.starts.shape, observers[0]
     values, left = observer.values(parameters, (batch,)), _one_by_one(observer, samples)
     restarted, status = np.tile(left, (len(observers), 1)), np.zeros((n_samples, batch), np.uint8)
@@ -191,7 +191,7 @@ def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Param
 
 
 def _one_by_one(observer: ObserverData, samples: Screened) -> Flags:
-    """Return which machines NumPy steps, shape (batch,): all without a compiler, else those of which a filter bank misses a measurement."""
+    """Return which machines NumPy steps, (batch,): without a compiler all, else banks with gaps."""
     if library() is None:
         return np.ones(samples.starts.shape[1], dtype=bool)
     return np.asarray((observer.bank is not None) & ~np.isfinite(samples.y).all(axis=(0, 2)))
@@ -285,7 +285,7 @@ def _pending(starts: Flags, delay: int) -> Whole:
 def _predict(
     observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters
 ) -> None:
-    """Take states, shape (n_samples, batch, n), over the samples that lie between them and their rows, without correction."""
+    """Predict states (n_samples, batch, n) to their rows, without correction."""
     batch = x.shape[1]
     for start in range(0, len(x), _ROWS):
         rows = np.arange(start, min(start + _ROWS, len(x)))
@@ -370,7 +370,7 @@ def _limits(observer: ObserverData, batch: int) -> dict[str, Any]:
 
 
 def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:
-    """Return the estimates of machines that start after the first sample, and which they are; nothing where none does."""
+    """Return the estimates of machines that start after the first sample, and which they are."""
     rows, machines = np.nonzero(samples.starts[1:])
     if not len(rows):
         return {}

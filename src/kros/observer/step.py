@@ -1,4 +1,4 @@
-"""The step (18)-(21) in NumPy, the reference for all generated code: the state of an observer over a batch of machines, and how a sample moves it on."""
+"""The step (18)-(21) in NumPy, the reference for all generated code."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Steps:
             self._gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
 
     def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
-        """Start all machines, or some, at measurements, shape (batch, q), and inputs where these are known, shape (batch, m)."""
+        """Start machines at measurements, (batch, q), and inputs where these are known, (batch, m)."""
         rows: Any = slice(None) if machines is None else machines
         self.x[rows] = self.observer.initial(y, self.values, u)[rows]
         self._x_c[rows], self._fresh[rows], self.waiting[rows] = 0.0, True, False
@@ -48,7 +48,7 @@ class Steps:
         self._fresh[:], self.waiting[:] = False, False
 
     def earlier(self, u: Array) -> Array:
-        """Return the earlier values that the lifting reads, shape (batch, n_earlier); after a start they equal the present ones."""
+        """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
         if not self._fresh.any():
             return self._earlier
         held = self.lifting.window.hold(self.x, np.broadcast_to(u, (len(self.x), u.shape[-1])))
@@ -78,7 +78,7 @@ class Steps:
         self._fresh &= ~on[:, 0]
 
     def alternatives(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Take a step as a filter bank, and return what filters and fallback estimate, (batch, n) each, and the level (batch,)."""
+        """Take a step, and return what filters and fallback estimate, (batch, n) each, and the level (batch,)."""
         assert self._gaps is not None
         self.step(y, u)
         return self._gaps.filtered, self._gaps.expected, self._gaps.level
@@ -102,7 +102,7 @@ class Steps:
 def forward(
     observer: ObserverData, values: Parameters, count: npt.NDArray[np.intp], x: Array, earlier: Array, u: Array
 ) -> Array:
-    """Predict states (batch, n) through the model over the first ``count`` inputs of u (d, batch, m), without correction."""
+    """Predict states (batch, n) over the first ``count`` inputs of u (d, batch, m), without correction."""
     steps, missing = Steps(observer, len(x), values), np.full((len(x), len(observer.measured)), np.nan)
     steps.place(x, earlier)
     for j, inputs in enumerate(u):

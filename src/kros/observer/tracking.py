@@ -1,15 +1,18 @@
-r"""A phase-locked loop: a lifting parameter, such as the phase of a gearbox, follows the machine while the observer runs.
+r"""A phase-locked loop: a lifting parameter, such as a gearbox's phase, follows the machine.
 
-With the parameter p of the running observer, the sensitivity ``s = d x_hat / d p`` obeys the linearised observer itself,
+With the parameter p of the running observer, the sensitivity ``s = d x_hat / d p`` obeys the linearised observer
+itself,
 
     s+ = (A_s + a sigma_x) s + a sigma_p - (into D^c C)_s s + (into C^c)_s s_c,      s_c+ = A^c s_c - B^c C s,
 
-and ``psi = C s`` says how the predicted measurement moves with p, delays of the machine included: for ``sin(100 position + phase)`` it is the cosine of the
-gearbox angle, filtered as the machine filters it, whichever way it turns. The innovation times psi is integrated with a small gain,
+and ``psi = C s`` says how the predicted measurement moves with p, delays of the machine included: for ``sin(100
+position + phase)`` it is the cosine of the gearbox angle, filtered as the machine filters it, whichever way it turns.
+The innovation times psi is integrated with a small gain,
 
     p+ = p + (dt / tau) psi nu / r,      r the mean of psi^2 over about tau,
 
-so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements count in units of their sizes in training.
+so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements
+count in units of their sizes in training.
 
 References
 ----------
@@ -71,12 +74,15 @@ class PhaseLockedLoop:
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
-                f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
+                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter "
+                f"{name!r} and measurements without delay, "
+                f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of "
+                f"{observer.runtime.delay}."
             )
         if not settle_s > 0:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found {settle_s:g} s."
+                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found "
+                f"{settle_s:g} s."
             )
         n = lifting.n_states
         self.observer, self.name, self.forget = observer, name, min(observer.sample_period_s / settle_s, 1.0)
@@ -91,7 +97,7 @@ class PhaseLockedLoop:
             array[slice(None) if machines is None else machines] = 0.0
 
     def step(self, steps: Steps, y: Array, u: Array) -> Array:
-        """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
+        """Move the observer on by a sample, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
         x, psi = steps.x.copy(), self._s[:, self._C].copy()
         nu = np.where(np.isfinite(y), steps.innovation(y), 0.0)
@@ -119,7 +125,8 @@ def measurement_sizes(observer: ObserverData) -> Array:
         return np.ones(1)
     if observer.seen is None:
         raise ConfigError(
-            f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of their sizes, which it "
+            f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of "
+            "their sizes, which it "
             "does not know; give it Observer(..., seen=Seen(measured, inputs))."
         )
     return np.where(observer.seen.measured > 0, observer.seen.measured, 1.0)
@@ -166,7 +173,8 @@ def track_parameter(
     >>> from kros.synthesis import Injection
     >>> lifting = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
     >>> A, K = np.array([[1.0, 0.002], [0.0, 0.0]]), gain([[0.2], [0.0]], 0.001)
-    >>> observer = Observer("x", lifting, A, np.array([[0.001], [0.0]]), (0,), ("u",), K, Injection.STATE, 0.001, {"phase": 0.0})
+    >>> model = A, np.array([[0.001], [0.0]]), (0,), ("u",)
+    >>> observer = Observer("x", lifting, *model, K, Injection.STATE, 0.001, {"phase": 0.0})
     >>> x = np.zeros((8000, 1, 1))
     >>> for k in range(7999):
     ...     x[k + 1] = x[k] + 0.001 + 0.002 * np.sin(10 * x[k] + 0.5)

@@ -64,7 +64,7 @@ class RecordedChannel:
 
 
 def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
-    """Return how a channel stands in the recordings, by the observer's file; one that the file does not name is as the observer has it."""
+    """Return how a channel stands in the recordings; one that the file does not name is as it is."""
     units, columns = (observer.about.get(key, {}) for key in ("units_of_measure", "columns"))
     own = columns.get(name, {}) if isinstance(columns, dict) else columns
     unit = units.get(name, "") if isinstance(units, dict) else units

@@ -216,7 +216,7 @@ class Source:
         return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
 
     def factors(self) -> dict[str, float]:
-        """Return by what the recordings of channels are multiplied, by name; a load torque is in the unit of its current."""
+        """Return by what recordings are multiplied, by name; a load torque has the unit of its current."""
         names = (*self.observer.recorded, *self.observer.inputs)
         found = dict(zip(names, recorded_factors(self.observer, names).tolist(), strict=True))
         return found if self.load is None else found | {self.load.load: found[self.load.current]}
@@ -236,7 +236,7 @@ class Source:
         return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
 
     def tracked(self) -> dict[str, Any] | None:
-        """Return what a phase-locked loop consists of: the observer's linear part, and slopes of lifted functions by states and parameter."""
+        """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
         if self.loop is None:
             return None
         o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
@@ -382,7 +382,7 @@ class Source:
         return [Precision().literal(float(v)) for v in values]
 
     def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
-        """Return the bounds of every channel in double precision, and in single precision between which a sample is good as it is."""
+        """Return the bounds of every channel in double precision, and those of good samples in single."""
         most, single = float(np.finfo(float).max), float(np.finfo(np.float32).max)
         rows = []
         for row in zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True):
@@ -395,7 +395,7 @@ class Source:
 
 
 def _uncorrected(observer: Observer) -> Array:
-    """Return what the model and the direct correction make of a change of the estimate, the lifted functions held; shape (n_lifted, n_lifted)."""
+    """Return the model with the direct correction, lifted functions held, shape (n_lifted, n_lifted)."""
     A = observer.A.copy()
     A[:, list(observer.measured)] -= observer.into @ observer.controller.D
     if observer.bank is not None:

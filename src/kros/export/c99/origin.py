@@ -5,9 +5,10 @@ together,
 
 .. math:: (A_s - I)\, s_x + B\, s_u = 0, \qquad s_y = 1,
 
-and the lifted functions repeat with a period P, an observer may run on ``x - o s_x``, ``y - o`` and ``u - o s_u`` with an origin o that is a multiple of
-P: the same estimates, of small numbers. There are such directions for nearly every model, since there are more signals than equations; the smallest
-one is taken. Generated code of either precision runs so; double precision in Python does without.
+and the lifted functions repeat with a period P, an observer may run on ``x - o s_x``, ``y - o`` and ``u - o s_u`` with
+an origin o that is a multiple of P: the same estimates, of small numbers. There are such directions for nearly every
+model, since there are more signals than equations; the smallest one is taken. Generated code of either precision runs
+so; double precision in Python does without.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def find_shift(observer: ObserverData) -> OriginShift | None:
 
 
 def _direction(moving: Long, at: int, n: int, sizes: Array) -> tuple[Array, Array]:
-    """Return the direction in which nothing of ``[A - I, B]`` moves, a one for the measured state: whole numbers for it and inputs, and what is left."""
+    """Return the direction in which ``[A - I, B]`` moves nothing: whole numbers, and what is left."""
     free = np.arange(len(sizes)) != at
     scaled = np.asarray(moving * sizes, dtype=float)[:, free]
     whole, rest = np.eye(len(sizes))[at], np.zeros(len(sizes))
@@ -85,7 +86,7 @@ def _direction(moving: Long, at: int, n: int, sizes: Array) -> tuple[Array, Arra
 
 @lru_cache(maxsize=64)
 def _period(lifting: Lifting, name: str, others: frozenset[str]) -> float | None:
-    """Return the movement of one state after which all lifted functions are what they were; zero where any will do, None where there is none."""
+    """Return the movement of a state after which all functions repeat; zero for any, None for none."""
     import sympy as sp
 
     symbol, rates = sp.Symbol(name, real=True), []

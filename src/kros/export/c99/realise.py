@@ -1,9 +1,11 @@
 r"""The linear part of an observer as numbers that rounding does little to, and with few operations.
 
-Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of one for every other state.
+Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of
+one for every other state.
 
-An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what is left is a millionth of
-either, and rounding is not. So the difference is formed first. For the input j and the measured state i with :math:`B_j \approx -c\,(A - I)_i`
+An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what
+is left is a millionth of either, and rounding is not. So the difference is formed first. For the input j and the
+measured state i with :math:`B_j \approx -c\,(A - I)_i`
 
 .. math:: (A - I)_i\, x_i + B_j u_j = \bigl((A - I)_i + c\, B_j\bigr) x_i + B_j\, (u_j - c\, x_i),
 
@@ -88,7 +90,7 @@ def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
 
 
 def to_modes(observer: Observer) -> Array | None:
-    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted): one for real modes, pairs for complex ones; None where there are none."""
+    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted); None without a bank."""
     if observer.bank is None:
         return None
     n, first, last = observer.lifting.n_states, len(observer.recorded), len(observer.recorded) + observer.bank.filters
@@ -114,7 +116,7 @@ def _modes(A: Array) -> Array:
 
 
 def in_coordinates(observer: Observer, turn: Array) -> Observer:
-    """The observer in lifted coordinates ``turn @ theta`` that leave the recorded states and the lifted functions alone."""
+    """The observer in coordinates ``turn @ theta`` that leave recorded states and functions alone."""
     n = observer.lifting.n_states
     bank, guard = observer.bank, observer.guard
     return replace(

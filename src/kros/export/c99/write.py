@@ -38,8 +38,8 @@ def export_c(
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
-    The source takes measurements and inputs as they stand in the recordings that the study read, and gives estimates so: the factors by which
-    the study multiplied columns, ``about.columns`` of the observer's file, are compiled in.
+    The source takes measurements and inputs as they stand in the recordings that the study read, and gives estimates
+    so: the factors by which the study multiplied columns, ``about.columns`` of the observer's file, are compiled in.
 
     Parameters
     ----------
@@ -57,7 +57,8 @@ def export_c(
     load : LoadOutput, optional
         Load torque and total current with their levels, as outputs of their own.
     held_out : HeldOut, optional
-        Recordings on which the numerical error is measured, where there is a compiler; the manifest and the description name it.
+        Recordings on which the numerical error is measured, where there is a compiler; the manifest and the description
+        name it.
 
     Returns
     -------
@@ -67,7 +68,8 @@ def export_c(
     Raises
     ------
     ConfigError
-        When the name is no C identifier, the folder holds something, a lifted function has no expression in C, or the parameter cannot be followed.
+        When the name is no C identifier, the folder holds something, a lifted function has no expression in C, or the
+        parameter cannot be followed.
 
     Examples
     --------

@@ -40,9 +40,10 @@ def export_fmu(
 ) -> Path:
     """Write an observer as an FMU for co-simulation.
 
-    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of the recordings;
-    ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one sample and gives the estimate for its end.
-    ``condition``, where the monitor knows some, is a tunable enumeration: the recorded condition that the machine is in, ``unknown`` at first.
+    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of
+    the recordings; ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one
+    sample and gives the estimate for its end. ``condition``, where the monitor knows some, is a tunable enumeration:
+    the recorded condition that the machine is in, ``unknown`` at first.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def export_fmu(
     Raises
     ------
     ConfigError
-        When the file exists or ends differently, the version or the name is none, or a lifted function has no expression in C.
+        When the file exists or ends differently, the version or the name is none, or a lifted function has no
+        expression in C.
 
     Examples
     --------
@@ -118,7 +120,7 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
 
 
 def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status, condition."""
+    """Return the variables in the order of their references, measurements first."""
     found: list[dict[str, Any]] = []
 
     def add(name: str, causality: str, text: str, start: str | None, suffix: str = "", kind: str = "real") -> None:
@@ -143,13 +145,13 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
 
 
 def conditions(observer: Observer) -> list[str]:
-    """Return the conditions that the monitor knows, in the order of their numbers, the unknown one first; nothing where it knows none."""
+    """Return the conditions that the monitor knows, the unknown one first; nothing where it knows none."""
     known = () if observer.monitor is None else observer.monitor.bounds
     return ["unknown", *plain_names(known)] if known else []
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:
-    """Return the shared library for this machine, by its place in the archive; nothing where there is no compiler that works."""
+    """Return the shared library for this machine by its place in the archive, if a compiler works."""
     compiler = find_compiler()
     if compiler is None or sys.platform not in ("linux", "darwin"):
         return {}

@@ -1,12 +1,13 @@
-r"""The extended Kalman filter of the re-lifted model: the gain follows the slopes of the lifted functions at the estimate.
+r"""The extended Kalman filter of the re-lifted model: its gain follows the slopes at the estimate.
 
-The model of the original states is ``x+ = f(x, u) = A_s theta(x) + B_s u``, the first n rows of the lifted model, with white noise Q on x+
-and R on y. At every sample
+The model of the original states is ``x+ = f(x, u) = A_s theta(x) + B_s u``, the first n rows of the lifted model, with
+white noise Q on x+ and R on y. At every sample
 
     S = C P C' + R,   L = P C' S^-1,   x^ = x_hat + L (y - C x_hat),   P^ = P - L C P
     x_hat+ = f(x^, u),   F = df/dx (x^),   P+ = F P^ F' + Q
 
-Slopes by earlier values and of input functions count as noise. With a linear model this is the Kalman filter with its start.
+Slopes by earlier values and of input functions count as noise. With a linear model this is the Kalman filter with its
+start.
 
 References
 ----------
@@ -50,7 +51,8 @@ class ExtendedKalman:
     parameters : mapping of str to float
         Default values of the lifting's parameters, the nominal unit's.
     delay : int
-        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the model.
+        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the
+        model.
 
     Examples
     --------
@@ -58,7 +60,8 @@ class ExtendedKalman:
     >>> from kros.lifting import Lifting
     >>> from kros.observer import ExtendedKalman
     >>> A, B = np.array([[1.0, 0.01], [0.0, 0.9]]), np.array([[0.0], [0.1]])
-    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0]))
+    >>> Q, R, P0 = np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0])
+    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), Q, R, P0)
     >>> kalman.run(np.zeros((100, 1, 1)), np.zeros((100, 1, 1))).shape
     (100, 1, 2)
     """
@@ -83,10 +86,10 @@ class ExtendedKalman:
             )
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n); parameters of shape (batch,).
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m).
 
-        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is corrected at that sample, and
-        the covariance grows.
+        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
+        corrected at that sample, and the covariance grows.
         """
         return self.run_all(y, u, parameters)[0]
 
@@ -167,11 +170,12 @@ class ExtendedKalman:
         return states.transpose(1, 0, 3, 2)
 
     def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
-        """Run on what was measured, with the inputs of its time, and predict each estimate to the row in which it is there."""
+        """Run on what was measured, and predict each estimate to the row in which it is there."""
         d, lifting, n = min(self.delay, len(y) - 1), self.lifting, self.lifting.n_states
         if lifting.history:
             raise DimensionError(
-                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found {lifting.functions}."
+                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
+                f"{lifting.functions}."
             )
         before = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
         values = {**self.parameters, **(parameters or {})}
@@ -187,7 +191,7 @@ class ExtendedKalman:
 
 
 def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
-    """Return the covariance of the first estimate: a state may be anywhere in its range, shape (n,); a measured one has the measurement's noise."""
+    """Return the covariance of the first estimate: a state anywhere in its range, a measured one with noise."""
     P0 = np.diag(scale**2)
     P0[np.ix_(list(measured), list(measured))] = R
     return np.asarray(P0)

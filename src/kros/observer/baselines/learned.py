@@ -1,11 +1,12 @@
-r"""A learned estimator without a model: ridge regression of the hidden states on the last hundred samples, as a yardstick without any guarantee.
+r"""A learned estimator without a model: ridge regression on the last hundred samples, a yardstick.
 
 With z = [y; u] and d delays, the estimate at sample k is
 
     x_hat_k = w_0 + sum_j W_j z_{k-1-j},   j = 0, ..., d - 1,
 
-linear in the samples and a constant; what came before the first sample is taken to equal it. The regression is in the coordinates
-[z_{k-1}; z_{k-1-j} - z_{k-j}], divided by their RMS: neighbouring samples of a slow signal are nearly equal.
+linear in the samples and a constant; what came before the first sample is taken to equal it. The regression is in the
+coordinates [z_{k-1}; z_{k-1-j} - z_{k-j}], divided by their RMS: neighbouring samples of a slow signal are nearly
+equal.
 """
 
 from __future__ import annotations
@@ -93,7 +94,8 @@ class Moments:
         rows = [i for i, unit in enumerate(self.units) if unit not in without]
         if not rows:
             raise DataError(
-                f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more units."
+                f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more "
+                "units."
             )
         h, delays = len(self.estimated), self.settings.delays
         products = self.products[rows].sum(axis=0)
@@ -107,7 +109,7 @@ class Moments:
 
 
 def regressors(z: Array, at: npt.NDArray[np.int64], delays: int) -> Array:
-    """Return [1, z_{k-1}, z_{k-2} - z_{k-1}, ..., z_{k-d} - z_{k-d+1}] for samples k, shape (len(at), 1 + d channels)."""
+    """Return [1, z_{k-1}, z_{k-2} - z_{k-1}, ...] for samples k, shape (len(at), 1 + d channels)."""
     padded = np.concatenate([np.repeat(z[:1], delays, axis=0), z[:-1]])
     past = padded[at[:, None] + np.arange(delays - 1, -1, -1)]
     past[:, 1:] -= past[:, :-1].copy()

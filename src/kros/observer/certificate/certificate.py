@@ -4,8 +4,8 @@ For every true trajectory and every sequence of measurement noise, whatever mach
 
 .. math:: \sum_k |e_k|^2 \le \gamma^2 \sum_k \left(|\omega_k|^2 + |n_k|^2\right) + V(e_0),
 
-with the signals divided by their sizes (`ReliftScales`), omega the one-step residual and n the noise. A Riccati equation
-with multipliers proposes; what is returned was proven in exact arithmetic.
+with the signals divided by their sizes (`ReliftScales`), omega the one-step residual and n the noise. A Riccati
+equation with multipliers proposes; what is returned was proven in exact arithmetic.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class ReliftStatus(str, Enum):
     CERTIFIED
         The gain is proven.
     UNSTABLE
-        A sequence of slopes inside the box makes the error grow without bound in the model: there is no certificate for this observer over this box.
-        Take a smaller box, weaken the correction, or use another model.
+        A sequence of slopes inside the box makes the error grow without bound in the model: there is no certificate for
+        this observer over this box. Take a smaller box, weaken the correction, or use another model.
     UNBOUNDED
         A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
     NOT_FOUND
@@ -172,7 +172,7 @@ def relift_certificate(
     scales: ReliftScales | None = None,
     parameters: Box | None = None,
 ) -> ReliftCertificate:
-    """Certify an observer as it runs: any lifting with bounded slopes, any correction filter or none, either way of injection.
+    """Certify an observer as it runs, with any lifting of bounded slopes and any correction.
 
     Parameters
     ----------

@@ -36,14 +36,14 @@ class Course:
         return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
 
     def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
-        """Whether the observer takes all samples, measurements at most at the limit and inputs within theirs, shape (batch,)."""
+        """Whether the observer takes all samples, within limits, shape (batch,)."""
         found, u = screened(observer, self.y, self.inputs), observer.runtime.clip_inputs(self.inputs)
         good = np.isfinite(found.y).all(axis=-1) & (found.u == u).all(axis=-1)
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
 def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
-    """Return what drove an observer along recorded episodes; recorded states stand for the true ones, and no sample is lost."""
+    """Return what drove an observer along episodes; recorded states stand for the true ones."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.clip_estimate(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
@@ -86,7 +86,7 @@ def held_residual(
 
 
 def first_error(observer: ObserverData, error: Array) -> Array:
-    """Return the first error with the earlier ones that the lifting reads behind it, which equal it; shape (batch, n_window)."""
+    """Return the first error with equal earlier ones behind it, shape (batch, n_window)."""
     states = observer.lifting.states
     earlier = [states.index(name) for name, delay in observer.lifting.window.quantities if delay and name in states]
     return np.concatenate([error, error[:, earlier]], axis=1)

@@ -1,4 +1,4 @@
-r"""The error of an observer that retracts and lifts its state at every step, as a linear system with slopes that move in a box.
+r"""The error of an observer that lifts its state at every step: a linear system with slopes in a box.
 
             ┌────────────────────────────┐
      w ────►│ xi+ = A xi + L p + B w     ├────► z = C xi
@@ -6,13 +6,15 @@ r"""The error of an observer that retracts and lifts its state at every step, as
      p │    └────────────────────────────┘   │ q
        └────────────── diag(d_k) ◄───────────┘            -1 <= d_k <= 1 in every entry, arbitrary from step to step
 
-For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this exactly (`docs/proofs.md`
-has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i its slope at a point between the two, hence in the
-box of its slopes; the middle of the box goes into A, every entry that can move into a channel of its own.
+For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this
+exactly (`docs/proofs.md` has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i
+its slope at a point between the two, hence in the box of its slopes; the middle of the box goes into A, every entry
+that can move into a channel of its own.
 
 Symbols
 -------
-xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first, and the predicted errors that count
+xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first,
+and the predicted errors that count
 w, z      : [omega / residual, n / noise] and e / error, the scaled signals of `ReliftScales`
 p, q      : what the slopes' movement adds, and what it acts on
 d_k       : position of every slope in its interval
@@ -51,7 +53,8 @@ class ReliftScales:
     Parameters
     ----------
     error : ndarray, shape (n,)
-        Range of every state: a scaled error of 0.01 is one percent of the largest value. Infinite for a state whose error does not count.
+        Range of every state: a scaled error of 0.01 is one percent of the largest value. Infinite for a state whose
+        error does not count.
     residual : ndarray, shape (n,)
         Size of the one-step residual in every state; zero for a state without.
     noise : ndarray, shape (q,)
@@ -84,9 +87,10 @@ class ReliftScales:
 
     @classmethod
     def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:
-        """Return the scales for which a population's residual has unit power: its gain then *is* the error that is certified on a typical unit.
+        """Return the scales for which a population's residual has unit power: the gain is then a typical error.
 
-        Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every measurement's noise, shape (q,).
+        Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every
+        measurement's noise, shape (q,).
         """
         n, sigma = residual.shape[-1], np.atleast_1d(np.asarray(noise, dtype=float))
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
@@ -131,12 +135,12 @@ class ErrorSystem:
         return np.zeros(self.L.shape[1]) if self.rest is None else self.rest
 
     def closed(self, d: npt.ArrayLike) -> Array:
-        """Return ``(I - diag(d) E)^-1 diag(d)``, from what the channels act on but for other channels to what they add; shape (n_p, n_p)."""
+        """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
         moved = np.diag(np.asarray(d, dtype=float))
         return moved if self.E is None else np.asarray(np.linalg.solve(np.eye(len(moved)) - moved @ self.E, moved))
 
     def corner(self, d: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``A + L diag(d) M`` and ``B + L diag(d) D``, other channels in between, for slopes at a place in the box, shape (n_p,)."""
+        """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
         moved = self.L @ self.closed(d)
         return self.A + moved @ self.M, self.B + moved @ self.D
 
@@ -145,7 +149,7 @@ class ErrorSystem:
         return [self.corner(d) for d in product((-1.0, 1.0), repeat=self.L.shape[1])]
 
     def multiplied(self, multipliers: Array, gain: float) -> tuple[tuple[Array, Array], Array, Array]:
-        """Return (A, B), C and D with p as an input and q as an output, scaled by multipliers: a gain proven for it holds in the whole box."""
+        """Return (A, B), C and D with p as input and q as output: a gain proven for it holds in the whole box."""
         root = np.sqrt(multipliers)
         B = np.hstack([self.L / root * gain, self.B])
         C = np.vstack([_WIDER * root[:, None] * self.M, self.C])
@@ -168,8 +172,8 @@ class ErrorSystem:
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' of the frozen response to the rest of the error.
 
-        The frozen response has ``p' = d' q'``. With ``r = xi - xi'`` and ``pi = p - p' + d' q'`` the rest obeys ``r+ = A r + L (pi - d' q')``,
-        ``pi = d (M r + E (pi - d' q') + q')``, from zero.
+        The frozen response has ``p' = d' q'``. With ``r = xi - xi'`` and ``pi = p - p' + d' q'`` the rest obeys ``r+ =
+        A r + L (pi - d' q')``, ``pi = d (M r + E (pi - d' q') + q')``, from zero.
         """
         width = self.L.shape[1]
         return replace(self, B=-self.L * self.place, D=np.eye(width) - self.nested * self.place, start=None)
@@ -211,7 +215,8 @@ def error_system(
     n, delay, limits = lifting.n_states, observer.runtime.delay, observer.runtime
     if (scales.error.shape, scales.residual.shape, scales.noise.shape) != ((n,), (n,), (q,)):
         raise DimensionError(
-            f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found {scales.error.shape}, "
+            f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found "
+            f"{scales.error.shape}, "
             f"{scales.residual.shape}, {scales.noise.shape}."
         )
     lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
@@ -238,7 +243,7 @@ def error_system(
         following[row, lags.index((name, lag - 1))] = 1.0
 
     def predicted(e: Array, at: int) -> tuple[Array, Array]:
-        """Errors (h) that act where some are estimated, and what becomes of them without correction; its channels begin at `at`."""
+        """Errors (h) that act, limits applied, and the next ones without correction; channels begin at `at`."""
         e, late = e.copy(), f", {at // link} samples on" if link and at else ""
         for k, i in enumerate(clips, at):
             q_rows[k], channels[k], rest[k] = _WIDER / 2 * e[i], f"limits of {names[i]}{late}", 1.0
@@ -284,7 +289,7 @@ def error_system(
 
 
 def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
-    """Return the errors, of h with the earlier ones, that a residual or a start drives: those of internal states start at zero."""
+    """Return the errors, of h, that a residual or a start drives: internal states start at zero."""
     n = observer.lifting.n_states
     return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
@@ -295,7 +300,7 @@ def _counted(scales: ReliftScales) -> list[int]:
 
 
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
-    """Return the sizes of all of xi, shape (n_xi,), from those of the errors with the earlier ones, shape (n_window,)."""
+    """Return the sizes of xi, shape (n_xi,), from those of the errors, shape (n_window,)."""
     delay = observer.runtime.delay
     late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[_counted(scales)]] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
@@ -304,7 +309,7 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
 def slope_box(
     observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None
 ) -> tuple[Array, Array]:
-    """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names))."""
+    """Return bounds of the slopes of all functions by entries of the window, each (p + r, len(names))."""
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
     ranges = {**(box or {}), **(parameters or {})}
     lower, upper = slope_bounds_of(formulas, names, ranges)

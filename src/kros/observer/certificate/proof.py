@@ -4,8 +4,8 @@ With a Lyapunov matrix ``P = R' R`` the gain gamma is proven when
 
     F = [[P, 0], [0, gamma^2 I]] - [A_c, B_c]' P [A_c, B_c] - [C, D]' [C, D] > 0
 
-for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers stand in for corners: then p is
-an input and q an output.)
+for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers
+stand in for corners: then p is an input and q an output.)
 
 The decision is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by
 a Cholesky factorisation in floating point of what is left without all that rounding can do; where that is not enough,
@@ -14,7 +14,8 @@ by elimination of integers.
 References
 ----------
 S. M. Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46 (2006) 433-452.
-E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation 22 (1968) 565-578.
+E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation
+22 (1968) 565-578.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def _positive(F: Integers) -> bool:
 
 
 def _clearly_positive(M: Integers) -> bool:
-    """Tell whether a matrix of integers is positive definite by far: a factorisation exists, whatever was rounded on the way."""
+    """Tell whether a matrix of integers is positive definite by more than rounding."""
     try:
         rounded = M.astype(float) * 2.0**-_BITS
         spare = _ROUNDING * (len(M) + 4) * np.finfo(float).eps * float(np.trace(rounded))

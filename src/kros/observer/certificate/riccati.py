@@ -4,13 +4,14 @@ A common quadratic Lyapunov function over all slopes in the box follows where mu
 
     sum |z|^2 + t_j (|q_j|^2 - |p_j|^2) - gamma^2 |w|^2 <= 0        on every trajectory with |p_j| <= |q_j|,
 
-and for one channel the S-lemma makes the converse true: nothing is lost against the corners. By the Kalman-Yakubovich-Popov lemma this is
+and for one channel the S-lemma makes the converse true: nothing is lost against the corners. By the
+Kalman-Yakubovich-Popov lemma this is
 
     H(theta)* [[T, 0], [0, I]] H(theta) < [[T, 0], [0, gamma^2 I]],     H = [[G_qp, G_qw], [G_zp, G_zw]]
 
-at all frequencies, an inequality in (T, gamma^2) alone, whatever the order. The least gamma over a grid of frequencies is found first; the Lyapunov
-matrix then solves the Riccati equation of the scaled system [sqrt(T) q, z] / [p sqrt(T), gamma w] with a small extra output that makes
-the inequality strict in every direction.
+at all frequencies, an inequality in (T, gamma^2) alone, whatever the order. The least gamma over a grid of frequencies
+is found first; the Lyapunov matrix then solves the Riccati equation of the scaled system [sqrt(T) q, z] / [p sqrt(T),
+gamma w] with a small extra output that makes the inequality strict in every direction.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Proposal:
 
 
 def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
-    """Yield proposals with a growing distance from the least gain, best first; none where the frequency inequality has no solution."""
+    """Yield proposals, best first; none where the frequency inequality has no solution."""
     if not _plain(system).is_stable():
         return
     multipliers, least = frequency_bound(system)
@@ -56,14 +57,14 @@ def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
     least = max(least, _NOTHING * size, np.finfo(float).tiny)  # where nothing arrives, any small gain will do
     for factor in _STEPS:
-        # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
+        # Multipliers that grow with the gain leave room for what the grid did not see.
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
             yield Proposal(least * factor, R, multipliers * factor)
 
 
 def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
-    """Return the best multipliers, shape (n_p,), and the least gain they allow on a grid; infinity where there are none."""
+    """Return the best multipliers, (n_p,), and the least gain they allow on a grid, infinity where none do."""
     width = system.L.shape[1]
     if not width or not np.any(system.C) or not np.any(np.hstack([system.B.ravel(), system.D.ravel()])):
         return np.ones(width), hinf_norm(_plain(system))
@@ -73,7 +74,7 @@ def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
 
 
 def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:
-    """Return the triangular factor of a Lyapunov matrix for one gain, or None where the Riccati equation has no solution."""
+    """Return the triangular factor of a Lyapunov matrix for a gain, or None without a solution."""
     from scipy.linalg import solve_discrete_are
 
     width = system.L.shape[1]
@@ -145,7 +146,7 @@ def _responses(system: ErrorSystem) -> Array:
 
 
 def _level(H: Array, multipliers: Array) -> float:
-    """Return the least gamma^2 that given multipliers allow on the grid, by a Schur complement; infinity where there is none."""
+    """Return the least gamma^2 that multipliers allow on the grid, by a Schur complement, or infinity."""
     width = len(multipliers)
     weight = np.concatenate([multipliers, np.ones(H.shape[1] - width)])
     F = np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)

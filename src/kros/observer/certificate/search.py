@@ -1,4 +1,4 @@
-"""Search for a proof: one Lyapunov matrix by a Riccati equation, decided exactly; a sequence of slopes that grows ends it."""
+"""Search for a proof: a Lyapunov matrix by a Riccati equation, decided exactly."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def first_proof(system: ErrorSystem) -> Proposal | None:
 
 
 def growing_sequence(system: ErrorSystem) -> str:
-    """Name a short sequence of corners whose product does not shrink; empty where there is none among the short ones."""
+    """Name a short sequence of corners whose product does not shrink, if there is one."""
     corners = system.corners() if system.corner_count <= MOST_CORNERS else []
     for length in range(1, _LONGEST + 1):
         if len(corners) ** length > MOST_CORNERS**2:
@@ -50,7 +50,8 @@ def growing_sequence(system: ErrorSystem) -> str:
             if radius >= 1:
                 plural = "s" if length > 1 else ""
                 return (
-                    f"The error grows: a sequence that repeats {length} corner{plural} of what can happen multiplies it "
+                    f"The error grows: a sequence that repeats {length} corner{plural} of what can happen multiplies "
+                    "it "
                     f"by {radius ** (1 / length):.6g} a step."
                 )
     return ""

@@ -1,13 +1,15 @@
-r"""A bound on the error of every unit of a set of signals: the residuals of recorded motion, known by their energies in bands of frequency.
+r"""A bound on the error for a set of signals: residuals of recorded motion, by their energies in bands.
 
-Let ``w_k``, k from -1, be the first error followed by the one-step residual and the noise of a recording, and T_j the frozen response from w to the error of
-state j as the observer runs, delay included. Then (`relift` page)
+Let ``w_k``, k from -1, be the first error followed by the one-step residual and the noise of a recording, and T_j the
+frozen response from w to the error of state j as the observer runs, delay included. Then (`relift` page)
 
-.. math:: \|e_j\| \le \Big(\sum_b \mathrm{tr}(M_{jb} \Phi_b)\Big)^{1/2} + \kappa_j \Big(\sum_l \frac{1}{s_l^2} \sum_b \mathrm{tr}(M_{lb} \Phi_b)\Big)^{1/2},
+.. math:: \|e_j\| \le \Big(\sum_b \mathrm{tr}(M_{jb} \Phi_b)\Big)^{1/2}
+          + \kappa_j \Big(\sum_l \frac{1}{s_l^2} \sum_b \mathrm{tr}(M_{lb} \Phi_b)\Big)^{1/2},
 
-``M_b`` above ``T^H T`` throughout band b for the error and for what the slopes and limits act on (`majorants`), and ``kappa_j`` the proven gain from the
-latter, divided by sizes s, to what they can add to state j alone. It holds for every signal with energies of at most ``Phi_b``: for those of a unit
-whatever course they take, for the cover of all units whatever unit they come from.
+``M_b`` above ``T^H T`` throughout band b for the error and for what the slopes and limits act on (`majorants`), and
+``kappa_j`` the proven gain from the latter, divided by sizes s, to what they can add to state j alone. It holds for
+every signal with energies of at most ``Phi_b``: for those of a unit whatever course they take, for the cover of all
+units whatever unit they come from.
 """
 
 from __future__ import annotations
@@ -52,7 +54,8 @@ class SignalBound:
         The recorded ones.
     units : tuple of str
     cover : ndarray, shape (n,)
-        Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is none.
+        Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is
+        none.
     bounds : ndarray, shape (units, n)
         For any signal with the energies of one unit.
     errors : ndarray, shape (units, n)
@@ -66,7 +69,8 @@ class SignalBound:
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
     within : bool, optional
-        Of an observer that goes on from limits: true where these change no estimate of the recordings, and the bound is for signals that keep it so.
+        Of an observer that goes on from limits: true where these change no estimate of the recordings, and the bound is
+        for signals that keep it so.
 
     Examples
     --------
@@ -109,7 +113,7 @@ class SignalBound:
         return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
 
     def facts(self, measured: Sequence[int] = ()) -> dict[str, Any]:
-        """Return what goes into the metrics; ratios are those of hidden states (of all where none is), over units that keep what is assumed."""
+        """Return what goes into the metrics; ratios are those of hidden states, of all where none is."""
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}
         hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
@@ -171,9 +175,11 @@ def signal_bound(
     >>> from kros.observer import Observer, relift_certificate, signal_bound
     >>> from kros.synthesis import Injection
     >>> x = np.random.default_rng(0).normal(size=(2, 200, 2)).cumsum(axis=1)
-    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, **names, sample_period_s=0.01)
     >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
-    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> model = np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",)
+    >>> observer = Observer("x", Lifting(("x",)), *model, gain([[0.5]], 0.01), Injection.STATE, 0.01)
     >>> bound = signal_bound(relift_certificate(observer), observer, batch)
     >>> bool((bound.errors <= bound.bounds).all())
     True
@@ -248,7 +254,7 @@ def _alike(one: ObserverData, other: ObserverData, batch: EpisodeBatch, seen: Co
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
-    """Return the proven gains from what the channels act on, divided by sizes, to what they add to every one of n errors; infinite where none is."""
+    """Return proven gains from what the channels act on, over sizes, to what they add to each of n errors."""
     if not len(acted):
         return np.zeros(n)
     if not np.isfinite(acted).all():
@@ -268,7 +274,7 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
 
 
 def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Course) -> tuple[Array, ErrorSystem]:
-    """Return the signals, shape (n_samples, batch, m), each of size one, and the system from them to the errors over their ranges."""
+    """Return the signals, (n_samples, batch, m), of size one, and the system from them to the scaled errors."""
     n, q = len(observer.recorded), len(observer.measured)
     start = seen.first[None, :, :n]
     later = np.concatenate([seen.omega[..., :n], seen.noise], axis=-1)

@@ -28,8 +28,8 @@ def plain(text: object) -> str:
     >>> plain("N*m"), plain("x */ system(0) /*")
     ('N·m', 'x ·/ system(0) /·')
     """
-    shown = "".join(c if c.isalnum() or c in _ALLOWED else "·" if c == "*" else "_" for c in str(text)[:_LONGEST])
-    return shown or "_"
+    shown = str(text)[:_LONGEST].replace("*", "·")
+    return "".join(c if c.isalnum() or c in _ALLOWED else "_" for c in shown) or "_"
 
 
 def plain_names(names: Iterable[str]) -> list[str]:

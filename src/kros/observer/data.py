@@ -103,46 +103,34 @@ class ObserverData:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "injection", member(Injection, self.injection, f"Observer {self.name}: the injection"))
-        if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
+        K, n, q, m = self.controller, self.lifting.n_states, len(self.measured), len(self.inputs)
+        rows, columns = self.lifting.n_lifted, m + len(self.lifting.input_functions)
+        width = columns if self.injection is Injection.INPUT else rows
+        self._require("the model A", self.A.shape, (rows, rows))
+        self._require(f"the model B, of {m} inputs and {columns - m} functions of them,", self.B.shape, (rows, columns))
+        if (K.n_inputs, K.n_outputs) != (q, width):
             raise DimensionError(
-                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and "
-                f"{len(self.lifting.input_functions)} functions of them need as many "
-                f"columns of B, found {self.B.shape[1]}."
+                f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
+                f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        width = self.B.shape[1] if self.injection is Injection.INPUT else self.A.shape[0]
-        K, n = self.controller, self.lifting.n_states
-        if (K.n_inputs, K.n_outputs) != (len(self.measured), width):
-            raise DimensionError(
-                f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} "
-                f"corrections ({self.injection.value} injection), "
-                f"found {K.n_inputs} to {K.n_outputs}."
-            )
-        self.runtime.require_fit(self.name, n, width, len(self.inputs))
-        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (
-            len(self.measured),
-            len(self.inputs),
-        ):
-            raise DimensionError(
-                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many "
-                "sizes seen in training, found "
-                f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
-            )
-        if self.monitor is not None and len(self.monitor.size) != len(self.measured):
-            raise DimensionError(
-                f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of "
-                f"{len(self.monitor.size)}."
-            )
+        self.runtime.require_fit(self.name, n, width, m)
+        if self.seen is not None:
+            self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
+        if self.monitor is not None:
+            self._require("the monitor", self.monitor.size.shape, (q,))
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.bank is not None:
-            self.bank.require_fit(
-                self.name, len(self.recorded), n, self.A.shape[0] + self.B.shape[1], len(self.measured)
-            )
+            self.bank.require_fit(self.name, len(self.recorded), n, rows + columns, q)
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
             self.guard.require_fit(self.name, n, K.n_states)
+
+    def _require(self, what: str, shape: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+        if shape != wanted:
+            raise DimensionError(f"Observer {self.name}: {what} should have shape {wanted}, found {shape}.")
 
     def __repr__(self) -> str:
         """Say what kind of observer it is, in a line."""

@@ -312,11 +312,7 @@ def _compiled(
     """Run observers of one model in the compiled loop."""
     observer, delay = observers[0], observers[0].runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observer.lifting.n_states, samples.u.shape[2]
-    order, q, window = max(o.controller.n_states for o in observers), len(observer.measured), observer.lifting.window
-    column = np.zeros((len(observers), observer.lifting.n_lifted + order + observer.B.shape[1] + q, batch))
-    known = np.where(samples.starts[0][:, None], samples.u[0], 0.0)
-    column[:, :n] = [o.initial(samples.y[0], values, known).T for o in observers]
-    low, high = (np.array(side) for side in zip(*(bounds(o.guard, n, order) for o in observers), strict=True))
+    order, earlier = max(o.controller.n_states for o in observers), len(observer.lifting.window.earlier)
     states, innovation = np.empty((n_samples, len(observers), n, batch)), None
     waiting, restarted = np.zeros((2, len(observers), batch), np.uint8)
     job: dict[str, Any] = {
@@ -324,35 +320,36 @@ def _compiled(
         "samples": n_samples,
         "batch": batch,
         "order": order,
-        "q": q,
+        "q": len(observer.measured),
         "late": delay,
         "overwrite": int(observer.bank is not None),
         "map": np.stack([_padded(o, order) for o in observers]),
         "y": samples.y.swapaxes(1, 2),
         "u": samples.u.swapaxes(1, 2),
         "measured": observer.measured,
-        "column": column,
-        "past": np.zeros((len(observers), batch, len(window.earlier))),
+        "past": np.zeros((len(observers), batch, earlier)),
         "fresh": np.ones(batch, np.uint8),
-        "low": low,
-        "high": high,
         "waiting": waiting,
         "restart": restarted,
         "states": states,
     }
+    job["column"] = np.zeros((len(observers), job["map"].shape[2], batch))
+    known = np.where(samples.starts[0][:, None], samples.u[0], 0.0)
+    job["column"][:, :n] = [o.initial(samples.y[0], values, known).T for o in observers]
+    job["low"], job["high"] = np.swapaxes([bounds(o.guard, n, order) for o in observers], 0, 1)
     job |= _limits(observer, batch) | _begins(observers, samples, values)
     if innovations:
         innovation = job["innovation"] = np.empty(samples.y.shape)
     if delay:
-        pending, earlier = _pending(samples.starts, delay), np.empty((n_samples, batch, len(window.earlier)))
-        job |= {"moving": (pending == delay) & ~samples.starts, "before": earlier, "pending": pending}
+        pending, before = _pending(samples.starts, delay), np.empty((n_samples, batch, earlier))
+        job |= {"moving": (pending == delay) & ~samples.starts, "before": before, "pending": pending}
     tape = formulas(observer.lifting, tape_of(observer.lifting, m), values, m, batch)
     loops.call("kros_relift", tape, ("relift_job", job))
     estimates = states.transpose(1, 0, 3, 2)
     if delay:
         with np.errstate(over="ignore", invalid="ignore"):
             for o, x in zip(observers, estimates, strict=True):
-                _predict(o, x, earlier, pending, samples, values)
+                _predict(o, x, before, pending, samples, values)
     return Compiled(estimates, innovation, restarted.view(bool))
 
 

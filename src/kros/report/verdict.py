@@ -118,7 +118,9 @@ def _numbers(facts: Facts) -> list[Number]:
 
 def _lag(lag_s: float | None) -> str:
     """Return how late a signal is, for a sentence."""
-    return "" if lag_s is None else f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
+    if lag_s is None:
+        return ""
+    return f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
 
 
 def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:

@@ -31,7 +31,6 @@ def export_c(
     out: Path | str,
     name: str = "observer",
     precision: str = "double",
-    study: Mapping[str, Any] | None = None,
     track: str | None = None,
     load: LoadOutput | None = None,
     held_out: HeldOut | None = None,
@@ -50,8 +49,6 @@ def export_c(
         Prefix of all public names, a C identifier.
     precision : str
         ``double`` or ``float``.
-    study : mapping, optional
-        The resolved study, written beside the source.
     track : str, optional
         A lifting parameter that follows the machine by a phase-locked loop (`PhaseLockedLoop`).
     load : LoadOutput, optional
@@ -95,8 +92,6 @@ def export_c(
             files = c_files(observer, name, precision, track, load, accuracy)
         except ConfigError as error:
             log.warning("Numerical error: not measured: %s", error)
-    if study is not None:
-        files["study.json"] = json_bytes(study).decode()
     with whole_folder(Path(out)) as folder:
         for file, text in files.items():
             write_bytes(folder / file, text.encode())
@@ -173,7 +168,9 @@ def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sample(value: float) -> str:
-    return f"{value:.17g}" if np.isfinite(value) else ("ABSENT" if np.isnan(value) else "BEYOND")
+    if np.isfinite(value):
+        return f"{value:.17g}"
+    return "ABSENT" if np.isnan(value) else "BEYOND"
 
 
 def _state_bytes(context: Mapping[str, Any]) -> int:

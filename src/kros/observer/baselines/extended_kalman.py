@@ -110,39 +110,30 @@ class ExtendedKalman:
         x = np.zeros((k, batch, n))
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
-        drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
-        linear, coupling = self.A[:n, :n], self.A[:n, n:]
-        missing = ~np.isfinite(y)
-        gone = np.atleast_1d(missing.any(axis=(1, 2)))
-        driven = u @ drive if not lifting.input_functions else None
-        estimates = np.empty((n_samples, k, batch, n))
-        earlier: Array | None = None
+        estimates, earlier = np.empty((n_samples, k, batch, n)), None
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for sample in range(n_samples):
                 estimates[sample] = x
-                PC, nu = P[..., C], y[sample] - x[..., C]
-                L = _divided(PC, PC[..., C, :] + self.R)
-                if gone[sample]:
-                    lost = np.asarray(
-                        missing[sample].any(axis=-1)
-                    )  # a sample with a measurement missing is left out whole
-                    L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
-                x = x + (L @ nu[..., None])[..., 0]
-                P = P - L @ PC.swapaxes(-1, -2)
+                x, P = self._corrected(x, P, y[sample])
                 held = np.broadcast_to(u[sample], (k, *u[sample].shape))
-                if lifting.history:
-                    earlier = lifting.window.hold(x, held) if earlier is None else earlier
-                    window = np.concatenate([x, earlier], axis=-1)
-                else:
-                    window = x
-                inflow = driven[sample] if driven is not None else lifting.lift_inputs(held, window, values) @ drive
-                x = lifting.lift(window, values) @ drift + inflow
-                F = linear + coupling @ lifting.slopes(window, values)[..., :n] if lifting.functions else linear
+                earlier = lifting.window.hold(x, held) if earlier is None else earlier
+                window = np.concatenate([x, earlier], axis=-1)
+                F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
+                x = (
+                    lifting.lift(window, values) @ self.A[:n].T
+                    + lifting.lift_inputs(held, window, values) @ self.B[:n].T
+                )
                 P = F @ P @ np.swapaxes(F, -1, -2) + Q
                 P = (P + P.swapaxes(-1, -2)) / 2
-                if earlier is not None:
-                    earlier = lifting.window.advance(window, held)
+                earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
+        """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
+        PC, nu = P[..., list(self.measured)], y - x[..., list(self.measured)]
+        L, lost = _divided(PC, PC[..., list(self.measured), :] + self.R), np.atleast_1d(~np.isfinite(y).all(axis=-1))
+        L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
+        return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
     def _compiled(self, loops: Library, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
         lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape

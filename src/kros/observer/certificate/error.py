@@ -179,30 +179,6 @@ class ErrorSystem:
         return replace(self, B=-self.L * self.place, D=np.eye(width) - self.nested * self.place, start=None)
 
 
-class _Signals:
-    """Rows of signals as functions of [xi, p, w]."""
-
-    def __init__(self, n_xi: int, n_p: int, n_w: int) -> None:
-        self.sizes = n_xi, n_p, n_w
-
-    def _one(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
-        rows = np.zeros((count, sum(self.sizes)))
-        rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
-        return rows
-
-    def xi(self, first: int, count: int) -> Array:
-        return self._one(0, first, count)
-
-    def p(self, first: int, count: int) -> Array:
-        return self._one(1, first, count)
-
-    def w(self, first: int, count: int, scale: npt.ArrayLike) -> Array:
-        return self._one(2, first, count, scale)
-
-    def split(self, rows: Array) -> list[Array]:
-        return np.split(rows, np.cumsum(self.sizes)[:-1], axis=1)
-
-
 def error_system(
     observer: ObserverData,
     scales: ReliftScales | None = None,
@@ -210,82 +186,103 @@ def error_system(
     parameters: Box | None = None,
 ) -> ErrorSystem:
     """Return the error dynamics of an observer as it runs, its delay and limits included."""
-    scales = scales or ReliftScales.ones(observer)
-    lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
-    n, delay, limits = lifting.n_states, observer.runtime.delay, observer.runtime
-    if (scales.error.shape, scales.residual.shape, scales.noise.shape) != ((n,), (n,), (q,)):
-        raise DimensionError(
-            f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found "
-            f"{scales.error.shape}, "
-            f"{scales.residual.shape}, {scales.noise.shape}."
-        )
-    lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
-    names = [delayed_name(name, lag) for name, lag in lags]
-    lower, upper = slope_box(observer, names, box, parameters)
-    columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
-    functions = lifting.functions + lifting.input_functions
-    middle, half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
-    moving = np.argwhere((half > _CONSTANT * np.abs(middle)) & np.any(columns, axis=0)[:, None])
-    clips, cuts, into = limits.clipped_states(n), limits.limited_corrections(observer.into[:n]), observer.into[:n]
+    return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()
 
-    h, order, link = len(names), K.n_states, len(clips) + len(moving)
-    slots = _driven(observer, scales, h)
-    width, own = len(slots), sum(i < n for i in slots)
-    shown = _counted(scales)
-    n_xi, n_p = h + order + (delay * width + len(shown) if delay else 0), link * (delay + 1) + len(cuts)
-    of = _Signals(n_xi, n_p, n + q)
-    q_rows, channels = np.zeros((n_p, sum(of.sizes))), [""] * n_p
-    rest = np.zeros(n_p)
 
-    following = np.zeros((h, h))
-    following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, h - n))]) + columns @ middle
-    for row, (name, lag) in enumerate(lags[n:], n):
-        following[row, lags.index((name, lag - 1))] = 1.0
+class _Assembly:
+    """The error dynamics while they are put together: rows of signals as functions of [xi, p, w]."""
 
-    def predicted(e: Array, at: int) -> tuple[Array, Array]:
+    def __init__(self, observer: ObserverData, scales: ReliftScales, box: Box | None, parameters: Box | None) -> None:
+        lifting, limits, n, q = observer.lifting, observer.runtime, observer.lifting.n_states, len(observer.measured)
+        shapes = (scales.error.shape, scales.residual.shape, scales.noise.shape)
+        if shapes != ((n,), (n,), (q,)):
+            raise DimensionError(
+                f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found "
+                f"{', '.join(map(str, shapes))}."
+            )
+        self.observer, self.scales, self.n = observer, scales, n
+        self.delay, self.order = limits.delay, observer.controller.n_states
+        lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
+        self.names, self.h = [delayed_name(name, lag) for name, lag in lags], len(lags)
+        lower, upper = slope_box(observer, self.names, box, parameters)
+        self.columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
+        middle, self.half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
+        moves = (self.half > _CONSTANT * np.abs(middle)) & np.any(self.columns, axis=0)[:, None]
+        self.moving, self.clips = np.argwhere(moves), limits.clipped_states(n)
+        self.cuts, self.into = limits.limited_corrections(observer.into[:n]), observer.into[:n]
+        self.following = np.zeros((self.h, self.h))
+        self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
+        for row, (name, lag) in enumerate(lags[n:], n):
+            self.following[row, lags.index((name, lag - 1))] = 1.0
+        self.slots, self.counted = _driven(observer, scales, self.h), _counted(scales)
+        self.link = len(self.clips) + len(self.moving)
+        late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
+        self.sizes = (self.h + self.order + late, self.link * (self.delay + 1) + len(self.cuts), n + q)
+        self.q_rows = np.zeros((self.sizes[1], sum(self.sizes)))
+        self.channels, self.rest = [""] * self.sizes[1], np.zeros(self.sizes[1])
+
+    def rows(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
+        """Return some entries of xi (0), p (1) or w (2)."""
+        rows = np.zeros((count, sum(self.sizes)))
+        rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
+        return rows
+
+    def bound(self, signal: Array, i: int, channel: int, what: str) -> None:
+        """Let a limit act on entry i of a signal: half of it is in the middle, the other half moves."""
+        self.q_rows[channel], self.channels[channel], self.rest[channel] = _WIDER / 2 * signal[i], what, 1.0
+        signal[i] = signal[i] / 2 + self.rows(1, channel, 1)[0]
+
+    def predicted(self, e: Array, at: int) -> tuple[Array, Array]:
         """Errors (h) that act, limits applied, and the next ones without correction; channels begin at `at`."""
-        e, late = e.copy(), f", {at // link} samples on" if link and at else ""
-        for k, i in enumerate(clips, at):
-            q_rows[k], channels[k], rest[k] = _WIDER / 2 * e[i], f"limits of {names[i]}{late}", 1.0
-            e[i] = e[i] / 2 + of.p(k, 1)[0]
-        after = following @ e
-        for k, (i, j) in enumerate(moving, at + len(clips)):
-            q_rows[k], channels[k] = half[i, j] * e[j], f"{functions[i]} by {names[j]}{late}"
-            after[:n] += np.outer(columns[:, i], of.p(k, 1)[0])
+        e, late = e.copy(), f", {at // self.link} samples on" if self.link and at else ""
+        functions = self.observer.lifting.functions + self.observer.lifting.input_functions
+        for k, i in enumerate(self.clips, at):
+            self.bound(e, i, k, f"limits of {self.names[i]}{late}")
+        after = self.following @ e
+        for k, (i, j) in enumerate(self.moving, at + len(self.clips)):
+            self.q_rows[k] = self.half[i, j] * e[j]
+            self.channels[k] = f"{functions[i]} by {self.names[j]}{late}"
+            after[: self.n] += np.outer(self.columns[:, i], self.rows(1, k, 1)[0])
         return e, after
 
-    e, after = predicted(of.xi(0, h), 0)
-    nu = e[list(observer.measured)] + of.w(n, q, scales.noise)
-    v = K.C @ of.xi(h, order) + K.D @ nu
-    for k, i in enumerate(cuts, n_p - len(cuts)):
-        q_rows[k], channels[k], rest[k] = _WIDER / 2 * v[i], f"limit of correction {i}", 1.0
-        v[i] = v[i] / 2 + of.p(k, 1)[0]
-    after[:n] -= into @ v
-    omega = of.w(0, n, scales.residual)
-    held = [of.xi(h + order + i * width, width) for i in range(delay)]  # residuals, the latest first
-    enters = np.zeros((h, width))
-    enters[slots, range(width)] = 1.0
-    arriving = np.zeros((width, sum(of.sizes)))
-    arriving[:own] = omega[slots[:own]]
-    new = [
-        after + enters @ held[-1] if delay else np.vstack([after[:n] + omega, after[n:]]),
-        K.A @ of.xi(h, order) + K.B @ nu,
-    ]
-    if delay:
-        ahead = new[0]
-        for i in range(1, delay + 1):
-            ahead = predicted(ahead, i * link)[1] + enters @ (held[delay - 1 - i] if i < delay else arriving)
-        new += [arriving, *held[:-1], ahead[shown]]
-    A, L, B = of.split(np.vstack(new))
-    M, E, D = of.split(q_rows)
-    C = np.zeros((n, n_xi))
-    C[shown, n_xi - len(shown) + np.arange(len(shown)) if delay else shown] = 1 / scales.error[shown]
-    start = np.eye(n_xi, h)
-    if delay:
-        start = np.zeros((n_xi, h))
-        start[h + order : h + order + width] = enters.T
-        start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
-    return ErrorSystem(A, L, B, M, D, C, observer.sample_period_s, tuple(channels), E if E.any() else None, rest, start)
+    def system(self) -> ErrorSystem:
+        """Return the error dynamics."""
+        n, h, order, K = self.n, self.h, self.order, self.observer.controller
+        e, after = self.predicted(self.rows(0, 0, h), 0)
+        nu = e[list(self.observer.measured)] + self.rows(2, n, len(self.observer.measured), self.scales.noise)
+        v = K.C @ self.rows(0, h, order) + K.D @ nu
+        for k, i in enumerate(self.cuts, self.sizes[1] - len(self.cuts)):
+            self.bound(v, i, k, f"limit of correction {i}")
+        after[:n] -= self.into @ v
+        following = self.late(after) if self.delay else [after]
+        if not self.delay:
+            after[:n] += self.rows(2, 0, n, self.scales.residual)
+        following.insert(1, K.A @ self.rows(0, h, order) + K.B @ nu)
+        (A, L, B), (M, E, D) = (
+            np.split(rows, np.cumsum(self.sizes)[:-1], axis=1) for rows in (np.vstack(following), self.q_rows)
+        )
+        n_xi, shown = self.sizes[0], self.counted
+        start, C = np.eye(n_xi, h), np.zeros((n, n_xi))
+        places = n_xi - len(shown) + np.arange(len(shown)) if self.delay else shown
+        C[shown, places] = 1 / self.scales.error[shown]
+        if self.delay:
+            start = np.zeros((n_xi, h))
+            start[h + order + np.arange(len(self.slots)), self.slots] = 1.0
+            start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
+        dt, nested = self.observer.sample_period_s, E if E.any() else None
+        return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, self.rest, start)
+
+    def late(self, after: Array) -> list[Array]:
+        """Return what follows with a delay: the error as measured, its residuals, the latest first, and the predicted one."""
+        width, inside = len(self.slots), [i for i in self.slots if i < self.n]
+        held = [self.rows(0, self.h + self.order + i * width, width) for i in range(self.delay)]
+        enters, arriving = np.eye(self.h)[:, self.slots], np.zeros((width, sum(self.sizes)))
+        arriving[: len(inside)] = self.rows(2, 0, self.n, self.scales.residual)[inside]
+        measured = ahead = after + enters @ held[-1]
+        for i in range(1, self.delay + 1):
+            ahead = self.predicted(ahead, i * self.link)[1]
+            ahead = ahead + enters @ (held[self.delay - 1 - i] if i < self.delay else arriving)
+        return [measured, arriving, *held[:-1], ahead[self.counted]]
 
 
 def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:

@@ -37,11 +37,7 @@ _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an epis
 _TOO_SHARP = "no bound: the responses of its error are too sharp to be enclosed by the arcs that are tried"
 _RIDGE = 1e-6
 _SPARE = 1e-6
-_OTHERS = (
-    0.0,
-    1e-3,
-    1.0,
-)  # weights of other states' errors beside the one that counts: with them the Riccati equation is better conditioned
+_OTHERS = (0.0, 1e-3, 1.0)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +56,6 @@ class SignalBound:
         For any signal with the energies of one unit.
     errors : ndarray, shape (units, n)
         RMS errors as they were.
-    movement : ndarray, shape (n,)
-        What slopes and limits may add, within `cover`.
     sizes : ndarray, shape (n,)
         Ranges of the states; all of the above are in the states' own units of measure.
     reason : str
@@ -90,7 +84,6 @@ class SignalBound:
     cover: Array
     bounds: Array
     errors: Array
-    movement: Array
     sizes: Array
     reason: str = ""
     outside: tuple[str, ...] = ()
@@ -117,24 +110,18 @@ class SignalBound:
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}
         hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratios, over = self.ratios[:, hidden], (self.cover / self.errors)[:, hidden]
-        ratios, over = (v[np.isfinite(self.bounds[:, hidden]) & np.isfinite(v)] for v in (ratios, over))
+        ratios = self.ratios[:, hidden]
+        ratios = ratios[np.isfinite(ratios)]
         facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
         facts |= {} if self.within is None else {"set_within_limits": self.within}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
-        facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
-        return facts | {
-            "set_cover_to_error_max": float(over.max()) if over.size else None,
-            "set_outside": list(self.outside),
-        }
+        ratio = {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
+        return facts | ratio | {"set_outside": list(self.outside)}
 
     def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""
         by = np.asarray(factors, dtype=float)
-        return replace(
-            self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")}
-        )
+        return replace(self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "sizes")})
 
 
 def signal_bound(
@@ -143,7 +130,6 @@ def signal_bound(
     batch: EpisodeBatch,
     estimates: Array | None = None,
     known: dict[bytes, BandEnergies] | None = None,
-    seen: Course | None = None,
 ) -> SignalBound:
     """Bound the errors of an observer for signals like those of recorded episodes.
 
@@ -158,8 +144,6 @@ def signal_bound(
         Of `run_observer` for these measurements; it is run where they are missing.
     known : dict, optional
         Energies that were found already, for observers of one model: filled here.
-    seen : Course, optional
-        What `course` found for these, where it is known already.
 
     Returns
     -------
@@ -184,66 +168,58 @@ def signal_bound(
     >>> bool((bound.errors <= bound.bounds).all())
     True
     """
-    seen = seen or course(observer, batch, estimates)
-    n, within, inside = len(observer.recorded), None, seen.taken(observer)
+    seen = course(observer, batch, estimates)
+    n, taken, within = len(observer.recorded), seen.taken(observer), None
     if observer.runtime.clipped_states(observer.lifting.n_states):
         free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
         if _alike(free, observer, batch, seen):
             observer, within = free, True
-    units = list(dict.fromkeys(batch.units))
+    units = tuple(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
-    beyond = np.sqrt(member @ seen.mean_square(seen.beyond))
     errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n] + seen.beyond))
-    nothing = np.full(n, np.inf)
-    found = SignalBound(
-        observer.recorded,
-        tuple(units),
-        nothing,
-        np.full(errors.shape, np.inf),
-        errors,
-        nothing,
-        certificate.scales.error[:n].copy(),
-        within=within,
-    )
+    none, sizes = np.full(n, np.inf), certificate.scales.error[:n].copy()
+    result = SignalBound(observer.recorded, units, none, np.full(errors.shape, np.inf), errors, sizes, within=within)
     if not certificate.certified:
-        return replace(found, reason="it has no certificate as it runs")
+        return replace(result, reason="it has no certificate as it runs")
     signal, system = _signals(certificate, observer, seen)
+    if not system.moved().is_stable():
+        return replace(result, reason="its error does not settle where slopes and limits rest")
+    bounds = _bounds(system, n, _energies(signal, batch, known).of_units(batch.units))
+    if bounds is None:
+        return replace(result, reason=_TOO_SHARP)
+    cover, each = bounds
+    outside = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not taken[rows].all())
+    each[[unit in outside for unit in units]] = np.inf
+    reason = "" if np.isfinite(cover).all() else "what slopes and limits can add has no proven gain"
+    by, beyond = sizes * (1 + _SPARE), np.sqrt(member @ seen.mean_square(seen.beyond))
+    cover = cover * by + beyond.max(axis=0)
+    return replace(result, cover=cover, bounds=each * by + beyond, reason=reason, outside=outside)
+
+
+def _bounds(system: ErrorSystem, n: int, energies: BandEnergies) -> tuple[Array, Array] | None:
+    """Return bounds of n scaled errors for the cover of all units, (n,), and for every unit, (units, n)."""
     frozen = system.moved()
-    if not frozen.is_stable():
-        return replace(found, reason="its error does not settle where slopes and limits rest")
-    energies = _energies(signal, batch, known).of_units(batch.units)
-    plant = StateSpace(
-        frozen.A,
-        frozen.B,
-        np.vstack([system.C[:n], frozen.C]),
-        np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]),
-        system.dt,
-    )
+    C, D = np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D])
+    plant = StateSpace(frozen.A, frozen.B, C, D, system.dt)
     # The cover is made for the errors and for what slopes act on: a matrix that no unit exceeds, where it matters.
     rough = majorants(plant, energies.edges, energies.energy.mean(axis=0))
     if rough is None:
-        return replace(found, reason=_TOO_SHARP)
-    matter = np.einsum(
-        "p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough
-    )
+        return None
+    size = np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny)
+    matter = np.einsum("p,pbij->bij", 1 / size, rough)
     matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
     final = cover(energies.energy, matter)
     M = majorants(plant, energies.edges, final)
     if M is None:
-        return replace(found, reason=_TOO_SHARP)
-    linear, own = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
-    acted = np.maximum(linear[n:], np.finfo(float).tiny)
+        return None
+    whole, each = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
+    acted = np.maximum(whole[n:], np.finfo(float).tiny)
     kappa = mismatch_gains(system, acted, n)
+    share = np.linalg.norm(each[:, n:] / acted, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
-        movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
-        each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
-    left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
-    each[[unit in left for unit in units]] = np.inf
-    reason = "" if np.isfinite(kappa).all() else "what slopes and limits can add has no proven gain"
-    by = found.sizes * (1 + _SPARE)
-    of_all = (linear[:n] + movement) * by + beyond.max(axis=0)
-    return replace(found, cover=of_all, bounds=each * by + beyond, movement=movement * by, reason=reason, outside=left)
+        movement = [np.where(kappa > 0, kappa * part, 0.0) for part in (np.sqrt(len(acted)), share)]
+    return whole[:n] + movement[0], each[:, :n] + movement[1]
 
 
 def _alike(one: ObserverData, other: ObserverData, batch: EpisodeBatch, seen: Course) -> bool:

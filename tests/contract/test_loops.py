@@ -16,7 +16,6 @@ from machines import LIMITS, MACHINES, drive, samples
 
 from kros.core.artifacts import read_json
 from kros.core.errors import ConfigError
-from kros.evaluate.errors import summarise_all
 from kros.export import HeldOut, export_c, export_fmu
 from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
@@ -84,26 +83,6 @@ def test_observers_side_by_side_run_alike(both):
     y, u, phase = machines_of()
     observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
     assert_same(*both(lambda: run_observers(observers, y, u, {"phase": phase})))
-
-
-@needs_compiler
-def test_errors_and_spectra_are_alike(both):
-    """Episodes that end within a segment and between two, with memories behind the states and an estimate that is lost."""
-    rng, lengths = np.random.default_rng(4), np.array([1500, 40, 511, 512, 767, 768, 1023, 1024, 1279, 1280, 1499])
-    estimates = rng.normal(size=(1500, 3, 5, len(lengths))).transpose(1, 0, 3, 2)
-    estimates[1, 700, 3, 1], estimates[2, 1100, 9, 0] = np.inf, np.nan
-    truth = 2 * rng.normal(size=(1500, len(lengths), 2))
-    truth[:, 7, 1] = 0.0
-
-    def run():
-        found = summarise_all(estimates, truth, lengths, 0.01)
-        return [
-            getattr(own, name)
-            for own in found
-            for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz")
-        ]
-
-    assert_same(*both(run))
 
 
 def model_of(lifting, units, rng):

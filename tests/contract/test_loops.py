@@ -279,17 +279,6 @@ def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, 
         assert len([r for r in caplog.records if r.name == caplog.records[-1].name]) == 1
 
 
-@needs_compiler
-def test_a_user_without_a_home_compiles_among_temporary_files(tmp_path, monkeypatch):
-    def nowhere():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(compiler.Path, "home", nowhere)
-    monkeypatch.setattr(compiler.tempfile, "gettempdir", lambda: str(tmp_path))
-    assert compiler.load(SOURCE, FLAGS).kros_answer() == 42
-
-
 def test_an_unknown_choice_is_refused(monkeypatch):
     monkeypatch.setenv("KROS_LOOPS", "fortran")
     library.cache_clear()

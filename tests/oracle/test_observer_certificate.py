@@ -23,7 +23,6 @@ from kros.observer.certificate.multipliers import best_multipliers
 from kros.observer.certificate.proof import _clearly_positive, _eliminated, _positive, proven
 from kros.observer.certificate.riccati import lyapunov_factor, riccati_proposals
 from kros.observer.certificate.search import proven_gain
-from kros.observer.residual.one_step import one_step_residual
 from kros.synthesis import Injection
 
 
@@ -309,18 +308,6 @@ def test_a_proof_stops_at_the_norm(seed: int) -> None:
     R = lyapunov_factor(error, np.zeros(0), 1.01 * norm)
     for factor in (0.99, 1.01, 1.1):
         assert proven(R, [(A, system.B)], system.C, factor * norm) == (factor >= 1.01)
-
-
-def test_the_residual_bound_of_a_recording_holds_sample_by_sample() -> None:
-    """The identity behind it all: e+ = f(x) - f(x_hat) - correction + omega, with the true slope of the sine between the two."""
-    observer = scalar(0.6, 0.3, 0.2)
-    rng = np.random.default_rng(0)
-    x, u = rng.standard_normal((50, 1, 1)), rng.standard_normal((50, 1, 1))
-    estimate = run_observer(observer, x, u)
-    e, omega = x - estimate, one_step_residual(observer.lifting, observer.A, observer.B, x, u)
-    slope = (np.sin(x) - np.sin(estimate))[1:-1] / e[1:-1]
-    assert np.abs(slope).max() <= 1
-    assert e[2:] == pytest.approx((0.6 - 0.2 + 0.3 * slope) * e[1:-1] + omega[1:], abs=1e-12)
 
 
 def test_a_certificate_survives_saving(tmp_path) -> None:  # type: ignore[no-untyped-def]

@@ -28,7 +28,7 @@ class Kind(str, Enum):
     DROPPED
         Single samples are missing at random: share of samples, 0 to 1.
     GAP
-        Samples are missing in pieces of so many samples, at random places, a tenth of all samples and at least one
+        Samples are missing in pieces of this many samples, at random places, a tenth of all samples and at least one
         piece an episode.
     BIAS
         A constant is added to every measurement: share of its largest value.
@@ -39,7 +39,7 @@ class Kind(str, Enum):
     PHASE
         The machine's lifting parameter is wrong, by so much in its own unit, rad for a phase.
     DELAY
-        Measurements are delayed by so many samples, unknown to the observer.
+        Measurements are delayed by this many samples, unknown to the observer.
 
     Examples
     --------

@@ -159,7 +159,7 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
 
 
 def _window(size: int) -> Array:
-    """Hann's, of so many samples."""
+    """Hann's window."""
     return np.asarray(0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size))
 
 

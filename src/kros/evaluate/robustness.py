@@ -63,7 +63,7 @@ class DisturbedEpisodes:
         ----------
         run : callable
             Takes measurements and inputs (n_samples, batch, m) and returns the estimates of every estimator, shape
-            (estimator, n_samples, batch, ...); states beyond the recorded ones are left out.
+            (estimator, n_samples, batch, ...); internal states are left out.
         estimators : int
             How many `run` returns, which limits what is run at once.
 

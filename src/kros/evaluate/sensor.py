@@ -50,7 +50,7 @@ def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> t
 
 
 def _late(y: Array, behind: Array) -> Array:
-    """Values of signals, (n_samples, batch), so many samples ago, on a line between samples."""
+    """Delayed values of signals, (n_samples, batch), on a line between samples."""
     at = np.clip(np.arange(len(y))[:, None] - behind, 0, len(y) - 1)
     low = np.floor(at).astype(int)
     share = at - low

@@ -117,7 +117,7 @@ def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Folders to compile into that belong to this user alone: nobody else may put a library there."""
+    """Folders to compile into that belong to this user alone: no other may put a library there."""
     folders = [Path(tempfile.gettempdir()) / f"kros-{os.getuid()}"]
     with contextlib.suppress(RuntimeError):  # a user without a home
         cache = os.environ.get("XDG_CACHE_HOME")

@@ -1,4 +1,4 @@
-"""The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with.
+"""The observer at run time: one-step predictor with retraction and re-lifting, and the baselines it is compared with.
 
 Examples
 --------

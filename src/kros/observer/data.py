@@ -60,17 +60,17 @@ class ObserverData:
     runtime : Runtime
         Delay of the measurement, limits, and the gain of filtered estimates.
     seen : Seen, optional
-        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none
+        Largest sizes of measurements and inputs in training; larger samples are implausible (see `screen`); none
         by default.
     sensor : mapping of str to Sensor
-        What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
+        Declared sensors of measured states, by name. What arrives late is corrected by `runtime`.
     monitor : Monitor, optional
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
     bank : FilterBank, optional
         Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the
         correction is zero.
     guard : Guard, optional
-        Bounds of its states beyond which it starts again; by default it does so where one is not finite.
+        Bounds of its states, outside which it starts again; by default where one is not finite.
     about : mapping of str to JSON values
         What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes
         with it.
@@ -220,9 +220,8 @@ class ObserverData:
         for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
             if names:
                 raise ConfigError(
-                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its "
-                    "lifting has "
-                    f"{', '.join(known) or 'no parameters'}."
+                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting "
+                    f"has {', '.join(known) or 'no parameters'}."
                 )
         for name in known if shape is not None else ():
             found = np.shape(values[name])

@@ -29,7 +29,7 @@ from ..core.errors import ConfigError, DataError
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-LARGEST = 1e3  # sizes of the innovation, beyond which more says nothing
+LARGEST = 1e3  # sizes of the innovation that count at most
 RECOVERY = 4  # samples that are not judged after one that is not good
 WEIGHT = 16  # of all bands together
 QUIET = 0.01  # of its limit: a band that is more quiet says no more

@@ -249,8 +249,7 @@ class RunningObserver:
         if array.shape != (len(names),):
             raise DimensionError(
                 f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape "
-                f"({len(names)},), "
-                f"found shape {array.shape}."
+                f"({len(names)},), found shape {array.shape}."
             )
         return array
 

@@ -121,8 +121,7 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
     if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2] or not len(y):
         raise DimensionError(
             f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a "
-            "last "
-            "axis for their channels and at least one sample."
+            "last axis for their channels and at least one sample."
         )
     if u.shape[2] != len(inputs):
         raise DimensionError(

@@ -75,9 +75,8 @@ class PhaseLockedLoop:
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
                 f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter "
-                f"{name!r} and measurements without delay, "
-                f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of "
-                f"{observer.runtime.delay}."
+                f"{name!r} and measurements without delay, found parameters {lifting.parameters}, a history of "
+                f"{lifting.history} and a delay of {observer.runtime.delay}."
             )
         if not settle_s > 0:
             raise ConfigError(
@@ -126,8 +125,7 @@ def measurement_sizes(observer: ObserverData) -> Array:
     if observer.seen is None:
         raise ConfigError(
             f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of "
-            "their sizes, which it "
-            "does not know; give it Observer(..., seen=Seen(measured, inputs))."
+            "their sizes, which it does not know; give it Observer(..., seen=Seen(measured, inputs))."
         )
     return np.where(observer.seen.measured > 0, observer.seen.measured, 1.0)
 

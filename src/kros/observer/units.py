@@ -1,7 +1,7 @@
 """Units of measure: an observer for signals divided by other sizes, and the units of the recordings.
 
 An observer works in the channels' units, and its file says by which factor every channel was multiplied when the files
-were read: generated code and `kros estimate` take and give what stands in the files that a study read.
+were read: generated code and `kros estimate` use the units of the files that a study read.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
 
 
 def recorded_factors(observer: ObserverData, names: Sequence[str]) -> npt.NDArray[np.float64]:
-    """Return the factor of every channel: its value is the factor times what stands in the recordings."""
+    """Return the factor of every channel: its value is the factor times the recorded one."""
     return np.array([recorded_channel(observer, name).factor for name in names])
 
 

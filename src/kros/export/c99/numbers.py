@@ -270,7 +270,7 @@ class Source:
         }
 
     def load_torque(self) -> dict[str, Any] | None:
-        """Return the numbers of `AngleLoad`, in double precision: it sums up for as long as it runs."""
+        """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
         if self.load is None:
             return None
         level, places, write = self.load.level, self.observer.recorded, Precision().literal
@@ -356,7 +356,7 @@ class Source:
         return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
 
     def symbol(self, name: str) -> str:
-        """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""
+        """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
         lifting = self.observer.lifting
         for names, array in ((lifting.window.names, "w"), (lifting.parameters, "p"), (self.observer.inputs, "u")):
             if name in names:

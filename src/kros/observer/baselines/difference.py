@@ -52,8 +52,7 @@ class FilteredDifference:
         if not 0 < self.cutoff_hz < 0.5 / self.sample_period_s:
             raise ConfigError(
                 f"Filtered difference: the cut-off of {self.cutoff_hz:g} Hz should lie between 0 and "
-                f"{0.5 / self.sample_period_s:g} Hz, half the sampling "
-                "frequency."
+                f"{0.5 / self.sample_period_s:g} Hz, half the sampling frequency."
             )
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:

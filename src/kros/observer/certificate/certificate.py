@@ -1,4 +1,4 @@
-r"""Certificate of an observer as it runs: retracted and re-lifted at every step.
+r"""Certificate of an observer at run time: retracted and re-lifted at every step.
 
 For every true trajectory and every sequence of measurement noise, whatever machine they come from,
 
@@ -57,7 +57,7 @@ class ReliftStatus(str, Enum):
 
 @dataclass(frozen=True, eq=False)
 class ReliftCertificate:
-    """What is proven about an observer as it runs.
+    """What is proven about an observer at run time.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def relift_certificate(
     scales: ReliftScales | None = None,
     parameters: Box | None = None,
 ) -> ReliftCertificate:
-    """Certify an observer as it runs, with any lifting of bounded slopes and any correction.
+    """Certify an observer at run time, with any lifting of bounded slopes and any correction.
 
     Parameters
     ----------

@@ -185,7 +185,7 @@ def error_system(
     box: Box | None = None,
     parameters: Box | None = None,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs, its delay and limits included."""
+    """Return the error dynamics of an observer at run time, its delay and limits included."""
     return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()
 
 
@@ -273,7 +273,7 @@ class _Assembly:
         return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, self.rest, start)
 
     def late(self, after: Array) -> list[Array]:
-        """Return what follows with a delay: the error as measured, its residuals, the latest first, and the predicted one."""
+        """Return what follows with a delay: the measured error, its residuals, the latest first, and the predicted one."""
         width, inside = len(self.slots), [i for i in self.slots if i < self.n]
         held = [self.rows(0, self.h + self.order + i * width, width) for i in range(self.delay)]
         enters, arriving = np.eye(self.h)[:, self.slots], np.zeros((width, sum(self.sizes)))

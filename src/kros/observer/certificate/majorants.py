@@ -30,7 +30,7 @@ from ...synthesis.worst_case.arcs import Enclosure
 
 Array = npt.NDArray[Any]
 _CLOSE = 0.004  # distance from segments, of a row's size in its band, or of its mean size over all of them
-_ARCS, _MOST_ARCS = 20_000, 40_000  # beyond which arcs of finite reach are not cut further, and none at all
+_ARCS, _MOST_ARCS = 20_000, 40_000  # at most, where an arc has a finite reach, and at all
 _AT_ONCE = 4_000_000  # numbers of resolvents in memory
 _ROUNDS = 30
 _PARTS = 8  # most that an arc is cut into at once

@@ -14,7 +14,7 @@ from .riccati import Proposal, riccati_proposals
 
 MOST_CORNERS = 64  # that are visited
 _LONGEST = 3
-_FEW_CORNERS = 4  # beyond which one larger matrix is decided sooner
+_FEW_CORNERS = 4  # that are decided one by one; for more, one larger matrix is decided sooner
 
 
 def frozen_gain(system: ErrorSystem) -> float:
@@ -51,8 +51,7 @@ def growing_sequence(system: ErrorSystem) -> str:
                 plural = "s" if length > 1 else ""
                 return (
                     f"The error grows: a sequence that repeats {length} corner{plural} of what can happen multiplies "
-                    "it "
-                    f"by {radius ** (1 / length):.6g} a step."
+                    f"it by {radius ** (1 / length):.6g} a step."
                 )
     return ""
 

@@ -42,7 +42,7 @@ _OTHERS = (0.0, 1e-3, 1.0)  # weights of other states' errors: with them the Ric
 
 @dataclass(frozen=True, eq=False)
 class SignalBound:
-    """Bounds on the errors of one observer as it runs.
+    """Bounds on the errors of one observer at run time.
 
     Parameters
     ----------
@@ -181,7 +181,7 @@ def signal_bound(
     none, sizes = np.full(n, np.inf), certificate.scales.error[:n].copy()
     result = SignalBound(observer.recorded, units, none, np.full(errors.shape, np.inf), errors, sizes, within=within)
     if not certificate.certified:
-        return replace(result, reason="it has no certificate as it runs")
+        return replace(result, reason="it has no certificate at run time")
     signal, system = _signals(certificate, observer, seen)
     if not system.moved().is_stable():
         return replace(result, reason="its error does not settle where slopes and limits rest")

@@ -86,8 +86,7 @@ def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[st
     if size < FEWEST_SAMPLES:
         raise DataError(
             f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least "
-            f"{FEWEST_SAMPLES} are needed; "
-            "leave short episodes out."
+            f"{FEWEST_SAMPLES} are needed; leave short episodes out."
         )
     size -= size % 2
     hann = np.sin(np.pi * np.arange(size) / size) ** 2

@@ -19,11 +19,10 @@ from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
-from .origin import FAR, OriginShift
+from .origin import FAR, OriginShift, find_shift
 from .realise import Realised
 
 Array = npt.NDArray[np.float64]
-FAR_SINGLE = 8  # periods from the origin, as far as single precision goes
 
 
 @dataclass(frozen=True)
@@ -72,7 +71,8 @@ class Source:
         realised = Realised.of(observer)
         observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
-        return cls(realised, name, Precision(precision), realised.shift, loop, load)
+        shift = find_shift(realised.observer) if precision == "float" else None
+        return cls(realised, name, Precision(precision), shift, loop, load)
 
     @property
     def observer(self) -> Observer:
@@ -194,7 +194,6 @@ class Source:
         shift, o, write = self.shift, self.observer, Precision().literal
         if shift is None:
             return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
-        far = (FAR_SINGLE if self.precision.type == "float" else FAR) * shift.period
         return {
             "shift": shift,
             "shift_states": self.wide(shift.states),
@@ -202,7 +201,7 @@ class Source:
             "shift_rest": self.wide(shift.rest),
             "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
             "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
-            "far": self.precision.literal(far),
+            "far": self.precision.literal(FAR * shift.period),
             "period": write(shift.period),
             "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
         }

@@ -7,8 +7,8 @@ together,
 
 and the lifted functions repeat with a period P, an observer may run on ``x - o s_x``, ``y - o`` and ``u - o s_u`` with
 an origin o that is a multiple of P: the same estimates, of small numbers. There are such directions for nearly every
-model, since there are more signals than equations; the smallest one is taken. Generated code of either precision runs
-so; double precision in Python does without.
+model, since there are more signals than equations; the smallest one is taken. Generated code of
+single precision runs so; double precision does without.
 """
 
 from __future__ import annotations
@@ -24,12 +24,10 @@ from ...lifting import Lifting
 from ...observer.data import ObserverData
 
 Array = npt.NDArray[np.float64]
-Long = npt.NDArray[np.longdouble]
-FAR = 1024  # periods from the origin, as far as double precision goes
-_EXACT, _NOTHING = 1e-11, 1e-13
-_SAME = 1e-18  # nothing, in extended precision
+FAR = 8  # periods from the origin, as far as single precision goes
+_ROUNDING = 5e4 * np.finfo(float).eps  # of the largest term
 _WHOLE = 0.01  # from a whole number, what is taken for one
-_ROUNDS = 4  # each leaves a share of what the one before left that double precision's rounding is
+_TINY = 1e-300
 _MOST = 64  # periods of the first function until all others repeat
 
 
@@ -49,39 +47,30 @@ def find_shift(observer: ObserverData) -> OriginShift | None:
     if len(observer.measured) != 1 or lifting.input_functions or lifting.history:
         return None
     at, n, m = observer.measured[0], lifting.n_states, len(observer.inputs)
-    sizes = (
-        np.ones(n + m)
-        if observer.seen is None
-        else np.concatenate([np.ones(n), np.maximum(observer.seen.inputs, 1e-300)])
-    )
+    size = np.ones(n + m)
     if observer.seen is not None:
-        sizes[at] = max(float(observer.seen.measured[0]), 1e-300)
-    moving: Long = np.hstack([observer.A[:n, :n] - np.eye(n, dtype=np.longdouble), observer.B[:n]])
-    whole, rest = _direction(moving, at, n, sizes)
-    largest = float(np.abs(moving * (whole + rest)).max(initial=0.0))
-    plain = np.where(np.abs(rest) < _NOTHING * sizes / sizes[at], 0.0, rest)
-    for candidate, least in ((plain, _SAME), (rest, _EXACT), (plain, _EXACT)):
-        if np.abs(moving @ whole + moving @ candidate).max() > least * max(largest, 1e-300):
-            continue
-        others = frozenset(lifting.states[i] for i in range(n) if candidate[i] != 0 and i != at)
-        period = _period(lifting, lifting.states[at], others)
-        if period is not None:
-            return OriginShift((whole + candidate)[:n], whole[n:], candidate[n:], period or 0.01 * float(sizes[at]))
-    return None
+        size[[at, *range(n, n + m)]] = np.maximum(np.append(observer.seen.measured, observer.seen.inputs), _TINY)
+    moving = np.hstack([observer.A[:n, :n] - np.eye(n), observer.B[:n]])
+    whole, rest = _direction(moving, at, n, size)
+    if np.abs(moving @ (whole + rest)).max() > _ROUNDING * max(np.abs(moving * (whole + rest)).max(), _TINY):
+        return None
+    others = frozenset(lifting.states[i] for i in range(n) if rest[i] != 0 and i != at)
+    period = _period(lifting, lifting.states[at], others)
+    if period is None:
+        return None
+    return OriginShift((whole + rest)[:n], whole[n:], rest[n:], period or 0.01 * float(size[at]))
 
 
-def _direction(moving: Long, at: int, n: int, sizes: Array) -> tuple[Array, Array]:
+def _direction(moving: Array, at: int, n: int, size: Array) -> tuple[Array, Array]:
     """Return the direction in which ``[A - I, B]`` moves nothing: whole numbers, and what is left."""
-    free = np.arange(len(sizes)) != at
-    scaled = np.asarray(moving * sizes, dtype=float)[:, free]
-    whole, rest = np.eye(len(sizes))[at], np.zeros(len(sizes))
-    for step in range(_ROUNDS):
-        left = np.asarray(moving @ whole + moving @ rest, dtype=float)
-        rest[free] += np.linalg.lstsq(scaled, -left, rcond=1e-13)[0] * sizes[free]
-        if step == 0:
+    free = np.arange(len(size)) != at
+    whole, rest = np.eye(len(size))[at], np.zeros(len(size))
+    for last in (False, True):
+        rest[free] = np.linalg.lstsq((moving * size)[:, free], -moving @ whole, rcond=1e-13)[0] * size[free]
+        if not last:
             near = np.round(rest[n:])
-            whole[n:], rest = np.where(np.abs(rest[n:] - near) < _WHOLE, near, 0.0), np.zeros(len(sizes))
-    return whole, rest
+            whole[n:] = np.where(np.abs(rest[n:] - near) < _WHOLE, near, 0.0)
+    return whole, np.where(np.abs(rest) < _ROUNDING * size / size[at], 0.0, rest)
 
 
 @lru_cache(maxsize=64)

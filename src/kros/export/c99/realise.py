@@ -20,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer
-from .origin import OriginShift, find_shift
 
 Array = npt.NDArray[np.float64]
 _ALIKE = 1e4  # condition of the modes, by which rounding grows
@@ -35,7 +34,6 @@ class Realised:
     observer: Observer
     model: Array  # (n, n_lifted + m)
     less: tuple[tuple[int, int, float], ...]
-    shift: OriginShift | None
     start: Array  # (n, n_lifted + m), of a filter bank
     into: Array  # (filters, q), from measurements to the filters of a bank
 
@@ -48,9 +46,9 @@ class Realised:
             A[:, i] += factor * observer.B[:, j]
             if observer.bank is not None:
                 start[:, i] += factor * start[:, len(A) + j]
-        turn, shift = to_modes(observer), find_shift(observer)
+        turn = to_modes(observer)
         if turn is None:
-            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, shift, start, _into(observer))
+            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, start, _into(observer))
         turned = in_coordinates(observer, turn)
         first, own = len(observer.recorded), turned.A.copy()
         measured = list(observer.measured)
@@ -60,7 +58,7 @@ class Realised:
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
         turned = replace(turned, A=own)
-        return cls(turned, model, less, shift, turn[:n, :n] @ start, _into(turned))
+        return cls(turned, model, less, turn[:n, :n] @ start, _into(turned))
 
 
 def _into(observer: Observer) -> Array:

@@ -85,10 +85,8 @@ class _Bank(_Part):
     filters: int
     start: Matrix
     forget: Row
-    half: float
-    recovery: float
-    levels: Row
-    shares: Matrix
+    half: Row
+    recovery: Row
     reach: Row
 
 

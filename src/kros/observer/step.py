@@ -77,12 +77,6 @@ class Steps:
         np.copyto(self._earlier, self.lifting.window.advance(window, u), where=on)
         self._fresh &= ~on[:, 0]
 
-    def alternatives(self, y: Array, u: Array) -> tuple[Array, Array, Array]:
-        """Take a step, and return what filters and fallback estimate, (batch, n) each, and the level (batch,)."""
-        assert self._gaps is not None
-        self.step(y, u)
-        return self._gaps.filtered, self._gaps.expected, self._gaps.level
-
     def _limit(self, x: Array, y: Array) -> None:
         """Keep corrections and the next estimates within their limits."""
         limits, K, n = self.observer.runtime, self.observer.controller, x.shape[1]

@@ -180,7 +180,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     doubles = of("m") + (1 + of("m") + len(of("shift_others")) if of("shift") else 0)
     reals = of("n") + of("order") + of("history") + len(of("parameters")) + of("delay") * of("m")
     reals += of("n") + of("order") + 2 if of("tracked") else 0
-    reals += of("recorded") + 1 + of("q") * (bank["filters"] + 1) if bank else 0
+    reals += 2 * of("recorded") + of("q") * (bank["filters"] + 1) if bank else 0
     reals += of("q") * monitor["bands"] * 3 + 1 if monitor else 0
     words = of("m") + bool(of("delay")) + bool(monitor) + 2 + bool(monitor and monitor["conditions"])
     align = 8 if doubles or real == 8 else 4

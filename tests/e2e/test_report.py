@@ -265,7 +265,7 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
         assert figure.axes
     assert dict(matplotlib.rcParams) == before
     assert len(plot(uncertain, entries=True).axes) == 1  # one input, an input form
-    assert any(text.get_text() == "certified" for text in plot(design).axes[2].texts)
+    assert any(text.get_text() == "status" for text in plot(design).axes[2].texts)
     drawn = plot(design, models=models).axes[4].lines
     assert [line.get_label() for line in drawn] == ["recorded", observer_label(design.observer.name)]
     run = RunResult(demo, metrics, ())

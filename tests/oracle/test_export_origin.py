@@ -24,7 +24,7 @@ def unbound(observer, **changes):
 KINDS = {
     "lifted": lambda: unbound(drive()),
     "linear": lambda: unbound(drive(())),
-    "limits": lambda: cancelling(unbound(drive(correction=np.full(5, 0.004), **LIMITS)), 0.0),
+    "limits": lambda: cancelling(unbound(drive(**LIMITS)), 0.0),
     "late": lambda: unbound(drive(delay=3)),
 }
 

@@ -89,7 +89,7 @@ class DesignTask:
     def runtime(self) -> Runtime:
         """What observers have to know of the machine: that measurements arrive late, and its limits, which cut off estimates."""
         lower, upper = sides(self.limits, self.models.lifting.states) if self.limits else (None, None)
-        return Runtime(delay_of(self.sensor), lower, upper, relift=False)
+        return Runtime(delay_of(self.sensor), lower, upper)
 
     @property
     def dynamics(self) -> Array:

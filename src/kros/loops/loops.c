@@ -43,7 +43,6 @@ typedef struct {
     whole late;        /* measurements are so many samples old, and so are the inputs of their time */
     whole overwrite;   /* measurements take the place of estimates before these are lifted */
     whole begins;
-    whole width;       /* of the corrections that have limits; 0 where none has */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
     const double *u;          /* (samples, m, batch) */
@@ -52,12 +51,6 @@ typedef struct {
     const int32_t *begin;     /* (samples, batch): one more than the row of `begun` that a machine starts from; none */
     const double *begun;      /* (observers, begins, n) */
     const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
-    const double *lower;      /* (n, batch); none where estimates go on without limits */
-    const double *upper;
-    const double *limit;      /* (width): largest corrections */
-    const double *limit_c;    /* (width, order) */
-    const double *limit_d;    /* (width, q) */
-    const double *into;       /* (n, width) */
     const double *low;        /* (observers, n + order): bounds beyond which a machine waits for a start; none */
     const double *high;
     uint8_t *waiting;         /* (observers, batch), moved on */
@@ -234,31 +227,6 @@ static void shifted(const formulas *f, const vec *reg, vec *next)
 PRODUCT(product, double, 1)
 PRODUCT(product_each, vec, MOST)
 
-/* Corrections within their limits: next += into (clipped - correction). */
-static void limit_corrections(const relift_job *s, whole n, const vec *c, const vec *nu, vec *next, whole w)
-{
-    for (whole i = 0; i < s->width; i++)
-        for (whole v = 0; v < w; v++) {
-            vec y = {0}, more;
-            for (whole j = 0; j < s->order; j++) y += s->limit_c[i * s->order + j] * c[j * MOST + v];
-            for (whole j = 0; j < s->q; j++) y += s->limit_d[i * s->q + j] * nu[j * MOST + v];
-            for (whole b = 0; b < WIDE; b++)
-                more[b] = (y[b] < -s->limit[i] ? -s->limit[i] : y[b] > s->limit[i] ? s->limit[i] : y[b]) - y[b];
-            for (whole j = 0; j < n; j++) next[j * MOST + v] += s->into[j * s->width + i] * more;
-        }
-}
-
-static void limit_states(const relift_job *s, whole n, vec *next, whole first, whole lanes)
-{
-    for (whole i = 0; i < n; i++) {
-        const double *lower = s->lower + i * s->batch + first, *upper = s->upper + i * s->batch + first;
-        for (whole b = 0; b < lanes; b++) {
-            double *x = LANES(next + i * MOST) + b;
-            *x = *x < lower[b] ? lower[b] : *x > upper[b] ? upper[b] : *x;
-        }
-    }
-}
-
 /* Which machines go on: none that stands still or waits, and none that would leave the bounds; how many. */
 static whole guarded(const relift_job *s, whole o, whole n, const vec *next, whole first, whole lanes, const uint8_t *moving, uint8_t *waiting, uint8_t *going)
 {
@@ -359,8 +327,6 @@ int kros_relift(const formulas *f, const relift_job *s)
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, used, column, next, rows, w);
-                if (s->width) limit_corrections(s, n, c, nu, next, w);
-                if (s->lower) limit_states(s, n, next, first, lanes);
                 shifted(f, reg, older);
                 if (guarded(s, o, n, next, first, lanes, moving, waiting, on) == lanes) {
                     memcpy(reg, next, (size_t)n * MOST * sizeof(vec));

@@ -113,7 +113,7 @@ class ObserverData:
                 f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
                 f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        self.runtime.require_fit(self.name, n, width, m)
+        self.runtime.require_fit(self.name, n)
         if self.seen is not None:
             self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
         if self.monitor is not None:
@@ -181,7 +181,7 @@ class ObserverData:
     def initial(
         self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
     ) -> Array:
-        """Return the first estimate, (..., n): measurements, and others zero or as a bank starts, within limits."""
+        """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
@@ -191,7 +191,7 @@ class ObserverData:
             values = self.values(parameters)
             lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
             x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
-        return self.runtime.relifted(x)
+        return x
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""

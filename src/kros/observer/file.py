@@ -61,12 +61,8 @@ class _Controller(_Model):
 
 class _Runtime(_Part):
     delay: int = 0
-    relift: bool = True
     lower: Limits | None = None
     upper: Limits | None = None
-    correction: Limits | None = None
-    input_lower: Limits | None = None
-    input_upper: Limits | None = None
 
 
 class _Seen(_Part):

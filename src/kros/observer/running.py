@@ -181,7 +181,7 @@ class RunningObserver:
             return self.estimate
         given = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(o.inputs)))).y[0]
         nu = np.where(np.isfinite(given), self._steps.innovation(given), 0.0)
-        return self._forward(o.runtime.relifted(self._steps.x + nu @ self._filter_gain.T))
+        return self._forward(self._steps.x + nu @ self._filter_gain.T)
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -235,7 +235,7 @@ class RunningObserver:
             steps.step(y, u)
         else:
             self.parameters[self._loop.name] = float(self._loop.step(steps, y, u)[0])
-        if not steps.waiting[0] and self.observer.runtime.binds(steps.x[0], steps.correction):
+        if not steps.waiting[0] and self.observer.runtime.binds(steps.x[0]):
             self._status |= SampleStatus.LIMIT
 
     def _measurement(self, y: npt.ArrayLike) -> Array:

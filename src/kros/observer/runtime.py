@@ -55,9 +55,6 @@ class Seen:
         return Seen(self.measured * measured, self.inputs * inputs)
 
 
-_ARRAYS = ("lower", "upper", "correction", "input_lower", "input_upper")
-
-
 @dataclass(frozen=True, eq=False)
 class Runtime:
     """Delay and limits of a running observer.
@@ -68,16 +65,8 @@ class Runtime:
         Samples by which measurements are delayed: what arrives at k was measured at ``k - delay``. The estimate is
         corrected as of then and predicted forward through the model.
     lower, upper : ndarray, shape (n,), optional
-        Limits of the estimate, state by state.
-    relift : bool
-        Whether the observer goes on from its estimate within the limits; otherwise these only cut off what it gives
-        out. A model of a machine under control need not be stable with a state that is stuck: what is cut off is safe
-        for every observer, the other for one that was made for it.
-    correction : ndarray, shape (width,), optional
-        Largest size of every correction.
-    input_lower, input_upper : ndarray, shape (m,), optional
-        Limits of the recorded inputs. What is beyond them is taken at the limit, as measurements are beyond the limits
-        of their states.
+        Limits of the estimates that are given out, state by state. The observer goes on from its estimate without
+        them: a model of a machine under control need not be stable with a state that is stuck.
 
     Raises
     ------
@@ -96,10 +85,6 @@ class Runtime:
     delay: int = 0
     lower: Array | None = None
     upper: Array | None = None
-    correction: Array | None = None
-    input_lower: Array | None = None
-    input_upper: Array | None = None
-    relift: bool = True
 
     def __post_init__(self) -> None:
         what = "Runtime of an observer"
@@ -108,94 +93,56 @@ class Runtime:
         for name, value in self.limits().items():
             object.__setattr__(self, name, np.asarray(value, dtype=float))
             if np.isnan(getattr(self, name)).any():
-                raise DataError(
-                    f"{what}: {name} contains what is not a number; leave limits out, or make them infinite."
-                )
-        for lower, upper in ((self.lower, self.upper), (self.input_lower, self.input_upper)):
-            if lower is not None and upper is not None and np.any(lower > upper):
-                raise DataError(f"{what}: lower limits {lower} should not exceed the upper ones {upper}.")
-        if self.correction is not None and np.any(self.correction < 0):
-            raise DataError(f"{what}: the largest corrections {self.correction} should be positive.")
+                raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
+        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
+            raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
     def limits(self) -> dict[str, Array]:
         """Return the limits that there are, by name."""
-        return {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
+        return {name: side for name, side in (("lower", self.lower), ("upper", self.upper)) if side is not None}
 
     def limited_states(self, n: int) -> list[int]:
         """Return which of n states have limits."""
-        sides = [np.isfinite(side) for side in (self.lower, self.upper) if side is not None]
+        sides = [np.isfinite(side) for side in self.limits().values()]
         return [int(i) for i in np.flatnonzero(np.any(sides, axis=0))] if sides else []
 
-    def clipped_states(self, n: int) -> list[int]:
-        """Return which of n states an observer goes on from within their limits."""
-        return self.limited_states(n) if self.relift else []
-
-    def limited_corrections(self, into: Array) -> list[int]:
-        """Return which corrections have a limit and reach a state; `into`, shape (n, width), is where they enter."""
-        if self.correction is None:
-            return []
-        return [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
-
-    def binds(self, x: Array, y_c: Array | None) -> bool:
-        """Whether an estimate, (n,), meets a limit, or a correction, (width,), exceeds one."""
+    def binds(self, x: Array) -> bool:
+        """Whether an estimate, (n,), meets a limit."""
         low = self.lower is not None and bool(np.any(x <= self.lower))
-        high = self.upper is not None and bool(np.any(x >= self.upper))
-        beyond = self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction))
-        return low or high or beyond
+        return low or (self.upper is not None and bool(np.any(x >= self.upper)))
 
     def clips_alike(self, other: Runtime) -> bool:
-        """Whether two observers have the same delay, their estimates the same limits, and their corrections none."""
-        pairs = ((self.lower, other.lower), (self.upper, other.upper))
-        same = all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
-        kind = (self.delay, self.relift, self.correction) == (other.delay, other.relift, None)
-        return same and kind and other.correction is None
+        """Whether two observers have the same delay, and their estimates the same limits."""
+        ours, theirs = self.limits(), other.limits()
+        same = ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
+        return same and self.delay == other.delay
 
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         low, high = (side if side is None else side[: x.shape[-1]] for side in (self.lower, self.upper))
         return x if low is None and high is None else np.asarray(np.clip(x, low, high))
 
-    def relifted(self, x: Array) -> Array:
-        """Return the estimates that an observer goes on from, shape (..., n)."""
-        return self.clip_estimate(x) if self.relift else x
-
-    def clip_correction(self, y_c: Array) -> Array:
-        """Return corrections within their limits, shape (..., width)."""
-        return y_c if self.correction is None else np.asarray(np.clip(y_c, -self.correction, self.correction))
-
-    def clip_inputs(self, u: Array) -> Array:
-        """Return inputs within their limits, shape (..., m)."""
-        free = self.input_lower is None and self.input_upper is None
-        return u if free else np.asarray(np.clip(u, self.input_lower, self.input_upper))
-
-    def times(self, x: Array, into: Array, u: Array) -> Runtime:
-        """Return the same in other units of measure, by the factors of states, corrections and recorded inputs."""
-        by = {"lower": x, "upper": x, "correction": into, "input_lower": u, "input_upper": u}
-        changes: dict[str, Any] = {name: limit * by[name] for name, limit in self.limits().items()}
+    def times(self, x: Array) -> Runtime:
+        """Return the same in other units of measure, by the factors of the states."""
+        changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
         return replace(self, **changes)
 
-    def require_fit(self, name: str, n: int, width: int, m: int) -> None:
+    def require_fit(self, name: str, n: int) -> None:
         """Refuse limits of another size than the observer's."""
-        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "input_lower": (m,), "input_upper": (m,)}
         for key, limit in self.limits().items():
-            if limit.shape != wanted[key]:
-                raise DimensionError(
-                    f"Observer {name}: runtime.{key} should have shape {wanted[key]}, found {limit.shape}."
-                )
+            if limit.shape != (n,):
+                raise DimensionError(f"Observer {name}: runtime.{key} should have shape ({n},), found {limit.shape}.")
 
     def content(self) -> dict[str, Any]:
         """Return what an observer's file holds of it: nothing that is as by default."""
-        content: dict[str, Any] = {"delay": int(self.delay)} if self.delay else {}
-        content |= {} if self.relift else {"relift": False}
-        return content | self.limits()
+        return ({"delay": int(self.delay)} if self.delay else {}) | self.limits()
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
         """Read what `content` returned; null stands for what is infinite."""
         values = dict(content)
-        for name in _ARRAYS:
+        for name, none in (("lower", -np.inf), ("upper", np.inf)):
             if values.get(name) is not None:
-                none = -np.inf if name.endswith("lower") else np.inf
                 values[name] = np.array([none if limit is None else limit for limit in values[name]], dtype=float)
         return cls(**values)
 

@@ -9,10 +9,9 @@ A sample is judged by itself, before the observer sees it:
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
-The range is the largest size seen in training, or that of the declared limits; without either a sample has none. An
-input with declared limits has none either: however large a command is, the machine gets the limit. So nothing that is
-far from anything possible enters a state, linear or lifted, and what is left of a fault is what the model misses while
-it lasts.
+The range is the largest size seen in training, or that of the declared limits; without either a sample has none. So
+nothing that is far from anything possible enters a state, linear or lifted, and what is left of a fault is what the
+model misses while it lasts.
 
 Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest,
 and the observer starts again at the first sample at which there are both. It does so, too, after an input was held for
@@ -143,19 +142,14 @@ class Bounds:
     most: Array
 
     @classmethod
-    def of_measurements(cls, lower: Array | None, upper: Array | None, seen: Array | None, count: int) -> Bounds:
-        """Return the bounds from declared limits and sizes seen in training, where there are any."""
-        low, high, size = _declared(lower, upper, seen, count)
+    def of(cls, count: int, seen: Array | None, lower: Array | None = None, upper: Array | None = None) -> Bounds:
+        """Return the bounds from sizes seen in training and declared limits, where there are any."""
+        low = np.full(count, -np.inf) if lower is None else lower
+        high = np.full(count, np.inf) if upper is None else upper
+        size = np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
         sides = [np.where(np.isfinite(side), np.abs(side), size) for side in (low, high)]
         far = np.minimum(BEYOND * np.maximum(*sides), _ANY)
         return cls(low, high, -far, far)
-
-    @classmethod
-    def of_inputs(cls, lower: Array | None, upper: Array | None, seen: Array | None, count: int) -> Bounds:
-        """Return those of inputs, which are plausible beyond a declared limit: the machine gets the limit."""
-        low, high, size = _declared(lower, upper, seen, count)
-        far = np.minimum(BEYOND * size, _ANY)
-        return cls(low, high, np.where(np.isfinite(low), -_ANY, -far), np.where(np.isfinite(high), _ANY, far))
 
     def pass_all(self, values: Array) -> bool:
         """Whether all samples, shape (..., channels), are good as they are."""
@@ -171,12 +165,6 @@ class Bounds:
         plausible = (values >= self.least) & (values <= self.most)
         within = np.clip(values, self.lower, self.upper)
         return within, plausible, np.isfinite(values) & (~plausible | (within != values))
-
-
-def _declared(lower: Array | None, upper: Array | None, seen: Array | None, count: int) -> tuple[Array, Array, Array]:
-    low = np.full(count, -np.inf) if lower is None else lower
-    high = np.full(count, np.inf) if upper is None else upper
-    return low, high, np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,8 +190,7 @@ class Screen:
         """Return the screen for sizes seen in training, and limits where these are declared."""
         limits, sizes = limits or Runtime(), (None, None) if seen is None else (seen.measured, seen.inputs)
         lower, upper = (None if side is None else side[list(at)] for side in (limits.lower, limits.upper))
-        measured = Bounds.of_measurements(lower, upper, sizes[0], q)
-        return cls(measured, Bounds.of_inputs(limits.input_lower, limits.input_upper, sizes[1], m))
+        return cls(Bounds.of(q, sizes[0], lower, upper), Bounds.of(m, sizes[1]))
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""

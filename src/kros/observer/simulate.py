@@ -337,7 +337,7 @@ def _compiled(
     known = np.where(samples.starts[0][:, None], samples.u[0], 0.0)
     job["column"][:, :n] = [o.initial(samples.y[0], values, known).T for o in observers]
     job["low"], job["high"] = np.swapaxes([bounds(o.guard, n, order) for o in observers], 0, 1)
-    job |= _limits(observer, batch) | _begins(observers, samples, values)
+    job |= _begins(observers, samples, values)
     if innovations:
         innovation = job["innovation"] = np.empty(samples.y.shape)
     if delay:
@@ -351,19 +351,6 @@ def _compiled(
             for o, x in zip(observers, estimates, strict=True):
                 _predict(o, x, before, pending, samples, values)
     return Compiled(estimates, innovation, restarted.view(bool))
-
-
-def _limits(observer: ObserverData, batch: int) -> dict[str, Any]:
-    """Return the limits of corrections and of the estimates that the observer goes on from."""
-    limits, K, n = observer.runtime, observer.controller, observer.lifting.n_states
-    job: dict[str, Any] = {}
-    if limits.correction is not None:
-        job = {"width": len(limits.correction), "limit": limits.correction}
-        job |= {"limit_c": K.C, "limit_d": K.D, "into": observer.into[:n]}
-    if limits.relift and not (limits.lower is None and limits.upper is None):
-        for name, side, none in (("lower", limits.lower, -np.inf), ("upper", limits.upper, np.inf)):
-            job[name] = np.tile((np.full(n, none) if side is None else side)[:, None], batch)
-    return job
 
 
 def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:

@@ -29,7 +29,6 @@ class Steps:
         self._earlier, self._fresh = np.zeros((batch, len(lifting.window.earlier))), np.ones(batch, dtype=bool)
         self._low, self._high = bounds(observer.guard, n, order)
         self.waiting = np.zeros(batch, dtype=bool)  # for a start: the next step would leave the bounds
-        self.correction: Array | None = None  # where it has limits: before them
         self._gaps: Gaps | None = None
         if observer.bank is not None:
             self._gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
@@ -70,20 +69,11 @@ class Steps:
         following = np.concatenate([theta, self._x_c, inputs, y], axis=-1) @ self._map.T
         if self._gaps is not None:
             self._gaps.follow(self.x, following[:, :n], missing)
-        self._limit(following[:, :n], y)
         on = self._guarded(following, moving)[:, None]
         np.copyto(self.x, following[:, :n], where=on)
         np.copyto(self._x_c, following[:, n:], where=on)
         np.copyto(self._earlier, self.lifting.window.advance(window, u), where=on)
         self._fresh &= ~on[:, 0]
-
-    def _limit(self, x: Array, y: Array) -> None:
-        """Keep corrections and the next estimates within their limits."""
-        limits, K, n = self.observer.runtime, self.observer.controller, x.shape[1]
-        if limits.correction is not None:
-            self.correction = self._x_c @ K.C.T + self.innovation(y) @ K.D.T
-            x += (limits.clip_correction(self.correction) - self.correction) @ self.observer.into[:n].T
-        x[...] = limits.relifted(x)
 
     def _guarded(self, following: Array, moving: Flags | None) -> Flags:
         """Return which machines take the step, shape (batch,): none that wait, and none that would leave the bounds."""

@@ -38,7 +38,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         A=observer.A * x[:, None] / x,
         B=observer.B * x[:, None] / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
-        runtime=observer.runtime.times(x[: lifting.n_states], into, u[: len(observer.inputs)]),
+        runtime=observer.runtime.times(x[: lifting.n_states]),
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
         monitor=None if observer.monitor is None else observer.monitor.times(y),
         guard=None if observer.guard is None else observer.guard.times(x[: lifting.n_states]),

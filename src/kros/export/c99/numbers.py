@@ -132,7 +132,6 @@ class Source:
             "order": o.controller.n_states,
             "delay": o.runtime.delay,
             "longest": LONGEST,
-            "width": o.into.shape[1],
             "history": len(window.earlier),
             "window_shift": [int(i) for i in window.shift] if lifting.history else [],
             "window_present": [int(i) for i in window.present] if lifting.history else [],
@@ -141,11 +140,10 @@ class Source:
     def linear(self) -> dict[str, Any]:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
-        limited, write = self.limited, self.precision.literal
+        write = self.precision.literal
         found = {
             "model": self.sums(self.realised.model),
-            "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
-            "into": self.sums(o.into[:n]) if limited else [],
+            "correction": self.sums(o.into[:n] @ np.hstack([K.C, K.D])),
             "controller": self.sums(np.hstack([K.A, K.B])),
         }
         return found | {
@@ -153,12 +151,6 @@ class Source:
             "less": [(j, i, None if factor == 1 else write(factor)) for j, i, factor in self.realised.less],
             "filter_gain": self.sums(o.filter_gain),
         }
-
-    @property
-    def limited(self) -> bool:
-        """Whether a step meets limits."""
-        run = self.observer.runtime
-        return run.correction is not None or bool(run.relift and run.limits().keys() & {"lower", "upper"})
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
@@ -170,13 +162,9 @@ class Source:
         )
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
-            "limited": self.limited,
             "clips_estimate": run.lower is not None or run.upper is not None,
-            "relifts": run.relift,
-            "clips_correction": run.correction is not None,
             "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
             "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
-            "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": self.bounds(screen.measured),
             "u_bounds": self.bounds(screen.inputs),

@@ -241,8 +241,6 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
         found.append(f"measurements arrive {limits.delay} samples late")
     if clips := limits.limited_states(len(names)):
         found.append(f"the true {', '.join(names[i] for i in clips)} stays within the limits of the estimate")
-    if any(side is not None and np.isfinite(side).any() for side in (limits.input_lower, limits.input_upper)):
-        found.append("the residual is that of the model with inputs within their limits")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")
     return tuple(found)

@@ -36,9 +36,9 @@ class Course:
         return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
 
     def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
-        """Whether the observer takes all samples, within limits, shape (batch,)."""
-        found, u = screened(observer, self.y, self.inputs), observer.runtime.clip_inputs(self.inputs)
-        good = np.isfinite(found.y).all(axis=-1) & (found.u == u).all(axis=-1)
+        """Whether the observer takes all samples, shape (batch,)."""
+        samples = screened(observer, self.y, self.inputs)
+        good = np.isfinite(samples.y).all(axis=-1) & (samples.u == self.inputs).all(axis=-1)
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
@@ -77,7 +77,7 @@ def held_residual(
     observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None
 ) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
-    h, inputs = observer.lifting.history, observer.runtime.clip_inputs(inputs)
+    h = observer.lifting.history
     if h:
         states, inputs = (np.concatenate([np.repeat(v[:1], h, axis=0), v]) for v in (states, inputs))
     residual = one_step_residual(observer.lifting, observer.A, observer.B, states, inputs, parameters)

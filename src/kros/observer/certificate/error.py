@@ -116,7 +116,6 @@ class ErrorSystem:
     dt: float  # s
     channels: tuple[str, ...] = ()  # what moves in every channel, for people
     E: Array | None = None  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
-    rest: Array | None = None  # (n_p,): places at which a frozen response is taken
     start: Array | None = None  # (n_xi, n_window): where the first error goes; the first states by default
 
     @property
@@ -128,11 +127,6 @@ class ErrorSystem:
     def nested(self) -> Array:
         """E, shape (n_p, n_p)."""
         return np.zeros((self.L.shape[1], self.L.shape[1])) if self.E is None else self.E
-
-    @property
-    def place(self) -> Array:
-        """Places of a frozen response, shape (n_p,)."""
-        return np.zeros(self.L.shape[1]) if self.rest is None else self.rest
 
     def closed(self, d: npt.ArrayLike) -> Array:
         """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
@@ -158,25 +152,22 @@ class ErrorSystem:
         D[: len(root), len(root) :] = _WIDER * root[:, None] * self.D
         return (self.A, B), C, D
 
-    def frozen(self, d: npt.ArrayLike | None = None) -> StateSpace:
-        """Return the system from w to z with slopes that stay where they are, at their place of rest by default."""
-        A, B = self.corner(self.place if d is None else d)
+    def frozen(self, d: npt.ArrayLike) -> StateSpace:
+        """Return the system from w to z with slopes that stay where they are."""
+        A, B = self.corner(d)
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
     def moved(self) -> StateSpace:
-        """Return the system from w to q, what the channels act on, of the frozen response."""
-        A, B = self.corner(self.place)
-        back = self.nested @ self.closed(self.place)
-        return StateSpace(A, B, self.M + back @ self.M, self.D + back @ self.D, self.dt)
+        """Return the system from w to q, what the channels act on, with slopes in the middle: the frozen response."""
+        return StateSpace(self.A, self.B, self.M, self.D, self.dt)
 
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' of the frozen response to the rest of the error.
 
-        The frozen response has ``p' = d' q'``. With ``r = xi - xi'`` and ``pi = p - p' + d' q'`` the rest obeys ``r+ =
-        A r + L (pi - d' q')``, ``pi = d (M r + E (pi - d' q') + q')``, from zero.
+        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p``, ``p = d (M r + E p + q')``.
         """
         width = self.L.shape[1]
-        return replace(self, B=-self.L * self.place, D=np.eye(width) - self.nested * self.place, start=None)
+        return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
 
 
 def error_system(
@@ -185,7 +176,7 @@ def error_system(
     box: Box | None = None,
     parameters: Box | None = None,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer at run time, its delay and limits included."""
+    """Return the error dynamics of an observer at run time, its delay included."""
     return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()
 
 
@@ -193,7 +184,7 @@ class _Assembly:
     """The error dynamics while they are put together: rows of signals as functions of [xi, p, w]."""
 
     def __init__(self, observer: ObserverData, scales: ReliftScales, box: Box | None, parameters: Box | None) -> None:
-        lifting, limits, n, q = observer.lifting, observer.runtime, observer.lifting.n_states, len(observer.measured)
+        lifting, n, q = observer.lifting, observer.lifting.n_states, len(observer.measured)
         shapes = (scales.error.shape, scales.residual.shape, scales.noise.shape)
         if shapes != ((n,), (n,), (q,)):
             raise DimensionError(
@@ -201,25 +192,24 @@ class _Assembly:
                 f"{', '.join(map(str, shapes))}."
             )
         self.observer, self.scales, self.n = observer, scales, n
-        self.delay, self.order = limits.delay, observer.controller.n_states
+        self.delay, self.order = observer.runtime.delay, observer.controller.n_states
         lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
         self.names, self.h = [delayed_name(name, lag) for name, lag in lags], len(lags)
         lower, upper = slope_box(observer, self.names, box, parameters)
         self.columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
         middle, self.half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
         moves = (self.half > _CONSTANT * np.abs(middle)) & np.any(self.columns, axis=0)[:, None]
-        self.moving, self.clips = np.argwhere(moves), limits.clipped_states(n)
-        self.cuts, self.into = limits.limited_corrections(observer.into[:n]), observer.into[:n]
+        self.moving, self.into = np.argwhere(moves), observer.into[:n]
         self.following = np.zeros((self.h, self.h))
         self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
         for row, (name, lag) in enumerate(lags[n:], n):
             self.following[row, lags.index((name, lag - 1))] = 1.0
         self.slots, self.counted = _driven(observer, scales, self.h), _counted(scales)
-        self.link = len(self.clips) + len(self.moving)
+        self.link = len(self.moving)
         late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
-        self.sizes = (self.h + self.order + late, self.link * (self.delay + 1) + len(self.cuts), n + q)
+        self.sizes = (self.h + self.order + late, self.link * (self.delay + 1), n + q)
         self.q_rows = np.zeros((self.sizes[1], sum(self.sizes)))
-        self.channels, self.rest = [""] * self.sizes[1], np.zeros(self.sizes[1])
+        self.channels = [""] * self.sizes[1]
 
     def rows(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
         """Return some entries of xi (0), p (1) or w (2)."""
@@ -227,32 +217,24 @@ class _Assembly:
         rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
         return rows
 
-    def bound(self, signal: Array, i: int, channel: int, what: str) -> None:
-        """Let a limit act on entry i of a signal: half of it is in the middle, the other half moves."""
-        self.q_rows[channel], self.channels[channel], self.rest[channel] = _WIDER / 2 * signal[i], what, 1.0
-        signal[i] = signal[i] / 2 + self.rows(1, channel, 1)[0]
-
-    def predicted(self, e: Array, at: int) -> tuple[Array, Array]:
-        """Errors (h) that act, limits applied, and the next ones without correction; channels begin at `at`."""
-        e, late = e.copy(), f", {at // self.link} samples on" if self.link and at else ""
+    def predicted(self, e: Array, at: int) -> Array:
+        """Return the next errors (h) without correction; the channels of their slopes begin at `at`."""
+        late = f", {at // self.link} samples on" if self.link and at else ""
         functions = self.observer.lifting.functions + self.observer.lifting.input_functions
-        for k, i in enumerate(self.clips, at):
-            self.bound(e, i, k, f"limits of {self.names[i]}{late}")
         after = self.following @ e
-        for k, (i, j) in enumerate(self.moving, at + len(self.clips)):
+        for k, (i, j) in enumerate(self.moving, at):
             self.q_rows[k] = self.half[i, j] * e[j]
             self.channels[k] = f"{functions[i]} by {self.names[j]}{late}"
             after[: self.n] += np.outer(self.columns[:, i], self.rows(1, k, 1)[0])
-        return e, after
+        return after
 
     def system(self) -> ErrorSystem:
         """Return the error dynamics."""
         n, h, order, K = self.n, self.h, self.order, self.observer.controller
-        e, after = self.predicted(self.rows(0, 0, h), 0)
+        e = self.rows(0, 0, h)
+        after = self.predicted(e, 0)
         nu = e[list(self.observer.measured)] + self.rows(2, n, len(self.observer.measured), self.scales.noise)
         v = K.C @ self.rows(0, h, order) + K.D @ nu
-        for k, i in enumerate(self.cuts, self.sizes[1] - len(self.cuts)):
-            self.bound(v, i, k, f"limit of correction {i}")
         after[:n] -= self.into @ v
         following = self.late(after) if self.delay else [after]
         if not self.delay:
@@ -270,7 +252,7 @@ class _Assembly:
             start[h + order + np.arange(len(self.slots)), self.slots] = 1.0
             start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
         dt, nested = self.observer.sample_period_s, E if E.any() else None
-        return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, self.rest, start)
+        return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, start)
 
     def late(self, after: Array) -> list[Array]:
         """Return what follows with a delay: the measured error, its residuals, the latest first, and the predicted one."""
@@ -280,7 +262,7 @@ class _Assembly:
         arriving[: len(inside)] = self.rows(2, 0, self.n, self.scales.residual)[inside]
         measured = ahead = after + enters @ held[-1]
         for i in range(1, self.delay + 1):
-            ahead = self.predicted(ahead, i * self.link)[1]
+            ahead = self.predicted(ahead, i * self.link)
             ahead = ahead + enters @ (held[self.delay - 1 - i] if i < self.delay else arriving)
         return [measured, arriving, *held[:-1], ahead[self.counted]]
 

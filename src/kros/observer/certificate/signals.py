@@ -25,7 +25,6 @@ from ...core.lti import StateSpace
 from ...data import EpisodeBatch
 from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
 from ..data import ObserverData
-from ..simulate import run_observer
 from .certificate import ReliftCertificate
 from .course import Course, course
 from .error import ErrorSystem, error_system
@@ -62,9 +61,6 @@ class SignalBound:
         Why there is no bound; empty where there is one.
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
-    within : bool, optional
-        Of an observer that goes on from limits: true where these change no estimate of the recordings, and the bound is
-        for signals that keep it so.
 
     Examples
     --------
@@ -87,7 +83,6 @@ class SignalBound:
     sizes: Array
     reason: str = ""
     outside: tuple[str, ...] = ()
-    within: bool | None = None
 
     @property
     def certified(self) -> bool:
@@ -113,7 +108,6 @@ class SignalBound:
         ratios = self.ratios[:, hidden]
         ratios = ratios[np.isfinite(ratios)]
         facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
-        facts |= {} if self.within is None else {"set_within_limits": self.within}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
         ratio = {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
         return facts | ratio | {"set_outside": list(self.outside)}
@@ -169,17 +163,13 @@ def signal_bound(
     True
     """
     seen = course(observer, batch, estimates)
-    n, taken, within = len(observer.recorded), seen.taken(observer), None
-    if observer.runtime.clipped_states(observer.lifting.n_states):
-        free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
-        if _alike(free, observer, batch, seen):
-            observer, within = free, True
+    n, taken = len(observer.recorded), seen.taken(observer)
     units = tuple(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
     errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n] + seen.beyond))
     none, sizes = np.full(n, np.inf), certificate.scales.error[:n].copy()
-    result = SignalBound(observer.recorded, units, none, np.full(errors.shape, np.inf), errors, sizes, within=within)
+    result = SignalBound(observer.recorded, units, none, np.full(errors.shape, np.inf), errors, sizes)
     if not certificate.certified:
         return replace(result, reason="it has no certificate at run time")
     signal, system = _signals(certificate, observer, seen)
@@ -220,13 +210,6 @@ def _bounds(system: ErrorSystem, n: int, energies: BandEnergies) -> tuple[Array,
     with np.errstate(invalid="ignore"):
         movement = [np.where(kappa > 0, kappa * part, 0.0) for part in (np.sqrt(len(acted)), share)]
     return whole[:n] + movement[0], each[:, :n] + movement[1]
-
-
-def _alike(one: ObserverData, other: ObserverData, batch: EpisodeBatch, seen: Course) -> bool:
-    """Whether two observers have the same estimates of the recordings."""
-    ours, theirs = (run_observer(o, seen.y, seen.inputs, o.own(batch.parameters)) for o in (one, other))
-    beyond = np.arange(len(ours))[:, None] >= seen.lengths
-    return bool(((ours == theirs).all(axis=-1) | beyond).all())
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:

@@ -134,18 +134,13 @@ class Design:
     recordings: Recordings
     settings: EstimatorSettings
 
-    def rows(
-        self, recordings: Recordings, rows: int, offset: float = 0.0
-    ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
-        """Yield episode, bank rows, targets and weights of every episode, with an offset of measurements, relative to their sizes.
-
-        Targets are states at the next sample, of measured ones their change.
-        """
+    def rows(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
+        """Yield episode, bank rows, targets and weights of every episode; targets are states at the next sample, of measured ones their change."""
         thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
         for number, (key, length) in enumerate(zip(recordings.keys, recordings.lengths, strict=True)):
             batch = recordings.read(key)
-            y = interpolated(batch.measurements(measured)[:length, 0]) + offset * recordings.size[measured]
+            y = interpolated(batch.measurements(measured)[:length, 0])
             v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
             at, weights = thinning.at(length, number)
             targets = batch.states[at + 1, 0] / recordings.size
@@ -170,9 +165,10 @@ class Design:
         found = self.recordings.groups(self.settings.folds, self.settings.parts)
         return dict(zip(self.recordings.keys, found, strict=True))
 
-    def sample(self, offset: float = 0.0) -> tuple[Array, Array]:
-        """Return thinned rows of the bank, and weights that sum to one; measurements with an offset, see `rows`."""
-        parts = list(self.rows(self.recordings.some(150), self.settings.sample, offset))
+    @cached_property
+    def sample(self) -> tuple[Array, Array]:
+        """Thinned rows of the bank, and weights that sum to one."""
+        parts = list(self.rows(self.recordings.some(150), self.settings.sample))
         weights = np.concatenate([w for *_, w in parts])
         return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()
 
@@ -201,11 +197,9 @@ class Whitening:
     @classmethod
     def of(cls, design: Design) -> Whitening:
         """Find the directions from thinned rows."""
-        X, weights = design.sample()
+        X, weights = design.sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
         trust = np.diag(design.bank.trust(design.settings))
-        moved = (design.sample(design.settings.offset)[0] - X) / size * np.sqrt(weights)[:, None]
-        trust = np.vstack([trust, qr_triangle(moved)])
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]

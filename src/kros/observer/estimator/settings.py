@@ -54,11 +54,6 @@ class EstimatorSettings(Settings):
     start_trust: float = Field(
         1e-2, ge=0, description="relative error of a nonlinear start value: rows with target zero"
     )
-    offset: float = Field(
-        1e-4,
-        ge=0,
-        description="offset of measurements that estimates should not feel, relative to their size: rows with target zero",
-    )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"
     )

@@ -242,19 +242,12 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
     """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
-    judged, bad = np.zeros(status.shape, dtype=bool), status != 0
-    events = bad | starts | ~moving
-    for machine, own in enumerate(judged.T):
-        wait = after = 0  # samples that are not judged yet; the sample behind the latest event
-        for k in [*np.flatnonzero(events[:, machine]).tolist(), len(own)]:
-            own[after + wait : k] = True
-            wait, after = max(wait - (k - after), 0), k + 1
-            if k == len(own):
-                break
-            wait = settle if starts[k, machine] else wait
-            if moving[k, machine]:
-                own[k] = wait == 0 and not bad[k, machine]
-                wait = min(wait + RECOVERY, settle) if bad[k, machine] else max(wait - 1, 0)
+    judged, bad, wait = np.zeros(status.shape, dtype=bool), status != 0, np.zeros(status.shape[1], dtype=int)
+    for k in range(len(status)):
+        wait = np.where(starts[k], settle, wait)  # samples that are not judged yet
+        judged[k] = moving[k] & ~bad[k] & (wait == 0)
+        following = np.where(bad[k], np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
+        wait = np.where(moving[k], following, wait)
     return judged
 
 

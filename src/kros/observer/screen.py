@@ -91,11 +91,6 @@ class Held:
         """Return what is known before the first sample."""
         return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
 
-    @classmethod
-    def good(cls, inputs: Array) -> Held:
-        """Return what is known after good samples, inputs of shape (batch, m) the last ones."""
-        return cls(inputs, np.zeros(inputs.shape, dtype=int), np.zeros(len(inputs), dtype=bool))
-
 
 @dataclass(frozen=True, eq=False)
 class Screened:
@@ -151,15 +146,6 @@ class Bounds:
         far = np.minimum(BEYOND * np.maximum(*sides), _ANY)
         return cls(low, high, -far, far)
 
-    def pass_all(self, values: Array) -> bool:
-        """Whether all samples, shape (..., channels), are good as they are."""
-        low, high = np.maximum(self.lower, self.least), np.minimum(self.upper, self.most)
-        channels = (values[..., i] for i in range(len(low)))
-        return all(
-            bool(least <= channel.min(initial=least) and channel.max(initial=most) <= most)
-            for channel, least, most in zip(channels, low, high, strict=True)
-        )
-
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
         """Return samples within limits, which are plausible, and which were beyond a limit or their range."""
         plausible = (values >= self.least) & (values <= self.most)
@@ -195,8 +181,6 @@ class Screen:
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
         before = Held.nothing(*u.shape[1:]) if held is None else held
-        if self.measured.pass_all(y) and self.inputs.pass_all(u):
-            return _as_they_are(y, u, before)
         measured, plausible, beyond = self.measured.judge(y)
         limited, good, far = self.inputs.judge(u)
         status = _bit(~np.isfinite(y), SampleStatus.MISSING) | _bit(~np.isfinite(u), SampleStatus.INVALID_INPUT)
@@ -237,12 +221,6 @@ def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike) -> Scre
 
 def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
     return np.where(wrong.any(axis=-1), np.uint8(bit), np.uint8(0))
-
-
-def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
-    starts = np.zeros(y.shape[:2], dtype=bool)
-    starts[0] = before.stale
-    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, np.ones(y.shape[:2], dtype=bool), Held.good(u[-1]))
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:

@@ -65,7 +65,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], screened(observer, y, u), parameters)[0][0]
+    return _run([observer], screened(observer, y, u), parameters).estimates[0]
 
 
 def run_with_status(
@@ -91,8 +91,8 @@ def run_with_status(
     ([1.0, 2.0, 4.0, 8.0, 8.0, 2.0], [0, 1, 1, 17, 16, 0])
     """
     samples = screened(observer, y, u)
-    estimates, status = _run([observer], samples, parameters)
-    return estimates[0], samples.status | status
+    run = _run([observer], samples, parameters)
+    return run.estimates[0], samples.status | run.status
 
 
 def run_observers(
@@ -137,57 +137,67 @@ def run_observers(
     )
     if len(observers) > 1 and (late or not all(alike)):
         return np.stack([run_observer(o, y, u, parameters) for o in observers])
-    return _run(observers, screened(first, y, u), parameters)[0]
+    return _run(observers, screened(first, y, u), parameters).estimates
 
 
 def run_innovations(
     observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
-    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
-    innovation, status = np.zeros(samples.y.shape), samples.status.copy()
-    starts, moving = samples.starts.copy(), np.ones(samples.starts.shape, dtype=bool)
-    left, delay = _one_by_one(observer, samples), observer.runtime.delay
-    if (loops := library()) is not None and not left.all():
-        machines = np.flatnonzero(~left)
-        some = samples.of(machines)
-        run = _compiled(loops, [observer], some, _of_machines(values, machines), innovations=True)
-        innovation[:, machines], left[machines] = run.innovation, run.restarted[0]
-        if delay:
-            moving[:, machines] = (_pending(some.starts, delay) == delay) & ~some.starts
-    if left.any():
-        machines = np.flatnonzero(left)
-        again = stepped(observer, samples.of(machines), _of_machines(values, machines))
-        innovation[:, machines], starts[:, machines] = again.innovation, again.starts
-        moving[:, machines], status[:, machines] = again.moving, status[:, machines] | again.status
-    starts[0] = True
-    return innovation, judged_samples(settle, status, starts, moving)
+    samples = screened(observer, y, u)
+    run = _run([observer], samples, parameters, innovations=True)
+    run.starts[0] = True
+    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
 
 
-def _run(observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None) -> tuple[Array, Bits]:
-    """Return estimates (observer, n_samples, batch, n), and the bit RESTARTED (n_samples, batch)."""
-    (n_samples, batch), observer = samples.starts.shape, observers[0]
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What observers did; all but the estimates of the first one."""
+
+    estimates: Array  # (observer, n_samples, batch, n)
+    innovation: Array  # (n_samples, batch, q); zero where none was wanted
+    status: Bits  # (n_samples, batch): RESTARTED, or nothing
+    starts: Flags  # (n_samples, batch)
+    moving: Flags  # (n_samples, batch)
+
+    def take(self, number: int, machines: Whole, run: Stepped) -> None:
+        """Take what an observer did on some machines."""
+        self.estimates[number][:, machines] = run.estimates
+        for name in ("innovation", "status", "starts", "moving"):
+            getattr(self, name)[:, machines] = getattr(run, name)
+
+
+def _run(
+    observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, innovations: bool = False
+) -> _Run:
+    """Run observers on screened samples, compiled where that is possible."""
+    (n_samples, batch), observer, loops = samples.starts.shape, observers[0], library()
+    n, delay = observer.lifting.n_states, observer.runtime.delay
     values, left = observer.values(parameters, (batch,)), _one_by_one(observer, samples)
-    restarted, status = np.tile(left, (len(observers), 1)), np.zeros((n_samples, batch), np.uint8)
-    if (loops := library()) is not None and not left.any():
-        run = _compiled(loops, observers, samples, values)
-        estimates, restarted = run.estimates, run.restarted
-    else:
-        estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch)).transpose(1, 0, 3, 2)
-        machines = np.flatnonzero(~left)
-        if loops is not None and len(machines):
-            run = _compiled(loops, observers, samples.of(machines), _of_machines(values, machines))
-            estimates[:, :, machines], restarted[:, machines] = run.estimates, run.restarted
+    restarted, machines = np.tile(left, (len(observers), 1)), np.flatnonzero(~left)
+    estimates: Array = np.empty(0)
+    innovation = np.zeros(samples.y.shape)
+    if loops is not None and len(machines):
+        some = samples if len(machines) == batch else samples.of(machines)
+        run = _compiled(loops, observers, some, _of_machines(values, machines), innovations)
+        estimates, restarted[:, machines] = run.estimates, run.restarted
+        if run.innovation is not None:
+            innovation[:, machines] = run.innovation
+    if len(machines) < batch:
+        estimates, part = np.empty((n_samples, len(observers), n, batch)).transpose(1, 0, 3, 2), estimates
+        if len(machines):
+            estimates[:, :, machines] = part
+    moving = (_pending(samples.starts, delay) == delay) & (~samples.starts | (delay == 0))
+    status, starts = np.zeros((n_samples, batch), np.uint8), samples.starts.copy()
+    result = _Run(estimates, innovation, status, starts, moving)
     for i, each in enumerate(observers):
         machines = np.flatnonzero(restarted[i])
-        if not len(machines):
-            continue
-        again = stepped(each, samples.of(machines), _of_machines(values, machines))
-        estimates[i][:, machines], status[:, machines] = again.estimates, again.status
-    for i in observer.runtime.limited_states(observer.lifting.n_states):
+        if len(machines):
+            result.take(i, machines, stepped(each, samples.of(machines), _of_machines(values, machines)))
+    for i in observer.runtime.limited_states(n):
         low, high = (side if side is None else side[i] for side in (observer.runtime.lower, observer.runtime.upper))
         np.clip(estimates[..., i], low, high, out=estimates[..., i])
-    return estimates, status
+    return result
 
 
 def _one_by_one(observer: ObserverData, samples: Screened) -> Flags:

@@ -266,7 +266,9 @@ def stepped(observer: ObserverData, samples: Screened, values: dict[str, Any], l
             starts[k] |= steps.waiting & samples.complete[k]
             pending[k] = np.minimum(since + 1, d)
             since = np.where(starts[k], 0, pending[k])
-        x[k], earlier[k] = steps.x, steps.earlier(samples.u[k - pending[k], np.arange(batch)])
+        x[k] = steps.x
+        if d:
+            earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])
         if k and starts[k].any():
             steps.begin(y, starts[k], u)
             if loop is not None:

@@ -64,7 +64,8 @@ class Steps:
         if self._gaps is not None:
             self._gaps.fill(self.x, y, missing)
         y = np.where(missing, self.x[:, self._measured], y)  # what is predicted corrects nothing
-        window = np.concatenate([self.x, self.earlier(u)], axis=-1)
+        delays = self._earlier.shape[1] > 0
+        window = np.concatenate([self.x, self.earlier(u)], axis=-1) if delays else self.x
         theta, inputs = self.lifting.lift(window, self.values), self.lifting.lift_inputs(u, window, self.values)
         following = np.concatenate([theta, self._x_c, inputs, y], axis=-1) @ self._map.T
         if self._gaps is not None:
@@ -72,8 +73,9 @@ class Steps:
         on = self._guarded(following, moving)[:, None]
         np.copyto(self.x, following[:, :n], where=on)
         np.copyto(self._x_c, following[:, n:], where=on)
-        np.copyto(self._earlier, self.lifting.window.advance(window, u), where=on)
-        self._fresh &= ~on[:, 0]
+        if delays:
+            np.copyto(self._earlier, self.lifting.window.advance(window, u), where=on)
+            self._fresh &= ~on[:, 0]
 
     def _guarded(self, following: Array, moving: Flags | None) -> Flags:
         """Return which machines take the step, shape (batch,): none that wait, and none that would leave the bounds."""

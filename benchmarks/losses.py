@@ -61,7 +61,7 @@ def tried(run: Path, patterns: int) -> list[str]:
     batch = EpisodeBatch.read(population, chosen, LONGEST, identified.parameters)
     batch = batch.head(int(batch.lengths.min()))
     n, y = len(population.states), batch.states[..., list(observer.measured)]
-    settle = json.loads((run / "metrics.json").read_text())["observers"][observer.name]["design"]["settle_samples"]
+    settle = json.loads((run / "metrics.json").read_text())["observers"][observer.name]["settle_samples"]
     first = max(len(y) // 4, len(y) - settle)
     lost = np.stack([pattern(rng, len(y), first) for _ in chosen], axis=1)
     values = observer.own(batch.parameters)

@@ -212,7 +212,7 @@ class Fold:
         """Train the learned estimator for a sensor."""
         models = self.uncertain.models
         first = models.models(models.kinds[0])
-        return make_learned(TrainingSet.whole(models, first, sensor), models.lifting, first.measured)
+        return make_learned(TrainingSet.whole(models, first, sensor), first.measured)
 
     def batch(self, sensor: Mapping[str, Sensor]) -> EpisodeBatch:
         """Read the test episodes of the units left out, as a sensor shows them."""

@@ -81,7 +81,7 @@ def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, 
                 o, b.measurements(o.measured), b.inputs, b.parameters
             )  # type: ignore[misc]
     models = uncertain.models
-    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.lifting, models.models().measured)
+    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.models().measured)
     return found | {"learned": lambda b: learned.run(b, b.parameters)}
 
 

@@ -150,8 +150,7 @@ def baselines(training: TrainingSet, folder: Path) -> dict[str, Any]:
     return {
         f"{names[0]}/ekf": partial(make_extended, training, models, nominal, noise),
         "filtered_difference": partial(make_difference, training, models.measured),
-        "learned": partial(make_learned, training, models.lifting, models.measured),
-        "learned, linear": partial(make_learned, training, Lifting(models.lifting.states), models.measured),
+        "learned": partial(make_learned, training, models.measured),
     }
 
 

@@ -19,7 +19,7 @@ from kros.export import CompiledObserver, HeldOut, export_c
 from kros.lifting import Lifting
 from kros.loops import find_compiler
 from kros.observer import Observer
-from kros.observer.recorded import recorded_channel
+from kros.observer.units import recorded_channel
 from kros.plants import PLANTS
 from kros.study.commands.estimate import estimate_recordings
 from kros.study.commands.export import export_run

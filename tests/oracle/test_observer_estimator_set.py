@@ -97,7 +97,7 @@ def member(case, E):
 
 
 def test_the_linear_estimate_is_the_observer_as_it_runs(found):
-    observer = replace(found.observer, runtime=Runtime(0, relift=False))
+    observer = replace(found.observer, runtime=Runtime(0))
     estimate, mean = linear_estimate(observer, LIFTING)
     _, batches = plant(spread=0.2)
     batch = next(iter(batches.values()))

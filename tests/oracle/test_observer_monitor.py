@@ -119,7 +119,7 @@ def test_what_cannot_be_a_monitor_is_refused():
                 ),
                 false_alarm_rate=0.1,
             )
-    with pytest.raises(DimensionError, match="monitor of 1 measurements"):
+    with pytest.raises(DimensionError, match=r"monitor should have shape \(1,\)"):
         replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), np.full((2, 3), [4, 4, 0]), 0.1))
 
 

@@ -78,9 +78,6 @@ Readers of one format are no longer public; use kros.read, which finds the forma
     kros.data.read_csv_folder kros.data.read_motor_drive_raw
 The check of a population and the class of a split are no longer public; kros.identify checks, split_episodes splits.
     kros.data.Split kros.data.check_population
-Certificates for any pattern of lost measurements are no longer part of kros; use kros.observer.dropout_bound for losses
-at a rate.
-    kros.observer.Dropped
 The function run_study is no longer part of kros; use kros.run, which takes a study too.
     kros.study.run_study
 The load's angle and the size of its observer are no longer settings; remove the keys, and let the step offset make the
@@ -125,6 +122,9 @@ the condition load and the states position and current.
 Requirements are no longer part of a study; remove the table require, and read certificates and outliers in
 metrics.json.
     require require.robust require.no_outliers
+Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
+for any pattern of losses, and the report's figure of lost measurements.
+    kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

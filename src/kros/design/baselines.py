@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Protocol
 
@@ -16,16 +16,13 @@ from ..data.population import EpisodeKey
 from ..evaluate import error_percent
 from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
-from ..lifting import Lifting
 from ..observer import ExtendedKalman, FilteredDifference, Seen
 from ..observer.baselines.difference import cutoffs_hz, followed
 from ..observer.baselines.extended_kalman import start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
-from ..observer.baselines.learned import Features, Learned
-from ..observer.baselines.learned_moments import Moments
+from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
-from ..observer.samples import Screened
-from ..observer.screen import Screen
+from ..observer.screen import Screen, Screened
 from ..observer.sensor import delay_of
 from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
@@ -40,10 +37,6 @@ class BaselineSettings:
 
     levels: tuple[float, ...] = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of the extended filter's process noise
     extended_samples: int = 2_000  # of an episode, on which these are compared
-    regressors: int = 600  # of the learned estimator, at most
-    moments: float = 2.5e7  # numbers in its moments of all units, conditions and states, 200 MB
-    least: float = 0.1  # share of a state's largest value, for which a state that hardly moves counts
-    work: float = 2e9  # samples times regressors of its training; no clock decides, so that every run is the same
     profile_samples: int = 5_000_000  # of the mean profile, at most, once every unit and condition has been read
     same_motion: float = 0.01  # RMS difference of inputs of the same motion, share of the largest input
 
@@ -169,32 +162,11 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
 
 
-def make_learned(
-    training: TrainingSet, lifting: Lifting, measured: tuple[int, ...], settings: BaselineSettings = DEFAULT
-) -> Baseline:
+def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
-    few = training.first_of_units().read()
-    y, u = hold_missing(few.measurements(measured)), few.batch.inputs
-    features = Features.of(lifting, measured, y, u)
-    groups, lengths = len({(key.unit, key.condition) for key in training.keys}), list[int]()
-    channels = features.channels(y[:1], u[:1], few.parameters).shape[-1]
-    hidden = max(1, lifting.n_states - len(measured))
-    most = min(settings.regressors, (settings.moments / (groups * hidden)) ** 0.5)
-    features = replace(features, taps=max(1, min(features.taps, int(most / channels))))
-    regressors = channels * features.taps
-
-    def episodes() -> Iterator[EpisodeBatch]:
-        for number, part in enumerate(training.one_by_one()):
-            if number >= groups and sum(lengths) * regressors > settings.work:
-                return
-            lengths.append(len(part.batch.states))
-            yield part.batch
-
-    moments = Moments.of(features, episodes(), settings.least * np.abs(few.batch.states).max(axis=(0, 1)))
-    choices = moments.choose()
-    estimators: dict[str, Learned] = {unit: moments.estimator([unit], choices) for unit in moments.units}
-    facts = {"status": "trained", "episodes": len(lengths), "episodes_recorded": len(training.keys)}
-    facts |= {"left_out": "the unit under test"}
-    facts["chosen"] = {lifting.states[i]: asdict(choice) for i, choice in zip(moments.estimated, choices, strict=True)}
-    estimators[""] = moments.estimator((), choices)
+    samples = len(training.population.read(training.keys[0])) * len(training.keys)
+    step = max(1, samples // Ridge().rows)
+    moments = Moments.of((part.batch for part in training.one_by_one()), measured, step)
+    facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
+    estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)

@@ -24,8 +24,7 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
-from ..observer.limits import Limit, limits_of
-from ..observer.sensor import Sensors, require_measured
+from ..observer.sensor import Limit, Sensors, limits_of, require_measured
 from ..synthesis import ObserverProblem
 from ..uncertainty.quantify import UncertainModels
 from .about import about

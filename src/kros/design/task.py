@@ -17,8 +17,7 @@ from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import Observer, ReliftCertificate, Runtime
-from ..observer.limits import Limits, sides
-from ..observer.sensor import Sensors, delay_of
+from ..observer.sensor import Limits, Sensors, delay_of, sides
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, rank
 
@@ -162,7 +161,7 @@ class DesignTask:
     def runtime(self) -> Runtime:
         """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
         lower, upper = sides(self.limits, self.models.lifting.states) if self.limits else (None, None)
-        return Runtime(delay_of(self.sensor), lower, upper, relift=False)
+        return Runtime(delay_of(self.sensor), lower, upper)
 
     @property
     def selector(self) -> Array:

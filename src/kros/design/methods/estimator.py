@@ -11,7 +11,7 @@ import numpy as np
 
 from ...identify.kinds import kind_of
 from ...observer import EstimatorSettings, Recordings, identify_estimator
-from ...observer.limits import sides
+from ...observer.sensor import sides
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Method
 

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...data.population import EpisodeKey
-from ...observer.recorded import recorded_channel, recorded_factors
+from ...observer.units import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.run_folder import open_finished
 from .field import FieldRecordings

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.artifacts import load_artifact, read_json
+from ...core.artifacts import load_artifact, read_json, write_json
 from ...core.errors import ConfigError, KrosError
 from ...core.files import did_you_mean
 from ...data import EpisodeBatch
@@ -62,9 +62,9 @@ def export_run(
         settings, facts = TrialSettings(), RecordingFacts.load(store.path("population"))
         level = settings.level(chosen.sample_period_s, facts.limits)
         load = LoadOutput(level, current=settings.current) if observer in loads else None
-        return export_c(
-            chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen), on_board=True
-        )
+        folder = export_c(chosen, out, name, precision, track, load, held_out(config, store, chosen))
+        write_json(folder / "study.json", config.dump())
+        return folder
 
 
 def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut | None:

@@ -20,8 +20,7 @@ from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibrate import segments_of
 from ...observer import Observer, run_with_status, track_parameter
-from ...observer.samples import Bits, SampleStatus
-from ...observer.screen import sample_status
+from ...observer.screen import Bits, SampleStatus, sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
 from ..engine.store import Store

@@ -18,7 +18,7 @@ from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
-from ...observer.limits import limits_of, sides
+from ...observer.sensor import limits_of, sides
 from ..engine.context import Context
 from .disturbed import Trial, alike, make_trial, run_disturbed
 from .held_out import HeldOut, Outcome
@@ -97,7 +97,7 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
         makers[f"{name}/ekf"] = partial(make_extended, training, models[name], context.uncertain.nominal, noise)
     profile = partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys)
     makers["filtered_difference"] = partial(make_difference, training, first.measured)
-    makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, context.lifting, first.measured)}
+    makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 

@@ -17,9 +17,8 @@ from ...evaluate import TrueErrors, true_errors
 from ...evaluate.errors import ErrorSummary, summarise_all
 from ...evaluate.sensor import as_shown
 from ...identify import ModelSet, free_run
-from ...observer import Observer
+from ...observer import Observer, run_observers
 from ...observer.sensor import Sensors
-from ...observer.simulate import run_some_at_a_time
 from .disturbed import Trial
 
 Array = npt.NDArray[np.float64]
@@ -63,7 +62,9 @@ class HeldOut:
 
         def run(batch: EpisodeBatch) -> Iterator[Array]:
             y, values = batch.measurements(first.measured), first.own(batch.parameters)
-            return run_some_at_a_time(observers, y, batch.inputs, values, max(1, _NUMBERS // batch.states.size))
+            count = max(1, _NUMBERS // batch.states.size)  # estimates of all of them may fill a memory
+            groups = (observers[i : i + count] for i in range(0, len(observers), count))
+            return (run_observers(group, y, batch.inputs, values) for group in groups)
 
         return self.outcomes(run)
 

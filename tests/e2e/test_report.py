@@ -258,7 +258,7 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
         uncertain,
         next(iter(uncertain.sets.values())),
         design,
-        RunResult(demo, metrics, ()),
+        RunResult(demo, metrics),
     ):
         figure = plot(result)
         assert isinstance(figure, Figure)
@@ -268,7 +268,7 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
     assert any(text.get_text() == "status" for text in plot(design).axes[2].texts)
     drawn = plot(design, models=models).axes[4].lines
     assert [line.get_label() for line in drawn] == ["recorded", observer_label(design.observer.name)]
-    run = RunResult(demo, metrics, ())
+    run = RunResult(demo, metrics)
     assert len(plot(run, name="phase").axes) == 3
     for wrong, options, match in (
         (run, {"name": "beauty"}, "no figure 'beauty'"),

@@ -90,7 +90,7 @@ def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -
     assert not refused.certified
 
     def design(name: str, proof: Any, hidden: float, blind: float = 5.0, **facts: Any) -> Design:
-        facts |= {"hidden_error_percent": hidden, "blind_error_percent": blind}
+        facts |= {"hidden_error_percent": hidden, "loss_error_percent": blind}
         return Design(name, good, Synthesis("", good.controller, Status.OPTIMAL), facts, proof)
 
     designs = [

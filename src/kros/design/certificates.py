@@ -24,6 +24,7 @@ from ..observer import (
     signal_bound,
 )
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
+from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
 from ..observer.screen import Screen
 from ..observer.units import factors, in_sizes
@@ -41,10 +42,7 @@ class CertificateSettings:
     """On how much of the recordings certificates and guards rest."""
 
     samples: int = 5_000  # of an episode, at most
-    losses: int = 3  # episodes in which measurements stop
-    loss_samples: int = 2_000  # of these, at most
-    loss_share: float = 0.4  # of these, at most
-    loss_after: float = 0.25  # share of these samples that arrive
+    losses: int = 12  # patterns of lost measurements that are simulated; in the first one they stop
     box: float = 1.5  # operating box in ranges, where slopes of a lifting have no global bounds
     room: float = 1.0  # by which estimates may leave what they and the recordings were in training, in ranges
 
@@ -94,7 +92,7 @@ def _certified_models(
         arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
-    blind = blind_error_percent(observers, data, settings)
+    lost = loss_error_percent(observers, data, settings)
     known: dict[bytes, BandEnergies] = {}
     certified = []
     for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
@@ -102,7 +100,7 @@ def _certified_models(
         bound = signal_bound(certificate, observer, batch, arrived[k], known)
         bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
         certificate = certificate.in_sizes(observer, {})
-        facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(blind[k])))
+        facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
         observer = replace(observer, guard=guards[k])
         certified.append(replace(design, observer=observer, certificate=certificate, facts={**design.facts, **facts}))
     return certified
@@ -130,21 +128,21 @@ def _certified_filters(
     left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
     percents = [data.compare([estimates])[0], *(other.percent(observer) for other in others)]
     hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * left_out, measured)) for percent in percents])))
-    blind = float(blind_error_percent([observer], data, settings)[0])
+    lost = float(loss_error_percent([observer], data, settings)[0])
     certificate = filter_certificate(observer, scales)
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
     certificate = replace(certificate, scales=scales)
     bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"]).in_sizes(by[:n])
-    facts = _facts(certificate, bound, measured, (hidden, blind))
+    facts = _facts(certificate, bound, measured, (hidden, lost))
     return replace(design, certificate=certificate, facts={**design.facts, **facts})
 
 
 def _facts(
     certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: tuple[float, float]
 ) -> dict[str, Any]:
-    """Return what the metrics say of certificates, and of the errors in training with and without measurements."""
+    """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
-    facts |= {"hidden_error_percent": errors[0], "blind_error_percent": errors[1]}
+    facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
     facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
     facts["set_bound"] = {
         s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
@@ -164,15 +162,20 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 
-def blind_error_percent(observers: Sequence[Observer], data: ValidationSet, settings: CertificateSettings) -> Array:
-    """Return the largest error in percent of the largest value where measurements stop, shape (observer,)."""
-    some, first = data.part(range(min(settings.losses, len(data.batch.keys)))), observers[0]
-    shortest = int(some.batch.lengths.min())
-    short = some.first(min(settings.loss_samples, max(2, round(settings.loss_share * shortest))))
-    y = short.measurements(first.measured)
-    y[max(1, round(settings.loss_after * len(y))) :] = np.nan
-    values = short.parameters if first.lifting.parameters else None
-    return np.asarray(short.compare(run_observers(observers, y, short.batch.inputs, values)).max(axis=-1))
+def loss_error_percent(observers: Sequence[Observer], data: ValidationSet, settings: CertificateSettings) -> Array:
+    """Return the largest error in percent of the largest value where measurements are lost, shape (observer,)."""
+    rows, first = np.arange(settings.losses) % len(data.batch.keys), observers[0]
+    some = data.part(rows.tolist()).first(int(data.batch.lengths[rows].min()))
+    y, x = some.measurements(first.measured), some.batch.states
+    lost = losses(np.random.default_rng(0), len(y), len(rows))
+    lost[len(y) // 4 :, 0] = True
+    estimates = run_observers(
+        observers, np.where(lost[..., None], np.nan, y), some.batch.inputs, first.own(some.parameters)
+    )
+    size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
+    return np.where(np.isfinite(errors), 100 * errors, np.inf)
 
 
 def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, size: float) -> ReliftCertificate:

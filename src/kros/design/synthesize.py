@@ -45,7 +45,7 @@ class DeploymentSettings:
     """Which observer is deployed."""
 
     as_good: float = 1.01  # ratio of errors that is no reason to prefer one observer to another
-    diverged: float = 100.0  # percent of the largest value, of an error without measurements
+    diverged: float = 300.0  # percent of the largest value, of the largest error where measurements are lost
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -288,7 +288,7 @@ def choose_deployed(designs: Sequence[Design], settings: DeploymentSettings | No
     errors = {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
     bounded = [d for d in designs if d.certificate and d.certificate.certified and np.isfinite(errors[d.name])]
     safe = [d for d in bounded if d.certified] or bounded
-    candidates = [d for d in safe if d.facts["blind_error_percent"] < settings.diverged] or safe
+    candidates = [d for d in safe if d.facts["loss_error_percent"] < settings.diverged] or safe
     least = min((errors[d.name] for d in candidates), default=np.inf)
     good = [d.name for d in candidates if errors[d.name] <= settings.as_good * least]
     best = preferred(good or [d.name for d in designs])

@@ -51,19 +51,6 @@ def test_total_and_noise_are_means_over_pairs(units: int) -> None:
     np.testing.assert_allclose(found.noise, np.mean(within), rtol=1e-12)
 
 
-def test_band_is_the_quantile_of_the_draws() -> None:
-    """A scalar B with Gaussian noise: 95 percent of the draws are within 1.96 standard deviations."""
-    rng = np.random.default_rng(1)
-    B = np.array([[[2.0]], [[3.0]]])
-    samples = B[:, None] + 0.1 * rng.normal(size=(2, 20000, 1, 1))
-    models = ModelSamples(
-        ("a", "b"), KoopmanMatrices(np.zeros_like(B), B), KoopmanMatrices(np.zeros_like(samples), samples)
-    )
-    found = variation_and_noise(models, FREQS, DT, nominal=1)
-    np.testing.assert_allclose(found.band, 0.196, rtol=0.03)
-    np.testing.assert_allclose(found.residual, np.array([[1.0], [0.0]]) * np.ones(len(FREQS)), atol=1e-12)
-
-
 def recordings(spread: float, units: int = 10, episodes: int = 12, seed: int = 2) -> ModelSamples:
     """Resampled models of noisy first-order systems, of the same one where `spread` is zero."""
     rng = np.random.default_rng(seed)
@@ -86,7 +73,6 @@ def test_identical_systems_are_all_noise_and_different_ones_hardly() -> None:
     assert 0.6 < np.exp(np.log(same.ratio).mean()) < 1.7
     different = variation_and_noise(recordings(0.3), FREQS, DT)
     assert np.all(different.noise_share < 0.05)
-    assert np.all(different.band.max(axis=0) < different.residual.max(axis=0))
 
 
 def test_shares_do_not_depend_on_units_of_measure_or_the_nominal(tmp_path: Path) -> None:
@@ -102,11 +88,10 @@ def test_shares_do_not_depend_on_units_of_measure_or_the_nominal(tmp_path: Path)
         scaled, FREQS, DT, nominal=7, output_scale=out * [1.0, 2.0], input_scale=into * [1.0, 4.0]
     )
     np.testing.assert_allclose(other.ratio, plain.ratio, rtol=1e-10)
-    np.testing.assert_allclose(other.band, plain.band, rtol=1e-10)
     other.save(tmp_path)
     again = VariationAndNoise.load(tmp_path)
     np.testing.assert_array_equal(again.noise_share, other.noise_share)
-    assert (again.form, again.unit_ids, again.nominal, again.level) == (other.form, other.unit_ids, 7, 0.95)
+    assert (again.form, again.unit_ids, again.nominal) == (other.form, other.unit_ids, 7)
 
 
 def test_bad_input_is_refused() -> None:

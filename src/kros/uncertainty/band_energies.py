@@ -25,17 +25,10 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..core.linalg import adjoint
+from .settings import BANDS
 
 Array = npt.NDArray[Any]
-BANDS = 96
-_ROUNDING = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
-_AT_ONCE, _BLOCK = 2_000_000, 2048  # lags of signals in memory at a time, and those whose weights are
-_BLOCKS = 4  # of weights that are kept
-_ITERATIONS, _TURNS = 60, 10  # at most; after so many it is looked which bands can be left
-_ENOUGH = 1.002  # of what is covered
-_REGULAR = 1e-14  # of the largest eigenvalue: what is smaller is rounding
 # of the largest energy, in every direction: the iteration needs its square above rounding
-_RIDGE = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +71,7 @@ class BandEnergies:
         return replace(self, energy=np.einsum("ue,ebij->ubij", member / member.sum(axis=1, keepdims=True), self.energy))
 
 
-def band_edges(n_samples: int, bands: int = BANDS) -> Array:
+def band_edges(n_samples: int, bands: int = BANDS.bands) -> Array:
     """Return edges of bands, logarithmic from the lowest frequency of an episode to Nyquist, and one below."""
     if n_samples < 2 or bands < 2:
         raise DimensionError(f"Bands: needs at least two samples and two bands, found {n_samples} and {bands}.")
@@ -104,7 +97,7 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     back = np.linalg.inv(half)
     E = half @ (energies / outer) @ half
     size = np.maximum(np.einsum("kbii->kb", E).real.max(axis=0), np.finfo(float).tiny)[:, None, None]
-    E = E / size + _RIDGE * np.eye(n)
+    E = E / size + BANDS.ridge * np.eye(n)
     M = _least(np.ascontiguousarray(np.swapaxes(E, 0, 1)))
     M = (M + adjoint(M)) / 2
     total = E.sum(axis=0)  # covers in any case
@@ -122,14 +115,14 @@ def _least(E: Array) -> Array:
     count, many, n = E.shape[:3]
     found, left = np.empty((count, n, n), complex), np.arange(count)
     G = np.broadcast_to(np.eye(n) / np.sqrt(many), E.shape).astype(complex)  # Y_k = G_k^H G_k
-    for turn in range(1, _ITERATIONS + 1):
+    for turn in range(1, BANDS.iterations + 1):
         rows = (G @ E).reshape(len(E), many * n, n)
         G = (rows @ _power(adjoint(rows) @ rows, -0.5)).reshape(E.shape)
-        if turn % _TURNS and turn < _ITERATIONS:
+        if turn % BANDS.turns and turn < BANDS.iterations:
             continue
         found[left] = now = (E @ (adjoint(G) @ G)).sum(axis=1)
         root = _power(now, -0.5)[:, None]
-        on = np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=1) > _ENOUGH
+        on = np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=1) > BANDS.enough
         if not on.any():
             break
         left, E, G = left[on], E[on], G[on]
@@ -145,14 +138,14 @@ def _touching(M: Array, E: Array) -> Array:
 def _power(matrices: Array, exponent: float) -> Array:
     """Powers of positive definite matrices."""
     values, vectors = np.linalg.eigh((matrices + adjoint(matrices)) / 2)
-    values = np.maximum(values, _REGULAR * np.maximum(values[..., -1:], np.finfo(float).tiny))
+    values = np.maximum(values, BANDS.regular * np.maximum(values[..., -1:], np.finfo(float).tiny))
     return np.asarray((vectors * (values**exponent)[..., None, :]) @ adjoint(vectors))
 
 
 def _energies(signals: Array, edges: Array) -> Iterator[Array]:
     """Yield integrals of ``R R^H / pi`` over bands, shape (b, n, n), for every signal of (n_samples, batch, n)."""
     n_samples, batch, n = signals.shape
-    many = max(1, _AT_ONCE // (n_samples * n * n))
+    many = max(1, BANDS.at_once // (n_samples * n * n))
     for start in range(0, batch, many):
         some = signals[:, start : start + many]
         size = np.sqrt(np.sum(some**2, axis=0))
@@ -162,7 +155,7 @@ def _energies(signals: Array, edges: Array) -> Iterator[Array]:
             energy = np.diff(total, axis=0) / np.pi
             values, vectors = np.linalg.eigh(energy)
             positive = (vectors * np.maximum(values, 0.0)[:, None, :]) @ adjoint(vectors)
-            yield (positive + _ROUNDING * np.eye(n)) * outer
+            yield (positive + BANDS.rounding * np.eye(n)) * outer
 
 
 def _lags(signals: Array) -> Array:
@@ -184,16 +177,16 @@ def _integrals(lags: Array, edges: Array) -> Array:
     batch, n_samples, n, _ = lags.shape
     lags = lags.reshape(batch, n_samples, n * n)
     even, odd = np.zeros((2, batch, len(edges), n * n))
-    for start in range(1, n_samples, _BLOCK):
-        by_even, by_odd = _weights(edges.tobytes(), start, min(start + _BLOCK, n_samples))
-        even += by_even @ lags[:, start : start + _BLOCK]
-        odd += by_odd @ lags[:, start : start + _BLOCK]
+    for start in range(1, n_samples, BANDS.block):
+        by_even, by_odd = _weights(edges.tobytes(), start, min(start + BANDS.block, n_samples))
+        even += by_even @ lags[:, start : start + BANDS.block]
+        odd += by_odd @ lags[:, start : start + BANDS.block]
     even, odd = (v.reshape(batch, len(edges), n, n) for v in (even, odd))
     whole = edges[:, None, None] * lags[:, :1].reshape(batch, 1, n, n)
     return whole + even + np.swapaxes(even, -1, -2) - 1j * (odd - np.swapaxes(odd, -1, -2))
 
 
-@lru_cache(maxsize=_BLOCKS)
+@lru_cache(maxsize=4)
 def _weights(edges: bytes, start: int, stop: int) -> tuple[Array, Array]:
     """Return the integrals of cosines and sines of some lags from zero to every edge."""
     lag = np.arange(start, stop)

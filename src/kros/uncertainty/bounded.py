@@ -23,7 +23,7 @@ from .forms import Form, check_responses, misfit
 from .inputs import check_candidate, check_ids, check_response, check_scales, find_nominal, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import choose_nominals
-from .settings import FitSettings
+from .settings import SET, FitSettings
 from .weights.bilinear import BilinearAxis, beyond, continuous_grid
 from .weights.fit import Target, fit_weight
 from .weights.residuals import Residuals
@@ -32,9 +32,6 @@ Array = npt.NDArray[Any]
 
 POOLED = "pooled"  # name of a nominal that is no unit
 _LOG = logging.getLogger(__name__)
-_EXACT = 1e-9  # relative misfit that is rounding
-_WARNED = 0.01  # misfit from which on another form is worth a thought: logged as a warning
-_RESOLVED = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it: a warning
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +160,7 @@ def _unresolved(bound: Array) -> npt.NDArray[np.intp]:
     """Return the inner maxima of a bound that fall by more than 3 dB to a neighbour."""
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
     top = (middle >= bound[:-2]) & (middle >= bound[2:])
-    return np.flatnonzero(top & (middle > np.maximum(_RESOLVED * low, 1e-8 * bound.max()))) + 1
+    return np.flatnonzero(top & (middle > np.maximum(SET.resolved * low, 1e-8 * bound.max()))) + 1
 
 
 def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, options: Options) -> dict[str, Any]:
@@ -204,10 +201,10 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
             ratio.size,
         )
     largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
-    if largest <= _EXACT and not unknown:
+    if largest <= SET.exact and not unknown:
         return False
     _LOG.log(
-        logging.WARNING if largest > _WARNED else logging.INFO,
+        logging.WARNING if largest > SET.warned else logging.INFO,
         "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an "
         "additive term. The additive form needs none.",
         form.value,

@@ -38,10 +38,9 @@ from ..core.small_matrices import (
     pseudo_inverse_first,
     sigma_max,
 )
+from .settings import SET
 
 Array = npt.NDArray[Any]
-
-MAX_CONDITION = 1e12  # beyond this an inverse form cannot rebuild the plant
 
 
 class Form(str, Enum):
@@ -211,7 +210,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     size = sigma_max(responses)
     ratio = np.divide(error, size, out=np.zeros_like(error), where=size > 0)
     if form.inverse:
-        ratio[~(condition_number(inverted_matrix(form, nominal, E)) <= MAX_CONDITION)] = np.nan
+        ratio[~(condition_number(inverted_matrix(form, nominal, E)) <= SET.condition)] = np.nan
     return ratio
 
 
@@ -222,7 +221,7 @@ def completion(
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
     if form.inverse:
-        regular = condition_number(inverted_matrix(form, G, E)) <= MAX_CONDITION
+        regular = condition_number(inverted_matrix(form, G, E)) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)
     return E, Gp - rebuild(form, G, E)
 

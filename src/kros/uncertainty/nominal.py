@@ -12,10 +12,9 @@ from ..core.errors import DimensionError
 from ..core.small_matrices import entries_first, lower_factor, multiply, pseudo_inverse_first, sigma_max_first
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses
+from .settings import SET
 
 Array = npt.NDArray[Any]
-
-_AT_ONCE = 16_000  # units times frequencies of one computation, which stays in the cache of a processor
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
             f"Nominal: responses of units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out."
         )
     count, n_freqs = G.shape[:2]
-    step, plants = max(1, _AT_ONCE // n_freqs), _Plants.of(form, G)
+    step, plants = max(1, SET.at_once // n_freqs), _Plants.of(form, G)
 
     def against(rows: Array, witness: Array) -> Array:
         """Residuals of the witness of every frequency for some nominals, shape (nominal, frequency)."""

@@ -20,14 +20,13 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
+from .settings import SET
 from .weights.cover import Cover, cover_ratio
 from .weights.entries import fit_entries
 from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
-MOST_UNITS = 200  # that are kept for a picture
-_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
 
 
@@ -98,7 +97,7 @@ def unit_residuals(
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
-    fitted = fit_entries(E[inside], freqs_hz, sample_period_s, _ENTRY_ORDER)
+    fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
     shown = shown_rows(inside)
     return UnitResiduals(
         form=form,
@@ -118,5 +117,5 @@ def unit_residuals(
 def shown_rows(inside: npt.NDArray[np.bool_]) -> Array:
     """Return at most 200 rows of covered units, evenly spread, and all others."""
     rows = np.flatnonzero(inside)
-    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(MOST_UNITS, len(rows))).round().astype(int))]
+    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]
     return np.sort(np.concatenate([some, np.flatnonzero(~inside)]))

@@ -30,13 +30,11 @@ from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual
 from .inputs import check_scale
+from .settings import OUTLIER, SET
 
 Array = npt.NDArray[Any]
 
-_AT_ONCE = 4_000_000  # complex numbers in memory
-_MOST_NOMINALS = 64
-_LEVEL = 0.95  # of the band
-_ARRAYS = ("freqs_hz", "residual", "band", "total", "noise")
+_ARRAYS = ("freqs_hz", "residual", "total", "noise")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,14 +47,9 @@ class VariationAndNoise:
     unit_ids : tuple of str
     nominal : int
         Row of the nominal unit.
-    level : float
-        Of the band.
     freqs_hz : ndarray, shape (frequency,), Hz
     residual : ndarray, shape (unit, frequency)
         Largest singular value of the residual against the nominal unit, in scaled coordinates.
-    band : ndarray, shape (unit, frequency)
-        What the largest singular value of the residual between a unit and a resampled model of its own stays below with
-        probability `level`.
     total, noise : ndarray, shape (frequency,)
         Mean squared Frobenius norms of residuals between units, and between resampled models of the same unit.
 
@@ -70,17 +63,15 @@ class VariationAndNoise:
     >>> estimate = KoopmanMatrices(poles, np.ones((2, 1, 1)))
     >>> samples = ModelSamples(("a", "b"), estimate, KoopmanMatrices(draws, np.ones((2, 30, 1, 1))))
     >>> found = variation_and_noise(samples, np.geomspace(0.1, 40, 20), 0.01)
-    >>> found.residual.shape, found.level
-    ((2, 20), 0.95)
+    >>> found.residual.shape
+    (2, 20)
     """
 
     form: Form
     unit_ids: tuple[str, ...]
     nominal: int
-    level: float
     freqs_hz: Array
     residual: Array
-    band: Array
     total: Array
     noise: Array
 
@@ -96,7 +87,7 @@ class VariationAndNoise:
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``variation_and_noise.json``."""
-        content = {"form": self.form, "unit_ids": self.unit_ids, "nominal": self.nominal, "level": self.level}
+        content = {"form": self.form, "unit_ids": self.unit_ids, "nominal": self.nominal}
         save_artifact(Path(folder), "variation_and_noise", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
@@ -104,13 +95,12 @@ class VariationAndNoise:
     def load(cls, folder: Path) -> VariationAndNoise:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "variation_and_noise")
-        axes = {"freqs_hz": "f", "residual": "uf", "band": "uf", "total": "f", "noise": "f"}
+        axes = {"freqs_hz": "f", "residual": "uf", "total": "f", "noise": "f"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             form=Form(content["form"]),
             unit_ids=tuple(content["unit_ids"]),
             nominal=content["nominal"],
-            level=content["level"],
             **{name: arrays[name] for name in _ARRAYS},
         )
 
@@ -171,21 +161,18 @@ def variation_and_noise(
     scale = check_scale("output", output_scale, n)[:, None] / check_scale("input", input_scale, m)
     # Responses of the estimates, scaled: (unit, frequency, n, m).
     G = models.estimate.responses(freqs, sample_period_s) / scale
-    noise, band = np.zeros(len(freqs)), np.empty((units, len(freqs)))
-    step = max(1, _AT_ONCE // (draws * n * max(n, m)))
+    noise = np.zeros(len(freqs))
+    step = max(1, OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):
         for part in (slice(start, start + step) for start in range(0, len(freqs), step)):
             other = models.responses(row, freqs[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, other, np.roll(other, 1, axis=0))) / units
-            band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), _LEVEL, axis=0)
     return VariationAndNoise(
         form=form,
         unit_ids=models.unit_ids,
         nominal=nominal,
-        level=_LEVEL,
         freqs_hz=freqs,
         residual=sigma_max(residual(form, G[nominal], G)),
-        band=band,
         total=_between(form, G),
         noise=noise,
     )
@@ -199,7 +186,7 @@ def _mean_square(E: Array) -> Array:
 def _between(form: Form, G: Array) -> Array:
     """Mean squared residual over ordered pairs of units, with at most 64 of them as nominals."""
     units = len(G)
-    chosen = np.unique(np.linspace(0, units - 1, min(units, _MOST_NOMINALS)).round().astype(int))
+    chosen = np.unique(np.linspace(0, units - 1, min(units, SET.nominals)).round().astype(int))
     return np.mean([_mean_square(residual(form, G[k], G)) for k in chosen], axis=0) * units / (units - 1)
 
 

@@ -17,16 +17,9 @@ import numpy.typing as npt
 
 from ...core.small_matrices import entries_first, sigma_max_first, squared
 from ..forms import Form, residual
+from ..settings import OUTLIER
 
 Array = npt.NDArray[Any]
-
-_MOST_NOMINALS = 64
-_SMOOTHING_DECADES = 1.0 / 3.0
-_SINKHORN = 50
-_SMALLEST = 1e-12  # relative to the largest typical entry of row and column
-_EQUAL = 1e-12  # responses that differ by less, relative to the larger, are the same
-_LEAST = 1e-10  # distance of responses that are the same, relative to the typical one
-_AT_ONCE = 4_000_000  # complex numbers of residuals in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +43,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     G = responses
     nominals = _nominals(G)
     own = nominals[:, None] == np.arange(len(G))
-    step = max(1, _AT_ONCE // (len(nominals) * len(G) * max(G.shape[2:]) ** 2))
+    step = max(1, OUTLIER.at_once // (len(nominals) * len(G) * max(G.shape[2:]) ** 2))
     sigma, left, right = [], [], []
     for start in range(0, G.shape[1], step):
         part = G[:, start : start + step]
@@ -64,7 +57,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
         sigma.append(sigma_max_first(entries_first(E / scales[0][:, :, None] / scales[1][:, None, :])))
         left.append(scales[0])
         right.append(scales[1])
-    level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), _LEAST)), freqs_hz)
+    level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), OUTLIER.least)), freqs_hz)
     level[own] = np.nan
     return Distances(nominals, level.max(axis=2), _median(level, own), np.concatenate(left), np.concatenate(right))
 
@@ -72,7 +65,7 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
     """Return smoothed levels of residuals in the scales of a population, shape (..., frequency), dB."""
     E = residual(form, nominal, perturbed) / found.left[:, :, None] / found.right[:, None, :]
-    return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), _LEAST)), freqs_hz)
+    return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), OUTLIER.least)), freqs_hz)
 
 
 def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:
@@ -91,9 +84,9 @@ def typical(squares: Array) -> tuple[Array, Array]:
     row[row <= 0] = 1.0
     column = (squares / row).max(axis=1, keepdims=True)
     column[column <= 0] = 1.0
-    weights = np.maximum(squares / row / column, _SMALLEST)
+    weights = np.maximum(squares / row / column, OUTLIER.smallest)
     left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
-    for _ in range(_SINKHORN):
+    for _ in range(OUTLIER.balancings):
         left = (weights / right[:, None, :]).sum(axis=2)
         right = (weights / left[:, :, None]).sum(axis=1)
     return np.sqrt(left * row[:, :, 0]), np.sqrt(right * column[:, 0])
@@ -107,18 +100,18 @@ def balance(responses: Array) -> tuple[Array, Array]:
 
 def _nominals(G: Array) -> Array:
     """All units, or 64 spread evenly over their distances from the entrywise median."""
-    if len(G) <= _MOST_NOMINALS:
+    if len(G) <= OUTLIER.nominals:
         return np.arange(len(G))
     middle = np.median(G.real, axis=0) + 1j * np.median(G.imag, axis=0)
     size = np.maximum(np.abs(middle), np.finfo(float).tiny)
     order = np.argsort((np.abs(G - middle) / size).mean(axis=(1, 2, 3)), kind="stable")
-    return np.sort(order[np.linspace(0, len(G) - 1, _MOST_NOMINALS).round().astype(int)])
+    return np.sort(order[np.linspace(0, len(G) - 1, OUTLIER.nominals).round().astype(int)])
 
 
 def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
-    return np.stack([np.abs(G - G[k]).max(axis=(2, 3)) <= _EQUAL * np.maximum(size, size[k]) for k in nominals])
+    return np.stack([np.abs(G - G[k]).max(axis=(2, 3)) <= OUTLIER.equal * np.maximum(size, size[k]) for k in nominals])
 
 
 def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:
@@ -134,5 +127,5 @@ def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:
 def _smooth(level: Array, freqs: Array) -> Array:
     """Moving average over log frequency, to a billionth of a dB."""
     x = np.log10(freqs)
-    near = (np.abs(x[:, None] - x) <= _SMOOTHING_DECADES / 2).astype(float)
+    near = (np.abs(x[:, None] - x) <= OUTLIER.smoothing / 2).astype(float)
     return np.asarray(np.round(level @ (near / near.sum(axis=0)), 9))

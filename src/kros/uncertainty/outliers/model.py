@@ -35,19 +35,13 @@ from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
+from ..settings import OUTLIER
 from .distances import Distances, balance, distances, largest_entries, scaled_levels
-from .score import FEWEST_UNITS, OutlierScore, Status, room_db
+from .score import OutlierScore, Status, room_db
 from .tail import Flags, excesses, margins, separate
 
 Array = npt.NDArray[Any]
 
-FALSE_ALARM_RATE = 1e-2
-_FREQUENCIES = 120
-_HALVES_DB = 10 * np.log10(2.0)
-_LEAST_LEVEL = 1e-10  # in amplitude, as distances have it
-_FEWEST = 2  # others that a unit can be compared with
-_PERCENT = 1.0
-_MOST = 12  # units whose changes are tried
 _ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
 
 
@@ -125,7 +119,7 @@ class OutlierModel:
             When it is not finite, or fewer than two inliers are left.
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
-        if len(rows) < _FEWEST:
+        if len(rows) < 2:
             raise DataError(
                 f"Scoring unit {unit}: {len(rows)} others are left to compare with, two are needed; record more units."
             )
@@ -138,13 +132,13 @@ class OutlierModel:
         _require_finite(G[None], (unit,), self.freqs_hz)
         comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
         margin = -np.inf
-        if self.n_units >= FEWEST_UNITS:
+        if self.n_units >= OUTLIER.fewest:
             levels = comparison.distances.levels
             margin = float(margins(levels, comparison.inliers, self.false_alarm_rate)[1][-1])
         (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): margin})
         level = comparison.distances.levels[-1]
         motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
-        beyond = np.maximum(10 ** (level / 20) - motion, _LEAST_LEVEL)
+        beyond = np.maximum(10 ** (level / 20) - motion, OUTLIER.least)
         certain = margin - float(level.max() - 20 * np.log10(beyond.max()))
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
 
@@ -165,7 +159,7 @@ class OutlierModel:
         """
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
         levels = scaled_levels(self.form, first, second, self._known, self.freqs_hz)
-        return np.asarray(np.median(levels, axis=0) - _HALVES_DB)
+        return np.asarray(np.median(levels, axis=0) - 10 * np.log10(2.0))
 
     @property
     def n_units(self) -> int:
@@ -216,7 +210,7 @@ def score_outliers(
     unit_ids: tuple[str, ...] | None = None,
     output_scale: npt.ArrayLike | None = None,
     input_scale: npt.ArrayLike | None = None,
-    false_alarm_rate: float = FALSE_ALARM_RATE,
+    false_alarm_rate: float = 0.01,
 ) -> OutlierModel:
     """Score every unit of a population against the others.
 
@@ -292,7 +286,7 @@ def scored_frequencies(freqs_hz: Array) -> Array:
 
 
 def _scored(count: int) -> Array:
-    return np.unique(np.linspace(0, count - 1, _FREQUENCIES).round().astype(int))
+    return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,7 +331,7 @@ class Comparison:
     def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
         """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
         cover = float(self.distances.levels[unit].max()) - score.excess_db
-        percent = _PERCENT * 10 ** ((cover + bound_db - self._changes) / 20)
+        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
         i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
         smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
         if score.outlier:
@@ -357,11 +351,11 @@ class Comparison:
     def _changes(self) -> Array:
         """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
         G = self.responses[self.inliers]
-        G = G[np.unique(np.linspace(0, len(G) - 1, min(_MOST, len(G))).round().astype(int))]
+        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
         levels = np.empty((*G.shape[2:], G.shape[1]))
         for i, j in np.ndindex(*G.shape[2:]):
             changed = G.copy()
-            changed[:, :, i, j] *= 1 + _PERCENT / 100
+            changed[:, :, i, j] *= 1 + OUTLIER.percent / 100
             shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
             levels[i, j] = np.median(shifted, axis=0)
         return levels

@@ -21,12 +21,10 @@ import numpy.typing as npt
 from ...identify import Factor, ModelSet, combine
 from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors
+from ..settings import OUTLIER
 from .score import OutlierScore, Status
 
 Array = npt.NDArray[Any]
-
-_SAME = 1e-9  # relative difference of the Gram matrices of one recording, read twice
-_LEAST = 0.5  # of the middle unit's samples: the variance of an estimate is at most twice the usual one
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +104,13 @@ class Recorded:
 
     def suffices(self, evidence: Evidence) -> bool:
         """Tell whether a unit was recorded for long enough to be compared with those of the study."""
-        return evidence.n_samples >= _LEAST * self.usual
+        return evidence.n_samples >= OUTLIER.recorded * self.usual
 
     def qualified(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
         """Return what can be said about a unit: nothing where it was recorded for too little."""
         if self.suffices(evidence):
             return score
-        score_db, more = min(score.score_db, score.threshold_db), _LEAST * self.usual / evidence.n_samples
+        score_db, more = min(score.score_db, score.threshold_db), OUTLIER.recorded * self.usual / evidence.n_samples
         return replace(score, score_db=score_db, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
 
     def same_recordings(self, factor: Factor) -> set[str]:
@@ -133,4 +131,4 @@ def _alike(stored: Factor, found: Factor, row: int) -> bool:
     candidates = np.flatnonzero(stored.n_samples == found.n_samples[row])
     gram = found.R[row].T @ found.R[row]
     size = np.sqrt(np.diag(gram))
-    return any((np.abs(R.T @ R - gram) <= _SAME * np.outer(size, size)).all() for R in stored.R[candidates])
+    return any((np.abs(R.T @ R - gram) <= OUTLIER.same * np.outer(size, size)).all() for R in stored.R[candidates])

@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ..settings import OUTLIER
+
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
-FEWEST_UNITS = 8
-LARGEST_DB = 26.0  # beyond the largest of the others: twenty times as far away as any of them is
-LARGEST_PERCENT = 900.0  # change of gain: ten times as large
+FEWEST_UNITS = OUTLIER.fewest
 
 
 class Status(StrEnum):
@@ -111,5 +111,8 @@ def room_db(detectable_db: float, detectable_percent: float) -> float:
     if not (np.isfinite(detectable_db) and np.isfinite(detectable_percent)):
         return float("-inf")
     return float(
-        min(LARGEST_DB - detectable_db, 20 * np.log10(LARGEST_PERCENT / max(detectable_percent, np.finfo(float).tiny)))
+        min(
+            OUTLIER.largest_db - detectable_db,
+            20 * np.log10(OUTLIER.largest_percent / max(detectable_percent, np.finfo(float).tiny)),
+        )
     )

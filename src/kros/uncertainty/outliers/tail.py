@@ -24,13 +24,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .score import FEWEST_UNITS
+from ..settings import OUTLIER
 
 Array = npt.NDArray[Any]
 Flags = npt.NDArray[np.bool_]
 
 LEAST_SCORES = 3
-_ROUNDING_DB = 1e-8  # levels are rounded to a tenth of that
 
 
 def prediction_bound(scores: Array, rate: float) -> Array:
@@ -80,7 +79,7 @@ def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
     bound[~inliers] = factor(count, rate) * scale(known).mean()
     if count > 2:
         bound[inliers] = factor(count - 1, rate) * scales_without_one(known).mean(axis=1)
-    return value, value - np.maximum(bound, _ROUNDING_DB)
+    return value, value - np.maximum(bound, OUTLIER.rounding_db)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,7 @@ def separate(levels: Array, rate: float) -> Separation:
     """Take units out while the largest excess is beyond the bound of the others, up to a third of them."""
     n = len(levels)
     inliers, margin = np.ones(n, bool), np.full(n, -np.inf)
-    if n < FEWEST_UNITS:
+    if n < OUTLIER.fewest:
         return Separation(inliers, margin, np.inf)
     each = rate / (1 + n * rate)  # in expectation all steps together flag n * rate
     while True:

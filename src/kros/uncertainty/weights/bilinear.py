@@ -17,13 +17,10 @@ import numpy.typing as npt
 
 from ...core.errors import ConfigError
 from ...core.lti import StateSpace
+from ..settings import SET
 from .residuals import Residuals
 
 Array = npt.NDArray[Any]
-
-_BEYOND = 10.0  # how far above the last frequency the grid goes on, for systems
-_POINTS_BEYOND = 16
-_DEFAULT_POINTS = 1000
 
 
 @dataclass(frozen=True)
@@ -95,7 +92,7 @@ class BilinearAxis:
 def beyond(freqs_hz: Array) -> Array:
     """Return the frequencies, and more of them up to ten times the last."""
     top = freqs_hz[-1]
-    return np.concatenate([freqs_hz, np.geomspace(top, _BEYOND * top, _POINTS_BEYOND)[1:]])
+    return np.concatenate([freqs_hz, np.geomspace(top, SET.beyond * top, SET.points_beyond + 1)[1:]])
 
 
 def continuous_grid(system: StateSpace) -> Array:
@@ -104,4 +101,4 @@ def continuous_grid(system: StateSpace) -> Array:
     sizes = sizes[sizes > 0]
     if not sizes.size:
         raise ConfigError("Frequency grid: static continuous models have no band of their own; give freqs_hz.")
-    return np.geomspace(sizes.min() / 100, sizes.max() * 10, _DEFAULT_POINTS)
+    return np.geomspace(sizes.min() / 100, sizes.max() * 10, SET.points)

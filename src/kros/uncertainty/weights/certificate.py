@@ -26,17 +26,13 @@ import numpy.typing as npt
 
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
+from ..settings import PROOF
 from .pencils import Descriptor, ResidualSystems
 
 Array = npt.NDArray[Any]
 Ratio = Callable[[Array], Array]
 
 _LOG = logging.getLogger(__name__)
-_MARGIN = 1e-5
-_LEVELS = 20  # limit; two or three are met
-_PROBE = 0.9  # of the peak: the level at which the pencil is tried
-_NEAR = 1e-3  # of its modulus: how far from the imaginary axis an eigenvalue may be
-_FINER, _ZOOMS = 20, 3  # points and rounds between the neighbours of a maximum
 
 
 class Method(str, Enum):
@@ -57,7 +53,7 @@ class Certificate:
     @property
     def bound(self) -> float:
         """What no ratio exceeds, by level sets; the largest one that was evaluated, on a grid."""
-        return self.peak * (1 + _MARGIN) if self.method is Method.LEVEL_SETS else self.peak
+        return self.peak * (1 + PROOF.margin) if self.method is Method.LEVEL_SETS else self.peak
 
 
 def certify(
@@ -73,11 +69,11 @@ def certify(
     pencils = [] if systems is None or peak <= 0 else systems.ratios(left, right)
     if not pencils or not _trusted(pencils, freqs_hz, known, left.dt):
         return Certificate(Method.GRID, peak, freq)
-    for _ in range(_LEVELS):
-        points = np.unique(np.concatenate([_candidates(p, peak * (1 + _MARGIN), left.dt) for p in pencils]))
+    for _ in range(PROOF.levels):
+        points = np.unique(np.concatenate([_candidates(p, peak * (1 + PROOF.margin), left.dt) for p in pencils]))
         values = ratio(points).max(axis=0)
         top = int(values.argmax())
-        if values[top] <= peak * (1 + _MARGIN):
+        if values[top] <= peak * (1 + PROOF.margin):
             return Certificate(Method.LEVEL_SETS, peak, freq)
         peak, freq = float(values[top]), float(points[top])
     return Certificate(Method.GRID, peak, freq)
@@ -85,10 +81,10 @@ def certify(
 
 def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, float]:
     """Return frequency and height of the highest peak, evaluated more densely between its neighbours."""
-    for _ in range(_ZOOMS):
+    for _ in range(PROOF.zooms):
         top = int(known.argmax())
         low, high = freqs_hz[max(top - 1, 0)], freqs_hz[min(top + 1, len(freqs_hz) - 1)]
-        freqs_hz = np.unique(np.append(np.linspace(low, high, _FINER + 1), freqs_hz[top]))
+        freqs_hz = np.unique(np.append(np.linspace(low, high, PROOF.finer + 1), freqs_hz[top]))
         known = ratio(freqs_hz).max(axis=0)
     top = int(known.argmax())
     return float(freqs_hz[top]), float(known[top])
@@ -97,7 +93,7 @@ def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, floa
 def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> Array:
     """Return the frequencies, Hz, at which a singular value may equal gamma."""
     s = pencil.crossings(gamma)
-    near = s[(np.abs(s.real) <= _NEAR * np.abs(s)) & (s.imag > 0)].imag
+    near = s[(np.abs(s.real) <= PROOF.near * np.abs(s)) & (s.imag > 0)].imag
     return np.unique(np.arctan(near) / (np.pi * dt))
 
 
@@ -111,11 +107,11 @@ def _candidates(pencil: Descriptor, gamma: float, dt: float) -> Array:
 def _trusted(pencils: list[Descriptor], freqs_hz: Array, known: Array, dt: float) -> bool:
     """Tell whether the pencil of the worst unit has an eigenvalue at every crossing that the grid shows."""
     unit = int(known.max(axis=1).argmax())
-    level = _PROBE * float(known[unit].max())
+    level = PROOF.probe * float(known[unit].max())
     above = known[unit] > level
     crossing = np.flatnonzero(above[1:] != above[:-1])
     at = _crossings_hz(pencils[unit], level, dt)
-    low, high = freqs_hz[crossing] * (1 - _NEAR), freqs_hz[crossing + 1] * (1 + _NEAR)
+    low, high = freqs_hz[crossing] * (1 - PROOF.near), freqs_hz[crossing + 1] * (1 + PROOF.near)
     seen = np.searchsorted(at, high, side="right") > np.searchsorted(at, low)
     if not seen.all():
         _LOG.debug("Certificate: %d of %d crossings have no eigenvalue; the grid decides", (~seen).sum(), len(seen))

@@ -24,17 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
+from ..settings import COVER
 
 Array = npt.NDArray[Any]
 
-_SQUARINGS = (1, 3, 6)  # q = 2^s + 1 = 3, 9, 65
-_NEWTON = 8
-_ENTRIES = 1200  # entries of E times frequencies in the search: 300 frequencies for 2 x 2, 75 for 4 x 4
-_UNITS = 6  # per frequency
-_PULL = 1e-3
-_REACH = 2.0  # largest Newton step, nepers
-_DIFFERENCE = 1e-5
-_TINY = 1e-300
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,22 +93,22 @@ def _descend(first: Array, size: Array, p: int) -> Array:
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    count = max(60, _ENTRIES // (first.shape[0] * first.shape[1]))
+    count = max(COVER.frequencies, COVER.entries // (first.shape[0] * first.shape[1]))
     chosen = alive[np.unique(np.linspace(0, len(alive) - 1, count).round().astype(int))]
     E = first[..., chosen] / size[chosen]
     E = E[:, :, _largest(sigma_max_first(E))]
     x = np.zeros((n, len(chosen)))
-    for power in _SQUARINGS:
-        for _ in range(_NEWTON):
+    for power in COVER.squarings:
+        for _ in range(COVER.newton):
             x, moved = _newton(_Smooth(E, p, power), x)
-            if moved < 1e-9:
+            if moved < COVER.settled:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
 
 
 def _largest(sizes: Array) -> Array:
     """Indices of the units that are among the largest residuals anywhere; the others are covered by the scale."""
-    order = np.argsort(-sizes, axis=0)[:_UNITS]
+    order = np.argsort(-sizes, axis=0)[: COVER.units]
     return np.unique(order)
 
 
@@ -146,11 +140,11 @@ class _Smooth:
             x[:p].mean(axis=0)
             + np.log(top)
             + np.log(total) / (2 * q)
-            + _PULL / 2 * (x**2).sum(axis=0)
+            + COVER.pull / 2 * (x**2).sum(axis=0)
             + x[p:].mean(axis=0)
         )
         gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
-        return cost, gradient + _PULL * x
+        return cost, gradient + COVER.pull * x
 
 
 def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
@@ -159,11 +153,11 @@ def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
     hessian = np.empty((x.shape[1], len(x), len(x)))
     for i in range(len(x)):
         ahead = x.copy()
-        ahead[i] += _DIFFERENCE
-        hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / _DIFFERENCE).T
+        ahead[i] += COVER.difference
+        hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / COVER.difference).T
     hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(len(x))
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
-    step *= np.minimum(1.0, _REACH / np.maximum(np.abs(step).max(axis=0), _TINY))
+    step *= np.minimum(1.0, COVER.reach / np.maximum(np.abs(step).max(axis=0), _TINY))
     slope = (gradient * step).sum(axis=0)
     best, length = x, np.ones(x.shape[1])
     pending = np.ones(x.shape[1], bool)

@@ -15,11 +15,10 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
 from ...core.small_matrices import sigma_max
+from ..settings import SET
 from .magnitude import fit_magnitude
 
 Array = npt.NDArray[Any]
-
-_SINGULAR = 1e10  # condition number beyond which weights have no inverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,5 +49,5 @@ def _excess(W: Array, E: Array) -> float:
     """Return the largest ``sigma_max(W^-1 E)`` of weights (frequency, p, p) over residuals."""
     if W.shape[-1] != W.shape[-2] or not np.abs(W).max():
         return float("nan")
-    usable = np.linalg.cond(W) < _SINGULAR
+    usable = np.linalg.cond(W) < SET.singular
     return float(sigma_max(np.linalg.solve(W[usable], E[:, usable])).max()) if usable.any() else float("nan")

@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from ...core.frequency import bilinear_squared, dense_grid
 from ...core.lti import block_diagonal, gain
-from ..settings import FitSettings
+from ..settings import PROOF, FitSettings
 from .certificate import Certificate, Method, certify
 from .cover import Cover, cover_ratio, optimal_cover
 from .joint import JointFit, JointProblem, fit_jointly, refit
@@ -27,10 +27,6 @@ from .weight import Weight
 Array = npt.NDArray[Any]
 
 _LOG = logging.getLogger(__name__)
-_MARGIN = 1e-9  # rounding of ratios
-_SAME = 1e-9  # relative distance of frequencies that are one: rounding
-_DECADES, _A_DECADE, _EVEN = 4, 15, 101  # of tau beyond the grid, points of the check in each, and evenly over Hz
-_WORST = 20  # frequencies that join in a round
 
 
 @dataclass(frozen=True)
@@ -70,9 +66,9 @@ def checking_grid(freqs_hz: Array, sample_period_s: float, density: int) -> Arra
     dense = dense_grid(freqs_hz, sample_period_s, density)
     tau = bilinear_squared(dense, sample_period_s)
     inner = np.log10(tau[(tau > 0) & (tau < np.inf)]) if ((tau > 0) & (tau < np.inf)).any() else np.zeros(1)
-    low, high = inner.min() - _DECADES, inner.max() + _DECADES
-    logs = np.logspace(low, high, 1 + int(_A_DECADE * (high - low)))
-    even = np.linspace(0.0, dense[-1], _EVEN)
+    low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades
+    logs = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
+    even = np.linspace(0.0, dense[-1], PROOF.even)
     return joined(dense, np.append(np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s), even))
 
 
@@ -82,7 +78,7 @@ def joined(freqs_hz: Array, others_hz: Array) -> Array:
     at = np.searchsorted(freqs_hz, others)
     below, above = freqs_hz[np.maximum(at - 1, 0)], freqs_hz[np.minimum(at, len(freqs_hz) - 1)]
     near = np.minimum(np.abs(others - below), np.abs(others - above))
-    return np.sort(np.concatenate([freqs_hz, others[near > _SAME * others]]))
+    return np.sort(np.concatenate([freqs_hz, others[near > PROOF.same * others]]))
 
 
 class _Fit:
@@ -201,7 +197,7 @@ def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array, block: int) -> 
 
 def _lifted(weight: Weight, proof: _Proof) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift, method = proof.bound * (1 + _MARGIN), proof.certificate.method
+    lift, method = proof.bound * (1 + PROOF.rounding), proof.certificate.method
     if not lift > 0:
         return replace(weight, cover_max=0.0, method=method)
     return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=method)
@@ -211,4 +207,4 @@ def _peaks(ratio: Array) -> Array:
     """Return the indices of the worst local maxima above one."""
     inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
     tops = np.flatnonzero((ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > 1))
-    return np.sort(tops[np.argsort(-ratio[tops])[:_WORST]])
+    return np.sort(tops[np.argsort(-ratio[tops])[: PROOF.worst]])

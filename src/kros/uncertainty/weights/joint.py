@@ -32,8 +32,7 @@ from .sections import Sections
 Array = npt.NDArray[Any]
 
 NEPER_DB = 20 / np.log(10.0)
-_FARTHEST = 1.5  # nepers: largest change of a parameter in a step
-_TINY = 1e-300
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +102,7 @@ def refit(problem: JointProblem, start: Sections, settings: FitSettings) -> Join
     start = start.moved(np.zeros_like(start.parameters), problem.ends)
     state = _State(problem, start, start.parameters, settings)
     for temperature in settings.temperatures:
-        damping = 1e-2
+        damping = settings.damping
         for _ in range(settings.steps):
             better = state.step(temperature, damping)
             if better is None:
@@ -175,9 +174,9 @@ class _State:
         gradient = sum(p[0] for p in parts) + pull * (self.sections.parameters - self.start)
         hessian = sum(p[1] for p in parts) + pull * np.eye(len(gradient))
         before = self.value(temperature)
-        for _ in range(8):
+        for _ in range(self.settings.trials):
             move = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-            move *= min(1.0, _FARTHEST / max(float(np.abs(move).max()), _TINY))
+            move *= min(1.0, self.settings.farthest / max(float(np.abs(move).max()), _TINY))
             trial = _State(self.problem, self.sections.moved(move, self.problem.ends), self.start, self.settings)
             if trial.value(temperature) < before:
                 return trial, max(damping / 4, 1e-6)

@@ -20,17 +20,14 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
-from .programs import EXACT, Grid
+from ..settings import MAGNITUDE
+from .programs import Grid
 from .rational import RationalMagnitude
 from .sections import Sections
 
 Array = npt.NDArray[Any]
 
-_FLOOR = 1e-8  # magnitudes below this fraction of the largest count as this fraction (-160 dB)
 _LOG = logging.getLogger(__name__)
-_TOP = 10.0  # tau (80 % of Nyquist) beyond which there are no knots
-_ROUNDS = 6  # of programs: frequencies at which n or d vanish between points join them
-_EVEN = 0.5  # share of the knots that is evenly spaced
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +144,7 @@ class Bound:
 
 def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Bound]:
     """Yield the tightest bounds of positive magnitudes at increasing tau, each better than those before."""
-    values = np.maximum(magnitude, _FLOOR * magnitude.max())
+    values = np.maximum(magnitude, MAGNITUDE.floor * magnitude.max())
     unit = float(np.exp(np.mean(np.log(values))))
     targets, lower = (values / unit) ** 2, None
     for order in range(max_order + 1):
@@ -161,7 +158,7 @@ def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Boun
             _LOG.debug("Magnitude fit: %s", error)
             continue
         yield Bound(order, sections, 10 * float(np.log10(ratio)))
-        if ratio < EXACT:
+        if ratio < MAGNITUDE.exact:
             break
 
 
@@ -180,7 +177,7 @@ def _best(tau: Array, targets: Array, order: int, lower: RationalMagnitude | Non
         return RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0))
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
     gamma = float((lower(tau) / targets).max())
-    for _ in range(_ROUNDS):
+    for _ in range(MAGNITUDE.rounds):
         best = Grid.of(tau, targets, knots, cuts).best(targets**-0.5, gamma)  # n and d share the slope
         try:
             zeros = best.not_positive() if best is not None else []
@@ -195,14 +192,14 @@ def _best(tau: Array, targets: Array, order: int, lower: RationalMagnitude | Non
 
 def _bends(tau: Array, log: Array, count: int) -> Array:
     """Return log tau, shape (count,), as dense as log magnitudes bend over log tau, plus a share evenly spaced."""
-    inside = (tau > 0) & (tau < _TOP)
+    inside = (tau > 0) & (tau < MAGNITUDE.highest)
     if inside.sum() < 3:
-        return np.linspace(-_TOP, 0.0, count + 2)[1:-1]
+        return np.linspace(-MAGNITUDE.highest, 0.0, count + 2)[1:-1]
     x = np.log(tau[inside])
     middle = (x[1:] + x[:-1]) / 2
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
     bend = bend / bend[-1] if bend[-1] > 0 else bend
-    share = (1 - _EVEN) * bend + _EVEN * (middle - middle[0]) / (middle[-1] - middle[0])
+    share = (1 - MAGNITUDE.even) * bend + MAGNITUDE.even * (middle - middle[0]) / (middle[-1] - middle[0])
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
 
 
@@ -220,4 +217,4 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
             f"Magnitude fit: magnitudes should be finite and not negative, found {values[where]} at {freqs[where]} Hz; "
             "look at the responses."
         )
-    return np.maximum(values, _FLOOR * values.max())
+    return np.maximum(values, MAGNITUDE.floor * values.max())

@@ -17,14 +17,11 @@ import numpy.typing as npt
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
 from ..forms import Form
+from ..settings import PROOF
 
 Array = npt.NDArray[Any]
 
-_LARGEST = 400  # rows of a pencil: eigenvalues of more take seconds for every unit
-_LIGHT = 0.1  # damping up to which a mode is a peak or a notch
-_AROUND = np.array([-3.0, -1.0, 0.0, 1.0, 3.0])  # half-widths
 OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
-_APART, _MOST = 0.5, 400  # half-widths, nearer than which modes are one; most modes, the least damped ones first
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,7 +159,7 @@ class ResidualSystems:
             return []
         before, after = (Descriptor.of(invert(w)) for w in (right, left))
         parts = [after @ part @ before for part in self]
-        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= _LARGEST else []
+        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
 
     def modes_hz(self, grid_hz: Array) -> Array:
         """Return frequencies in and around every mode of residuals and plants."""
@@ -172,17 +169,17 @@ class ResidualSystems:
             *(Descriptor.of(self.units[k]) for k in range(self.units.batch_shape[0])),
         ]
         modes = np.concatenate([system.poles() for system in (*self, *plants)]).astype(complex)
-        light = modes[(modes.imag > 0) & (np.abs(modes.real) <= _LIGHT * np.abs(modes))]
+        light = modes[(modes.imag > 0) & (np.abs(modes.real) <= PROOF.light * np.abs(modes))]
         at_hz = np.arctan(light.imag) / (np.pi * dt)
         width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * dt)
         light = light[(width < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])]
         light = light[np.argsort(np.abs(light.real) / np.abs(light), kind="stable")]
         apart: list[tuple[float, float]] = []
         for half, middle in zip(np.abs(light.real), light.imag, strict=True):
-            if len(apart) < _MOST and all(abs(middle - other) > _APART * max(half, w) for w, other in apart):
+            if len(apart) < PROOF.modes and all(abs(middle - other) > PROOF.apart * max(half, w) for w, other in apart):
                 apart.append((float(half), float(middle)))
         halves, middles = np.array(apart).reshape(-1, 2).T
-        omega = (middles[:, None] + halves[:, None] * _AROUND).ravel()
+        omega = (middles[:, None] + halves[:, None] * PROOF.around).ravel()
         found = np.unique(np.arctan(omega[omega > 0]) / (np.pi * dt))
         return found[found <= grid_hz[-1]]
 

@@ -26,16 +26,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..settings import MAGNITUDE
 from .rational import RationalMagnitude, basis
 
 Array = npt.NDArray[Any]
-
-EXACT = 10**1e-5  # ratio of squared magnitudes, 1e-4 dB, that counts as one
-_EDGE = 1e-4  # how far n and d may fall between the ends of the grid and DC or Nyquist
-_STEPS = 60  # limit; about twenty are met
-_SETTLED = 1 - 1e-10  # ratio of steps: rounding
-_FAR = 1e8  # rows are of size one, and solutions at most some thousands
-_EXCEEDED, _ACROSS = 1e-10, 1e-11  # rounding of rows
 
 
 @dataclass(eq=False)
@@ -54,13 +48,13 @@ class Grid:
         """Evaluate the basis on a grid."""
         phi = basis(tau, knots)
         nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
-        edge = _EDGE * phi[nearest] - basis(np.concatenate([[0.0], cuts, [np.inf]]), knots)
+        edge = MAGNITUDE.edge * phi[nearest] - basis(np.concatenate([[0.0], cuts, [np.inf]]), knots)
         return cls(targets, knots, phi, edge, nearest)
 
     def best(self, scale: Array, gamma: float) -> RationalMagnitude | None:
         """Return the bound of the smallest ratio, from a denominator and a ratio; None where none is better."""
         best = None
-        for _ in range(_STEPS):
+        for _ in range(MAGNITUDE.steps):
             solution = self._solved(scale, gamma)
             if solution is None:
                 break
@@ -69,10 +63,10 @@ class Grid:
                 break
             ratio = n / (self.targets * d)
             spread = float(ratio.max() / ratio.min())
-            if spread >= gamma * _SETTLED:
+            if spread >= gamma * MAGNITUDE.settled:
                 break
             best, gamma, scale = RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots), spread, d
-            if gamma < EXACT:
+            if gamma < MAGNITUDE.exact:
                 break
         return best
 
@@ -103,7 +97,7 @@ def minimised(A: Array, g: Array, active: Array | None = None) -> tuple[Array, A
     """Return x and its active rows: minimise the last of x under `A x <= 0`, `g x = 1`."""
     n = len(g)
     bounds = np.delete(-np.eye(n), int(np.abs(g[:-1]).argmax()), axis=0)
-    begin = np.vstack([bounds, g]), np.append(np.full(n - 1, _FAR), 1.0), np.full(n - 1, -1)
+    begin = np.vstack([bounds, g]), np.append(np.full(n - 1, MAGNITUDE.largest), 1.0), np.full(n - 1, -1)
     for vertex in ([] if active is None else [_near(A, g, active)]) + [begin]:
         try:
             solution = _stepped(A, *vertex)
@@ -123,7 +117,7 @@ def _near(A: Array, g: Array, active: Array) -> tuple[Array, Array, Array]:
         negative = np.arange(0)
     M[negative] *= -1
     names[negative] = -1
-    return M, np.append(np.where(names < 0, _FAR, 0.0), 1.0), names
+    return M, np.append(np.where(names < 0, MAGNITUDE.largest, 0.0), 1.0), names
 
 
 def _stepped(A: Array, M: Array, right: Array, names: Array) -> tuple[Array, Array] | None:
@@ -133,10 +127,10 @@ def _stepped(A: Array, M: Array, right: Array, names: Array) -> tuple[Array, Arr
         x = inverse @ right
         exceeded = A @ x
         worst = int(exceeded.argmax())
-        if not exceeded[worst] > _EXCEEDED:
+        if not exceeded[worst] > MAGNITUDE.exceeded:
             return None if (names < 0).any() or not np.isfinite(x).all() else (x, names)
         share = (A[worst] @ inverse)[:-1]
-        leaving = np.flatnonzero(share > _ACROSS)
+        leaving = np.flatnonzero(share > MAGNITUDE.across)
         if not leaving.size:
             return None
         first = leaving[(np.maximum(-inverse[-1, leaving], 0.0) / share[leaving]).argmin()]

@@ -20,13 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import KrosError
+from ..settings import MAGNITUDE
 from .sections import Sections
 
 Array = npt.NDArray[Any]
-
-_REAL = 1e-12  # relative imaginary part below which a root is real: rounding
-_INSIDE = 1e-13  # distance from the unit circle that is no rounding
-_DIGITS = 30
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +42,7 @@ class RationalMagnitude:
     def not_positive(self) -> list[float]:
         """Return the tau >= 0 at which numerator or denominator vanish."""
         sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
-        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= _REAL * abs(r))
+        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= MAGNITUDE.real * abs(r))
 
     def factor(self) -> Sections:
         """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
@@ -60,7 +57,7 @@ class RationalMagnitude:
             [-np.sqrt(-complex(r)) for r in roots(c, self.knots)] for c in (self.numerator, self.denominator)
         )
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
-        if not (distance > _INSIDE).all():
+        if not (distance > MAGNITUDE.inside).all():
             raise KrosError(
                 f"Spectral factor: a pole or zero is {distance.min():.1e} from the unit circle, which double precision "
                 "does not hold; try another order."
@@ -86,7 +83,7 @@ def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
     order = len(knots)
     if not (np.isfinite(coefficients).all() and coefficients[0] and coefficients[-1]):
         raise KrosError(f"Spectral factor: no {order} roots of coefficients {coefficients}; try another order.")
-    with mpmath.workdps(_DIGITS):
+    with mpmath.workdps(MAGNITUDE.digits):
         unit = mpmath.mpf(float(np.exp(np.log(knots).mean()))) if order else mpmath.mpf(1)
         powers, factor = [mpmath.mpf(0)] * (order + 1), mpmath.mpf(1)  # highest power first
         for k in range(order, -1, -1):

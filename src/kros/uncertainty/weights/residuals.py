@@ -13,11 +13,10 @@ import numpy.typing as npt
 from ...core.lti import StateSpace
 from ...core.small_matrices import sigma_max
 from ..forms import Form, completion, residual
+from ..settings import SET
 from .pencils import ResidualSystems
 
 Array = npt.NDArray[Any]
-
-_PIECE = 10_000  # units times frequencies in one piece of a computation, which then stays in the cache of a processor
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,7 @@ class Residuals:
         """Return residuals, shape (unit, frequency, p', m'); fits, checks and proofs ask for the same frequencies."""
         key = freqs_hz.tobytes()
         if key not in self._known:
-            G, step = self.nominal(freqs_hz), max(1, _PIECE // max(1, len(freqs_hz)))
+            G, step = self.nominal(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
             self._known[key] = np.concatenate([self._of(G, freqs_hz, rows) for rows in self.blocks(step)])
         return self._known[key]
 

@@ -26,7 +26,7 @@ Array = npt.NDArray[Any]
 
 _FAR = 1e30  # tau at Nyquist
 _NARROW, _WIDE = np.log(4 * 3e-3**2), 40.0  # y: a damping of 0.003, and two real ones 17 decades apart
-_TINY = 1e-300
+_TINY = np.finfo(float).tiny
 _REAL = 1e-9  # relative imaginary part below which a root is real: rounding
 
 

@@ -57,11 +57,8 @@ class CompiledObserver:
 
     def __init__(self, folder: Path, library: Path) -> None:
         manifest = json.loads((Path(folder) / "manifest.json").read_text())
-        self.name, self.states, self.conditions = (
-            manifest["name"],
-            tuple(manifest["states"]),
-            tuple(manifest.get("conditions", ())),
-        )
+        self.name, self.states = manifest["name"], tuple(manifest["states"])
+        self.conditions = tuple(manifest.get("conditions", ()))
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
         self._real = np.float32 if manifest["precision"] == "float" else np.float64
@@ -84,10 +81,8 @@ class CompiledObserver:
                 f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one."
             )
         manifest = json.loads((folder / "manifest.json").read_text())
-        name, sizes = (
-            manifest["name"],
-            {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])},
-        )
+        sizes = {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
+        name = manifest["name"]
         library, loop = folder / f"lib{name}.so", _LOOP.format(name=name, wide=_wide(manifest), **sizes)
         sources = [f"-I{folder}", str(folder / f"{name}.c"), str(folder / f"{name}_selftest.c"), "-x", "c", "-"]
         try:
@@ -140,10 +135,8 @@ class CompiledObserver:
         self, y: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None
     ) -> npt.NDArray[np.uint8]:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
-        machine, real = (
-            np.zeros(self.state_bytes, dtype=np.uint8),
-            ctypes.c_float if self._real is np.float32 else ctypes.c_double,
-        )
+        machine = np.zeros(self.state_bytes, dtype=np.uint8)
+        real = ctypes.c_float if self._real is np.float32 else ctypes.c_double
         self._c[f"{self.name}_init"](_at(machine))
         for name, value in (parameters or {}).items():
             self._c[f"{self.name}_set_{name}"](_at(machine), real(value))

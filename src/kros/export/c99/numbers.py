@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -19,8 +19,8 @@ from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
-from .origin import FAR, OriginShift, find_shift
-from .realise import Realised
+from .origin import OriginShift, find_shift
+from .realise import RULE, Realised
 
 Array = npt.NDArray[np.float64]
 
@@ -154,17 +154,13 @@ class Source:
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
-        o, run, n, screen = (
-            self.observer,
-            self.observer.runtime,
-            self.observer.lifting.n_states,
-            Screen.of(self.observer),
-        )
+        o, run, screen = self.observer, self.observer.runtime, Screen.of(self.observer)
+        ends = {"lower": (run.lower, -np.inf), "upper": (run.upper, np.inf)}
+        wide = replace(self, precision=Precision())
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
             "clips_estimate": run.lower is not None or run.upper is not None,
-            "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
-            "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
+            **{k: wide.numbers(np.full(o.lifting.n_states, end) if v is None else v) for k, (v, end) in ends.items()},
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": self.bounds(screen.measured),
             "u_bounds": self.bounds(screen.inputs),
@@ -189,7 +185,7 @@ class Source:
             "shift_rest": self.wide(shift.rest),
             "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
             "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
-            "far": self.precision.literal(FAR * shift.period),
+            "far": self.precision.literal(RULE.far * shift.period),
             "period": write(shift.period),
             "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
         }
@@ -232,16 +228,11 @@ class Source:
         def code(slope: Any) -> str:
             return f"({c_code(slope, self.symbol, self.precision)})"
 
-        slopes = []
+        slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
         for f in o.lifting.formulas:
-            given = () if o.bank is None else o.measured  # measurements take the place of estimates
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
-            slopes.append(
-                {
-                    "by_value": code(f.derivative(name)),
-                    "by_state": [(j, code(d)) for j, d in by_state.items() if d != 0],
-                }
-            )
+            lines = [(j, code(d)) for j, d in by_state.items() if d != 0]
+            slopes.append({"by_value": code(f.derivative(name)), "by_state": lines})
         return {
             "name": name,
             "place": o.lifting.parameters.index(name),
@@ -326,15 +317,14 @@ class Source:
                 "units": own.units,
                 "alarms": own.alarms,
                 "hours": f"{own.hours:.3g}",
-            }
-            | {"interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None},
+                "interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None,
+            },
         }
 
     def guard(self) -> dict[str, Any]:
         """Return the bounds of states and of the correction, and how long a start takes."""
         own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
-        most = np.finfo(np.float32 if self.precision.type == "float" else np.float64).max
-        low, high = (np.clip(side, -most, most) for side in bounds(own, n, order))
+        low, high = (np.clip(side, -self.most, self.most) for side in bounds(own, n, order))
         wide = {"lower": self.wide(low[:n]), "upper": self.wide(high[:n])}
         return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
 
@@ -354,11 +344,14 @@ class Source:
         """Return the literals of a matrix, row by row."""
         return [[self.precision.literal(float(v)) for v in row] for row in values]
 
-    def numbers(self, values: Array, wide: bool = False) -> list[str]:
+    def numbers(self, values: Array) -> list[str]:
         """Return the literals of a row; infinity as the largest number."""
-        precision = Precision() if wide and self.precision.type == "float" else self.precision
-        most = float(np.finfo(np.float32 if precision.type == "float" else np.float64).max)
-        return [precision.literal(float(np.clip(v, -most, most))) for v in values]
+        return [self.precision.literal(float(np.clip(v, -self.most, self.most))) for v in values]
+
+    @property
+    def most(self) -> float:
+        """Largest number of this precision."""
+        return float(np.finfo(np.float32 if self.precision.type == "float" else np.float64).max)
 
     def wide(self, values: Array) -> list[str]:
         """Return literals in double precision."""
@@ -384,7 +377,3 @@ def _uncorrected(observer: Observer) -> Array:
     if observer.bank is not None:
         A[:, list(observer.measured)] = 0.0
     return A
-
-
-def _filled(values: Array | None, count: int, otherwise: float) -> Array:
-    return np.full(count, otherwise) if values is None else values

@@ -22,13 +22,10 @@ import numpy.typing as npt
 
 from ...lifting import Lifting
 from ...observer.data import ObserverData
+from .realise import RULE
 
 Array = npt.NDArray[np.float64]
-FAR = 8  # periods from the origin, as far as single precision goes
-_ROUNDING = 5e4 * np.finfo(float).eps  # of the largest term
-_WHOLE = 0.01  # from a whole number, what is taken for one
-_TINY = 1e-300
-_MOST = 64  # periods of the first function until all others repeat
+_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +49,13 @@ def find_shift(observer: ObserverData) -> OriginShift | None:
         size[[at, *range(n, n + m)]] = np.maximum(np.append(observer.seen.measured, observer.seen.inputs), _TINY)
     moving = np.hstack([observer.A[:n, :n] - np.eye(n), observer.B[:n]])
     whole, rest = _direction(moving, at, n, size)
-    if np.abs(moving @ (whole + rest)).max() > _ROUNDING * max(np.abs(moving * (whole + rest)).max(), _TINY):
+    if np.abs(moving @ (whole + rest)).max() > RULE.rounding * max(np.abs(moving * (whole + rest)).max(), _TINY):
         return None
     others = frozenset(lifting.states[i] for i in range(n) if rest[i] != 0 and i != at)
     period = _period(lifting, lifting.states[at], others)
     if period is None:
         return None
-    return OriginShift((whole + rest)[:n], whole[n:], rest[n:], period or 0.01 * float(size[at]))
+    return OriginShift((whole + rest)[:n], whole[n:], rest[n:], period or RULE.static * float(size[at]))
 
 
 def _direction(moving: Array, at: int, n: int, size: Array) -> tuple[Array, Array]:
@@ -69,8 +66,8 @@ def _direction(moving: Array, at: int, n: int, size: Array) -> tuple[Array, Arra
         rest[free] = np.linalg.lstsq((moving * size)[:, free], -moving @ whole, rcond=1e-13)[0] * size[free]
         if not last:
             near = np.round(rest[n:])
-            whole[n:] = np.where(np.abs(rest[n:] - near) < _WHOLE, near, 0.0)
-    return whole, np.where(np.abs(rest) < _ROUNDING * size / size[at], 0.0, rest)
+            whole[n:] = np.where(np.abs(rest[n:] - near) < RULE.plain, near, 0.0)
+    return whole, np.where(np.abs(rest) < RULE.rounding * size / size[at], 0.0, rest)
 
 
 @lru_cache(maxsize=64)
@@ -93,7 +90,7 @@ def _period(lifting: Lifting, name: str, others: frozenset[str]) -> float | None
 
 def _common(rates: list[Any]) -> float | None:
     ratios = np.array(rates) / min(rates)
-    for count in range(1, _MOST + 1):
+    for count in range(1, RULE.periods + 1):
         if np.abs(ratios * count - np.round(ratios * count)).max() < 1e-9:
             return float(2 * np.pi / min(rates) * count)
     return None

@@ -22,9 +22,23 @@ import numpy.typing as npt
 from ...observer import Observer
 
 Array = npt.NDArray[np.float64]
-_ALIKE = 1e4  # condition of the modes, by which rounding grows
-_SMALLER = 0.1  # of a column, where a difference is worth a subtraction
-_PLAIN = 0.01  # factors as near to one are one: that difference is exact
+
+
+@dataclass(frozen=True)
+class ExportRule:
+    """How an observer is realised in C, and how the origin of single precision moves; estimates stay the same."""
+
+    alike: float = 1e4  # condition of the modes, by which rounding grows, up to which they are used
+    smaller: float = 0.1  # of a column: what is left of it where a difference is worth a subtraction
+    plain: float = 0.01  # factors as near to a whole number are whole: their difference is exact
+    negligible: float = 1e-12  # of the largest entry of a block of modes: rounding
+    far: int = 8  # periods from the origin, as far as single precision goes
+    rounding: float = 5e4 * np.finfo(float).eps  # of the largest term of a direction
+    periods: int = 64  # of the first function at most, until all others repeat
+    static: float = 0.01  # of the largest measurement: the step of the origin where no function repeats
+
+
+RULE = ExportRule()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +68,7 @@ class Realised:
         measured = list(observer.measured)
         A = turn @ A @ np.linalg.inv(turn)  # leaves the measured columns apart from the others
         block = np.abs(own[first:n, first:n])
-        own[first:n, first:n][block < 1e-12 * block.max()] = 0.0
+        own[first:n, first:n][block < RULE.negligible * block.max()] = 0.0
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
         turned = replace(turned, A=own)
@@ -78,10 +92,10 @@ def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
         for j in free:
             along = observer.B[:n, j]
             factor = -float(along @ column) / max(float(along @ along), 1e-300)
-            factor = 1.0 if abs(factor - 1) < _PLAIN else factor
+            factor = 1.0 if abs(factor - 1) < RULE.plain else factor
             left[j] = float(np.linalg.norm(column + factor * along)), factor
         best = min(left, key=left.__getitem__, default=None)
-        if best is not None and left[best][0] < _SMALLER * np.linalg.norm(column):
+        if best is not None and left[best][0] < RULE.smaller * np.linalg.norm(column):
             found.append((best, i, left[best][1]))
             free.remove(best)
     return tuple(found)
@@ -108,7 +122,7 @@ def _modes(A: Array) -> Array:
         for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
     ]
     basis = np.array(columns).T
-    if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > _ALIKE:
+    if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > RULE.alike:
         return np.eye(len(A))
     return np.asarray(np.linalg.inv(basis))
 

@@ -124,11 +124,15 @@ def test_errors_against_the_true_signal_stand_beside_those_against_the_recording
 
 
 def test_the_best_certified_observer_is_one_that_was_designed() -> None:
-    entries = {"l/open_loop": {"worst_case_h2": 1.0}, "l/mixed": {"worst_case_h2": 1.0}, "l/h2": {"worst_case_h2": 1.0}}
-    rows = [row("l/open_loop", 0.1), row("l/mixed", 0.5), row("l/h2", 0.4), row(NAME, 0.2)]
+    entries = {
+        "l/open_loop": {"worst_case_h2": 1.0},
+        "l/mixed": {"worst_case_h2": 1.0},
+        "l/worst_case_h2": {"worst_case_h2": 1.0},
+    }
+    rows = [row("l/open_loop", 0.1), row("l/mixed", 0.5), row("l/worst_case_h2", 0.4), row(NAME, 0.2)]
     first = errors(Facts(metrics(observers={**entries, NAME: {}}, evaluation=rows))).tables[0]
     notes = {cells[0].text: cells[0].note for cells in first.rows}
-    assert notes["l, H2"].startswith("best with a certificate")
+    assert notes["l, worst-case H2"].startswith("best with a certificate")
     signals = {**metrics()["observers"], NAME: {"set_certified": True}}
     first = errors(Facts(metrics(observers=signals, evaluation=rows))).tables[0]
     assert first.rows[first.chosen[0]][0].note.startswith("deployed and best with a certificate")

@@ -10,10 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .population import Channel, EpisodeKey, Role
-from .recording import some, title
+from .recording import CHECK, some, title
 
 Array = npt.NDArray[np.float64]
-LONGEST_S, SHORTEST_S = 0.5, 1e-6  # sampling periods outside are usual for a time in ms or us that is taken for seconds
 _FACTORS = {  # between units of measure that are mixed up, and what they are
     180 / np.pi: "degrees and radians",
     30 / np.pi: "revolutions per minute and radians per second",
@@ -40,7 +39,7 @@ _RULE = AlertRule()
 def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
     """Return what speaks against a sampling period."""
     unusual = f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s"
-    alerts = [] if SHORTEST_S < period_s < LONGEST_S else [f"{unusual}, on which every frequency depends."]
+    alerts = [] if CHECK.shortest_s < period_s < CHECK.longest_s else [f"{unusual}, on which every frequency depends."]
     return (*alerts, *_derivatives(values, channels, period_s))
 
 

@@ -18,16 +18,13 @@ from ..core import limits
 from ..core.errors import ConfigError, DataError
 from ..core.files import shortened
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
-from .recording import title, usable
+from .recording import CHECK, title, usable
 
 logger = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Look = Callable[[EpisodeKey, Array], None]
 
 ON_NAN = ("error", "drop_episode")
-MIN_SAMPLES = 3  # two consecutive states and one more
-WILD = 1e3  # times the size of a channel, from which on a sample is wild
-_ROUNDING = 1e-12  # of the largest value: what filters and scales make of a constant
 
 
 class NonFiniteError(DataError):
@@ -39,8 +36,8 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *
     if values.ndim != 2 or values.shape[1] != len(channels):
         declared = f"{len(channels)} channels {[c.name for c in channels]} are declared"
         raise DataError(f"{title(key)}: {declared}, found an array of shape {values.shape}; transpose or correct it.")
-    if len(values) < MIN_SAMPLES:
-        need = f"at least {MIN_SAMPLES} samples are needed, found {len(values)}"
+    if len(values) < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
     if not gaps and not usable(values).all():
         check_finite(values, key, channels)
@@ -54,7 +51,7 @@ def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *
 
 def is_constant(column: Array) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    room = _ROUNDING * abs(column[0])
+    room = CHECK.constant * abs(column[0])
     lower, upper = column[0] - room, column[0] + room
     return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
 
@@ -100,11 +97,11 @@ class GroupWatch:
         self._ranges[key] = np.ptp(values, axis=0)
         for i, column in enumerate(values.T):
             few = np.sort(column[:: max(1, len(column) // 64)])
-            if self._ranges[key][i] <= WILD * (few[-2] - few[1]):
+            if self._ranges[key][i] <= CHECK.wild * (few[-2] - few[1]):
                 continue  # a few samples show already that the channel moves as much
             outside = max(1, len(column) // 100)  # at each end; one at least, for short episodes
             quantiles = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
-            far = np.flatnonzero(np.abs(column - quantiles[1]) > WILD * (quantiles[2] - quantiles[0]))
+            far = np.flatnonzero(np.abs(column - quantiles[1]) > CHECK.wild * (quantiles[2] - quantiles[0]))
             if far.size:
                 self._suspects.append((key, i, np.stack([far, column[far]]), quantiles))
 
@@ -113,7 +110,7 @@ class GroupWatch:
         for suspect, i, (samples, values), (low, middle, high) in self._suspects:
             others = sorted(ranges[i] for key, ranges in self._ranges.items() if key != suspect)
             size = max(high - low, abs(low), abs(high), others[(len(others) - 1) // 2] if others else 0.0)
-            wild = np.flatnonzero((np.abs(values - middle) > WILD * size) & (size > 0))
+            wild = np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))
             if wild.size:
                 actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
                 most = f"98 % of its samples are from {low:g} to {high:g}"

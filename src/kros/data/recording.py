@@ -17,10 +17,25 @@ from ..core import limits
 from ..core.errors import DataError
 from .population import EpisodeKey
 
-TIME_TOLERANCE = 1e-3  # largest deviation of one time step, in sampling periods
-PERIOD_TOLERANCE = 1e-4  # largest relative difference of the sampling periods of two episodes
-
 Float = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CheckRule:
+    """What recordings are refused for, and which sampling periods are doubted."""
+
+    time: float = 1e-3  # largest deviation of one time step, in sampling periods
+    period: float = 1e-4  # largest relative difference of the sampling periods of two episodes
+    end: float = 1e-6  # of a sample: how far rounding may move the end of an even grid
+    samples: int = 3  # fewest: two consecutive states and one more
+    wild: float = 1e3  # times the size of a channel, from which on a sample is wild
+    constant: float = 1e-12  # of the largest value: what filters and scales make of a constant
+    # sampling periods outside are usual for a time in ms or us that is taken for seconds
+    shortest_s: float = 1e-6
+    longest_s: float = 0.5
+
+
+CHECK = CheckRule()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,15 +140,15 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
     deviation = np.abs(steps - period)
     worst = int(deviation.argmax())
     step = 'declare [[data.prepare]] step = "resample"'
-    if deviation[worst] > TIME_TOLERANCE * period:
-        count = np.count_nonzero(deviation > TIME_TOLERANCE * period)
+    if deviation[worst] > CHECK.time * period:
+        count = np.count_nonzero(deviation > CHECK.time * period)
         raise DataError(
             f"{title(recording.key)}{where}: uneven time, {count} of {len(steps)} steps differ from {period:g} s by "
-            f"more than {TIME_TOLERANCE:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
+            f"more than {CHECK.time:g} of it, the worst {steps[worst]:g} s at sample {worst}; {step}, "
             f"period_s = {period:.3g}, or fix the source."
         )
     mean = float((time[-1] - time[0]) / len(steps))
-    if abs(mean - period_s) > max(PERIOD_TOLERANCE, TIME_TOLERANCE / len(steps)) * period_s:
+    if abs(mean - period_s) > max(CHECK.period, CHECK.time / len(steps)) * period_s:
         raise DataError(
             f"Two sampling periods: {period_s:g} s in {reference} and {period:g} s in {recording.key}{where}; a "
             f"population has one, {step}, period_s = {max(period, period_s):g}, or leave one out."

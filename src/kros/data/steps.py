@@ -38,14 +38,13 @@ from ..core.files import did_you_mean, shortened
 from ..core.removed import refusing
 from .checks import check_finite
 from .population import Channel, Role, Scalings, scaling_of
-from .recording import Recording, check_increasing, estimate_period, title
+from .recording import CHECK, Recording, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
 __getattr__ = refusing(__name__)
 
 Float = npt.NDArray[np.float64]
 Channels = tuple[Channel, ...]
-_ROUNDING = 1e-6  # of a sample: how far rounding may move the end of an even grid
 
 
 @dataclass(frozen=True)
@@ -284,7 +283,7 @@ class Resample(Step):
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
         finer = math.ceil(self.period_s / median_s - 1e-3)
         step = self.period_s / finer
-        grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + _ROUNDING) + 1)
+        grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + CHECK.end) + 1)
         fine = np.column_stack([np.interp(grid, time_s, column) for column in values.T])
         return fine if finer == 1 else np.ascontiguousarray(lowpass(fine, self.passband * 0.5 / finer)[::finer])
 

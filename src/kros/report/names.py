@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from math import floor, isfinite, log10
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
+from ..data.recording import some
 from .theme import Tone
 
 
@@ -29,11 +30,8 @@ METHODS = {
     "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
     "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
     "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
-    "h2": Method("H2", "H2-optimal for the nominal model", Tone.SKY),
-    "hinf": Method("H∞", "H∞-optimal for the nominal model", Tone.SKY),
     "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),
     "residual_h2": Method("residual-shaped H2", "noise shaped like the recorded residuals", Tone.INK),
-    "memory": Method("subspace predictor", "predictor identified from recordings", Tone.SKY),
     "estimator": Method("estimator", "stable filter bank with a linear readout", Tone.SKY),
 }
 BASELINES = tuple(name for name, method in METHODS.items() if method.baseline)
@@ -160,7 +158,7 @@ def joined(parts: Sequence[str]) -> str:
 
 def some_of(names: Sequence[str], most: int = 8) -> str:
     """Return the first names of a list, and how many more there are."""
-    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+    return some(names, most)
 
 
 def episode_title(key: EpisodeKey) -> str:

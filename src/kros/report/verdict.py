@@ -193,7 +193,8 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if (better := better_observer(table, facts.deployed, hidden)) is not None:
         text = f"“{observer_label(better)}” has smaller errors in all hidden channels."
         designed = "relift_certified" in facts.observers.get(better, {})
-        action = f'observer.deployed = "{better}" selects it.' if designed else "It is a baseline that is not exported."
+        export = f"`kros export c --observer {better}` exports it."
+        action = export if designed else "It is a baseline that is not exported."
         yield text, f"Compare both. {action}", "errors"
     same = not_improved(table, facts.deployed, hidden)
     if 0 < len(same) < len(hidden):

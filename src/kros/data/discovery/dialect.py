@@ -12,12 +12,9 @@ from pathlib import Path
 
 from ...core.errors import DataError
 from ..readers.tables import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
+from .examine import RULE
 from .roles import is_unit_row
 
-HEAD_BYTES = 1 << 18
-ROWS = 60  # first rows of numbers that are looked at closely
-SPREAD = 200  # further lines, spread over the head of a file: machines rest at first, and zeros have no decimal point
-_ABOVE = 20  # lines that may stand before the header
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
 _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
@@ -55,11 +52,11 @@ def look_at(path: Path) -> TableHead:
     """Return how a text file is written: the reading with most rows of numbers of equal width."""
     with opened(path) as file:
         content = b""
-        while len(content) < HEAD_BYTES and (more := file.read(HEAD_BYTES - len(content))):
+        while len(content) < RULE.head and (more := file.read(RULE.head - len(content))):
             content += more
     encoding = encoding_of(content)
     lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
-    lines = lines[:-1] if len(content) >= HEAD_BYTES else lines
+    lines = lines[:-1] if len(content) >= RULE.head else lines
     readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
     rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
     if _score(rows, decimal)[0] < 2:
@@ -85,9 +82,9 @@ def encoding_of(content: bytes) -> str:
 
 def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:
     """Cut the first lines, and some of the others, into cells."""
-    first, rest = lines[: _ABOVE + ROWS], lines[_ABOVE + ROWS :]
+    first, rest = lines[: RULE.above + RULE.rows], lines[RULE.above + RULE.rows :]
     rows = []
-    for line in (*first, *rest[:: max(1, len(rest) // SPREAD)]):
+    for line in (*first, *rest[:: max(1, len(rest) // RULE.spread)]):
         try:
             cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
         except csv.Error:
@@ -124,7 +121,7 @@ def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
     data = [i for i, r in enumerate(rows) if _is_data(r, dialect.decimal)]
     width = _width([rows[i] for i in data])
     first = next(i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data))
-    cells = tuple(tuple(rows[i]) for i in data if i >= first)[:ROWS]
+    cells = tuple(tuple(rows[i]) for i in data if i >= first)[: RULE.rows]
     written = sum(bool(c) for c in cells[0])
     above = [i for i in range(first) if 2 * sum(map(bool, rows[i])) >= written and abs(len(rows[i]) - width) <= 1]
     blank = ("",) * width

@@ -22,7 +22,7 @@ from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
 from ..readers.tables import PARQUET, Dialect, file_fields, parquet_head, read_columns
 from ..recording import some, usable
-from .dialect import ROWS, TableHead, look_at
+from .dialect import TableHead, look_at
 from .examine import RULE, Examined, examine
 from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
@@ -131,7 +131,7 @@ def _head_of(path: Path) -> TableHead | None:
     try:
         if path.suffix != ".parquet":
             return look_at(path)
-        fields, rows = parquet_head(path, ROWS)
+        fields, rows = parquet_head(path, RULE.rows)
     except DataError:
         return None
     return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(rows))

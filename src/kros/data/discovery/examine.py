@@ -13,7 +13,7 @@ from ...core.errors import DataError
 from ...core.work import Work
 from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import EpisodeKey, Population
-from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, check_increasing
+from ..recording import CHECK, check_increasing
 
 Array = npt.NDArray[np.float64]
 
@@ -22,6 +22,10 @@ Array = npt.NDArray[np.float64]
 class DiscoveryRule:
     """What recordings are judged by before a study exists."""
 
+    head: int = 1 << 18  # bytes of a text file that say how it is written
+    rows: int = 60  # first rows of numbers that are looked at closely
+    spread: int = 200  # further lines, spread over the head: machines rest at first, and zeros have no decimal point
+    above: int = 20  # lines that may stand before the header
     looked_at: int = 15  # files whose first lines say how all are written
     sampled: int = 6  # files whose numbers say what columns are
     pieces: int = 5  # episodes that a single long recording is cut into
@@ -79,7 +83,7 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     n_bridged = sum(s.gap[0] > 0 for s in good)
     how = f"of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"
     worst = max((s for s in good if s.uneven[0]), key=lambda s: s.uneven, default=None)
-    different = any(abs(s.period_s - median) > PERIOD_TOLERANCE * median for s in good)
+    different = any(abs(s.period_s - median) > CHECK.period * median for s in good)
     return Examined(
         wrong,
         (*([f"{n_bridged} episodes have gaps, {how}"] if n_bridged else []), *(s.nan for s in good if s.nan)),
@@ -128,6 +132,6 @@ def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
     period, longest = float(np.median(steps)), int(steps.argmax())
     deviation = np.abs(steps - period) / period
     worst = int(deviation.argmax())
-    uneven = (float(deviation[worst]), worst) if deviation[worst] > TIME_TOLERANCE else look.uneven
+    uneven = (float(deviation[worst]), worst) if deviation[worst] > CHECK.time else look.uneven
     gap = (float(steps[longest]), longest) if steps[longest] > RULE.gap * period else look.gap
     return replace(look, period_s=period, uneven=uneven, gap=gap)

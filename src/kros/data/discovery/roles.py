@@ -15,7 +15,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from ..alerts import LONGEST_S, SHORTEST_S
+from ..recording import CHECK
 
 Array = npt.NDArray[np.float64]
 _TIMES = {1.0: "s sec seconds sek", 1e-3: "ms msec", 1e-6: "us µs μs", 1e-9: "ns", 60.0: "min", 3600.0: "h"}
@@ -211,7 +211,7 @@ def time_scale(unit: str, step: float) -> tuple[float, str]:
     if unit.lower() in SECONDS:
         return SECONDS[unit.lower()], f"its unit of measure is {unit}"
     for name in ("s", "ms", "us", "ns"):
-        if SHORTEST_S < SECONDS[name] * step < LONGEST_S:
+        if CHECK.shortest_s < SECONDS[name] * step < CHECK.longest_s:
             return SECONDS[name], f"a step of {step:g} looks like {name}: correct time_scale if it is not"
     return 1.0, f"a step of {step:g} fits no unit of time: correct time_scale"
 

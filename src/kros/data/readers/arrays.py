@@ -17,7 +17,6 @@ from ..prepare import assemble
 from ..recording import Recording, Recordings, title
 
 Array = npt.NDArray[np.float64]
-_EXACT = 2.0**53  # floating-point numbers from here on do not tell whole numbers apart
 
 
 @dataclass(frozen=True, eq=False)
@@ -344,7 +343,7 @@ def from_pykoop(
 
 def _episode(value: Any, row: int, unit: str) -> str:
     """Return the name of a row's episode; whole numbers are written without a point."""
-    if isinstance(value, float) and value.is_integer() and abs(value) < _EXACT:
+    if isinstance(value, float) and value.is_integer() and abs(value) < 2.0**53:
         return str(int(value))
     if not _is_name(value):
         wanted = "the first column should number the episodes (as floating-point numbers below 2**53)"

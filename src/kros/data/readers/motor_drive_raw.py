@@ -13,6 +13,7 @@ import io
 import logging
 import math
 import re
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -31,10 +32,27 @@ from .parquet import in_threads
 
 logger = logging.getLogger(__name__)
 
-GEAR_RATIO = 100
-PERIOD_S = 1e-3
-REST_SAMPLES = 1000
-TARGET_LAG = 1
+
+@dataclass(frozen=True)
+class RawLayout:
+    """Numbers of the paper's layout."""
+
+    gear_ratio: int = 100
+    period_s: float = 1e-3
+    rest: int = 1000  # samples at rest before an episode
+    calibrated: tuple[int, int] = (500, 1000)  # samples of it in which the position is at its target
+    lag: int = 1  # samples by which targets lag the measurements
+    percent: float = 0.01
+    decimals: tuple[int, ...] = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, targets of both
+    first: datetime = datetime(2023, 1, 1)  # of the stamps that are written
+
+    @property
+    def radians(self) -> float:
+        """Radians at the gear's output of a degree at the motor."""
+        return math.pi / 180 / self.gear_ratio
+
+
+LAYOUT = RawLayout()
 GROUPS = ("population", OUTLIERS)
 CHANNELS = (
     Channel("position", Role.STATE, "deg", measured=True),
@@ -43,15 +61,13 @@ CHANNELS = (
     Channel("target_position", Role.INPUT, "deg"),
     Channel("target_velocity", Role.INPUT, "deg/s"),
 )
-MOTOR_DEG_TO_RAD = math.pi / 180 / GEAR_RATIO
-PERCENT = 0.01
 STEPS: tuple[Step, ...] = (
-    Scale(("position", "target_position"), MOTOR_DEG_TO_RAD, "rad"),
-    Scale(("velocity", "target_velocity"), MOTOR_DEG_TO_RAD, "rad/s"),
-    Scale(("current",), PERCENT, "1"),
-    Shift(("target_position", "target_velocity"), TARGET_LAG),
-    Offset("position", "target_position", 500, 1000),
-    Trim(start=REST_SAMPLES),
+    Scale(("position", "target_position"), LAYOUT.radians, "rad"),
+    Scale(("velocity", "target_velocity"), LAYOUT.radians, "rad/s"),
+    Scale(("current",), LAYOUT.percent, "1"),
+    Shift(("target_position", "target_velocity"), LAYOUT.lag),
+    Offset("position", "target_position", *LAYOUT.calibrated),
+    Trim(start=LAYOUT.rest),
 )
 FOLDER = r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)"
 EPISODE = r"[^/]*(?=\d{3}\.csv$)0{0,2}(?P<episode>\d{1,3})\.csv"  # the last three characters of the stem
@@ -63,12 +79,10 @@ MAPPING = CsvMapping(
         for number, c in enumerate(CHANNELS, start=2)
     ),
     prepare=STEPS,
-    metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
+    metadata={"plant": "harmonic-drive", "gear_ratio": LAYOUT.gear_ratio},
 )
 
 HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
-DECIMALS = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, target position, target velocity
-FIRST_STAMP = datetime(2023, 1, 1)
 
 
 def find_root(source: Path) -> Path | None:
@@ -97,7 +111,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
         raise DataError(f"{what}: file {root / strange} should be named {wanted}; rename it or move it away.")
     population = read_csv_folder(root, MAPPING)
     period = population.sample_period_s
-    scale = next((s for s in (1.0, 1e-3, 1e-6) if math.isclose(period * s, PERIOD_S, rel_tol=0.01)), None)
+    scale = next((s for s in (1.0, 1e-3, 1e-6) if math.isclose(period * s, LAYOUT.period_s, rel_tol=0.01)), None)
     if scale is None:
         text = "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples."
         logger.warning(text, period, population.episodes[0])
@@ -153,7 +167,7 @@ def _write_folder(population: Population, folder: Path, index: int, keys_of: tup
     """Write the episodes of one unit and condition."""
     unit, condition, keys = keys_of
     group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
-    stamp = (FIRST_STAMP + timedelta(minutes=10 * index)).strftime("%Y%m%dT%H%M%S")
+    stamp = (LAYOUT.first + timedelta(minutes=10 * index)).strftime("%Y%m%dT%H%M%S")
     name = f"{stamp}_{unit}_{condition}"
     target = folder / "batch_b" / group / name
     target.mkdir(parents=True)
@@ -168,10 +182,10 @@ def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
     from pyarrow import csv
 
     recorded = values.copy()
-    recorded[TARGET_LAG:, 3:] = values[:-TARGET_LAG, 3:]
-    recorded[:TARGET_LAG, 3:] = values[0, 3:]
-    recorded /= np.array([MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD, PERCENT, MOTOR_DEG_TO_RAD, MOTOR_DEG_TO_RAD])
-    columns = zip([np.arange(len(values)) * sample_period_s, *recorded.T], DECIMALS, strict=True)
+    recorded[LAYOUT.lag :, 3:] = values[: -LAYOUT.lag, 3:]
+    recorded[: LAYOUT.lag, 3:] = values[0, 3:]
+    recorded /= np.array([LAYOUT.radians, LAYOUT.radians, LAYOUT.percent, LAYOUT.radians, LAYOUT.radians])
+    columns = zip([np.arange(len(values)) * sample_period_s, *recorded.T], LAYOUT.decimals, strict=True)
     rounded = [from_numpy(np.round(column, decimals) + 0.0) for column, decimals in columns]
     table = pa.Table.from_arrays(rounded, names=[c.name for c in CHANNELS] + ["time"])
     buffer = io.BytesIO(HEADER)

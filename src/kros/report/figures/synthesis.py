@@ -30,7 +30,7 @@ from ..theme import DRAWING, HUES, Tone
 from .entries import short
 from .episodes import estimate_figure
 
-_WITHOUT = (*BASELINES, "memory", "estimator")  # no correction of a model by design
+_WITHOUT = (*BASELINES, "estimator")  # no correction of a model by design
 
 Curve = tuple[str, np.ndarray, str, str]
 

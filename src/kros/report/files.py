@@ -88,9 +88,8 @@ def to_png(figure: Figure) -> bytes:
 
 def to_pdf(figure: Figure) -> bytes:
     """Return a figure as PDF; the same content gives the same bytes."""
-    return _encode(
-        figure, "pdf", dpi=DRAWING.dots_per_inch, metadata={"CreationDate": None, "Creator": None, "Producer": None}
-    )
+    metadata = dict.fromkeys(("CreationDate", "Creator", "Producer"))
+    return _encode(figure, "pdf", dpi=DRAWING.dots_per_inch, metadata=metadata)
 
 
 def to_svg(figure: Figure, name: str) -> str:

@@ -238,9 +238,7 @@ def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if known[channel] > THRESHOLDS.small_set * size:
         text = (
             f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
-        )
-        text += f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
-        text += (
+            f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
             f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from the units."
         )
         yield text, "Do not read a bound over the set as a bound on the error.", "spread"

@@ -1,4 +1,4 @@
-"""From systems or responses of units to an uncertain set: nominal, residuals, and what the form leaves out.
+"""From systems or responses of units to an uncertain set: nominal, residuals, and the remainder of the form.
 
 Continuous systems are bounded on the unit circle that the bilinear map makes of the imaginary axis
 (`weights.bilinear`), responses between their frequencies as if they were straight lines in the complex plane, without a
@@ -22,7 +22,7 @@ from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
 from .inputs import check_candidate, check_ids, check_response, check_scales, find_nominal, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
-from .nominal import choose_nominals
+from .nominal import choose_nominal
 from .settings import SET, FitSettings
 from .weights.bilinear import BilinearAxis, beyond, continuous_grid
 from .weights.fit import Target, fit_weight
@@ -69,7 +69,8 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
     system, ids, scales = read_systems(models, options.unit_ids, options.output_scale, options.input_scale)
     freqs, axis = _axis(system, freqs_hz, getattr(models, "longest_s", None))
     units = scale_system(system, *scales)
-    choices = choose_nominals(units.frequency_response(freqs))
+    responses = units.frequency_response(freqs)
+    choices = {other: choose_nominal(responses, other) for other in Form}
     if isinstance(options.nominal, StateSpace):
         check_candidate(options.nominal, system)
         index, chosen = -1, options.nominal
@@ -104,7 +105,7 @@ def bound_responses(
         check_response(name, value, G.shape[1:], freqs)
     scales = check_scales(options.output_scale, options.input_scale, G.shape[2:])
     units = G / scales[0][:, None] * scales[1]
-    choices = choose_nominals(units)
+    choices = {other: choose_nominal(units, other) for other in Form}
     index = -1 if given else find_nominal(nominal, ids, choices[form].index)
     chosen = np.asarray(nominal) if given else G[index]
     base = chosen / scales[0][:, None] * scales[1]
@@ -124,7 +125,9 @@ def bound_responses(
 def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
     """Return where a bound of responses holds, in words, and the frequencies of peaks that are not resolved."""
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
-    unresolved = freqs[_unresolved(bound)]
+    middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
+    top = (middle >= bound[:-2]) & (middle >= bound[2:])
+    unresolved = freqs[1:-1][top & (middle > np.maximum(SET.resolved * low, SET.negligible * bound.max()))]
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
@@ -154,13 +157,6 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
     step = np.where(right > left, freqs[right] - freqs[left], 1.0)
     share = ((at_hz - freqs[left]) / step).clip(0.0, 1.0)[:, None, None]
     return np.asarray(values[:, left] * (1 - share) + values[:, right] * share)
-
-
-def _unresolved(bound: Array) -> npt.NDArray[np.intp]:
-    """Return the inner maxima of a bound that fall by more than 3 dB to a neighbour."""
-    middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
-    top = (middle >= bound[:-2]) & (middle >= bound[2:])
-    return np.flatnonzero(top & (middle > np.maximum(SET.resolved * low, 1e-8 * bound.max()))) + 1
 
 
 def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, options: Options) -> dict[str, Any]:

@@ -12,7 +12,7 @@ inverse_output_...      Gp = (1 - E)^-1 G                      (Gp - G) Gp^+    
 ======================  =====================================  =========================  =============================
 
 The inverse forms also need the inverted matrix to be regular. Elsewhere the residual is the least-squares fit, what it
-leaves out is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published
+does not rebuild is the misfit, and `completion` covers that by an additive remainder. `paper=True` gives the published
 pipeline's variants of the multiplicative forms, `G^+ Gp - 1`, `Gp G^+ - 1`, `1 - Gp^+ G` and `1 - G Gp^+`: with more
 outputs than inputs the output ones contain the identity on the complement of the range, whatever the plants.
 

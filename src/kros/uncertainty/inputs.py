@@ -38,10 +38,8 @@ def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
             f"({', '.join(ids[:5])} ...)."
         )
     if count < 2:
-        raise DataError(
-            f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); "
-            "record more units."
-        )
+        needs = f"uncertainty of a population needs at least two units, found {count} ({', '.join(ids)})"
+        raise DataError(f"Quantify: {needs}; record more units.")
     return ids
 
 
@@ -120,10 +118,8 @@ def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     matrices = (system.A, system.B, system.C, system.D)
     finite = np.all([np.broadcast_to(np.isfinite(M).all(axis=(-2, -1)), count) for M in matrices], axis=0)
     if not finite.all():
-        raise DataError(
-            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it "
-            "again."
-        )
+        name = names[int(np.argmin(finite))]
+        raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
     stable = np.broadcast_to(system.is_stable(), count)
     if stable.all():
         return

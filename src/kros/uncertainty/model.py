@@ -198,10 +198,7 @@ class UncertainModel(Uncertainty):
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = (
-    *("left_orders", "right_orders", "cover_max", "overbound_db_max"),
-    *("within_tolerance", "method"),
-)
+_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "within_tolerance", "method")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:

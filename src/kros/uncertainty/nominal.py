@@ -110,11 +110,6 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
         return NominalChoice(form, index, largest, 20 * np.log10(scores), evaluated)
 
 
-def choose_nominals(responses: npt.ArrayLike) -> dict[Form, NominalChoice]:
-    """Return the best nominal of every form."""
-    return {form: choose_nominal(responses, form) for form in Form}
-
-
 def _central(G: Array) -> int:
     """Return the unit closest to the mean at a few frequencies, to begin with."""
     some = G[:, np.linspace(0, G.shape[1] - 1, 8).astype(int)]

@@ -80,7 +80,7 @@ class UncertainModels:
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
         kinds, scores = ", ".join(self.sets), f"{flagged} of {len(self.scores)} outlier scores flagged"
-        return f"<UncertainModels: {kinds} around unit {self.nominal}, {scores}>"
+        return f"<UncertainModels: {kinds}, nominal unit {self.nominal}, {scores}>"
 
     def save(self, folder: Path | str) -> None:
         """Write all of it, with models and recordings, in the layout of a run folder."""

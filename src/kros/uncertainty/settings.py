@@ -169,6 +169,7 @@ class SetRule:
     exact: float = 1e-9  # relative misfit that is rounding
     warned: float = 0.01  # misfit from which on another form is worth a thought
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
+    negligible: float = 1e-8  # of the largest bound: smaller peaks do not count
     beyond: float = 10.0  # how far above its last frequency the grid of continuous systems goes on
     points_beyond: int = 15
     points: int = 1000  # of the default grid of continuous systems

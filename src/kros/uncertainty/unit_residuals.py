@@ -60,14 +60,7 @@ class UnitResiduals:
     def load(cls, folder: Path) -> UnitResiduals:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "unit_residuals")
-        axes = {
-            "freqs_hz": "f",
-            "entries": "ufpm",
-            "ratio": "uf",
-            "largest": "fpm",
-            "entry_weights": "fpm",
-            "entry_orders": "pm",
-        }
+        axes = dict(zip(_ARRAYS, ("f", "ufpm", "uf", "fpm", "fpm", "pm"), strict=True))
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         return cls(
             form=Form(content["form"]),
@@ -98,7 +91,9 @@ def unit_residuals(
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
-    shown = shown_rows(inside)
+    rows = np.flatnonzero(inside)  # at most 200 of the covered units, evenly spread, and all others
+    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]
+    shown = np.sort(np.concatenate([some, np.flatnonzero(~inside)]))
     return UnitResiduals(
         form=form,
         nominal_id=nominal[0],
@@ -112,10 +107,3 @@ def unit_residuals(
         entry_orders=fitted.orders,
         entry_excess=fitted.excess,
     )
-
-
-def shown_rows(inside: npt.NDArray[np.bool_]) -> Array:
-    """Return at most 200 rows of covered units, evenly spread, and all others."""
-    rows = np.flatnonzero(inside)
-    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]
-    return np.sort(np.concatenate([some, np.flatnonzero(~inside)]))

@@ -192,17 +192,13 @@ def _between(form: Form, G: Array) -> Array:
 
 def _require(models: ModelSamples, nominal: int) -> None:
     """Raise an error for too few units or draws, models that are not finite, or a nominal that is no unit."""
-    units, draws = models.samples.A.shape[:2]
+    (units, draws), what = models.samples.A.shape[:2], "Variation and noise"
     if units < 2 or draws < 2:
-        raise DataError(
-            f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}."
-        )
+        raise DataError(f"{what}: needs at least two units and two draws of each, found {units} and {draws}.")
     parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
     finite = np.all([np.isfinite(part).reshape(units, -1).all(axis=1) for part in parts], axis=0)
     if not finite.all():
-        raise DataError(
-            f"Variation and noise: unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not "
-            "finite; leave the unit out, or raise alpha."
-        )
+        unit = f"unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not finite"
+        raise DataError(f"{what}: {unit}; leave the unit out, or raise alpha.")
     if not 0 <= nominal < units:
-        raise ConfigError(f"Variation and noise: the nominal should be a row of {units} units, found {nominal}.")
+        raise ConfigError(f"{what}: the nominal should be a row of {units} units, found {nominal}.")

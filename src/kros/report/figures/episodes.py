@@ -83,7 +83,9 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
     if not shown or not shown[0].observers:
         raise NotShownError("no observer was run on the episodes that are shown")
     known = list(shown[0].observers)
-    names = _paper(known) if paper else deployed_pair(known, run.deployed)
+    names = paper_pair(known) if paper else deployed_pair(known, run.deployed)
+    if not names:
+        raise NotShownError("this study has no observer of the paper's method; add mixed to synthesis.methods")
     states = range(min(len(run.states), DRAWING.states)) if paper else run.hidden[:2]
     blocks = [
         _observed(f"{role}: unit {one.key.unit}, episode {one.key.episode}", one, names, states)
@@ -105,13 +107,6 @@ def other_condition(run: RunFolder) -> tuple[Figure, str]:
     text = _PAPER if pair else ""
     text += f"Designed in “{condition_label(run.identify_on)}” alone; errors are recorded minus estimated values."
     return _figure(run, [block], text)
-
-
-def _paper(names: Sequence[str]) -> list[str]:
-    pair = paper_pair(names)
-    if not pair:
-        raise NotShownError("this study has no observer of the paper's method; add mixed to synthesis.methods")
-    return pair
 
 
 def _observed(title: str, shown: Shown, names: Sequence[str], states: Sequence[int]) -> Block:

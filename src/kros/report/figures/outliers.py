@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...data.population import natural_key
-from ...uncertainty import OutlierModel, OutlierScore
+from ...uncertainty import OutlierModel
 from ..canvas import Axes, Figure, grid, name_units, note, units_axis
 from ..names import condition_label, number, some_of, words
 from ..run_folder import RunFolder
@@ -44,18 +44,19 @@ def scores_figure(conditions: Mapping[str, OutlierModel]) -> Figure:
     return figure
 
 
-def referred_range(score: OutlierScore) -> tuple[float, float]:
-    """Return the range of a score over the nominal units, relative to the threshold as the score itself is, dB."""
-    shift = score.score_db - score.excess_db
-    return score.lowest_db + shift, score.highest_db + shift
-
-
 def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
     places, highest = {u: i for i, u in enumerate(units)}, max(model.scores, key=lambda s: s.score_db)
     for score in model.scores:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
-        low, high = referred_range(score)
-        axes.plot([place, place], [low, high], color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
+        shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
+        axes.plot(
+            [place, place],
+            [score.lowest_db + shift, score.highest_db + shift],
+            color=tone.light,
+            lw=3.5,
+            alpha=0.3,
+            solid_capstyle="butt",
+        )
         (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:

@@ -44,7 +44,8 @@ _INPUT_SIDE = (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
 def forms(run: RunFolder) -> tuple[Figure, str]:
     """Draw the largest residuals in all forms, linear beside Koopman (the paper's Figure 7)."""
     chosen = {n: run.uncertain[n] for n in best_models(run.uncertain)}
-    published = {n: published_bounds(m, run.models[n]) for n, m in chosen.items() if n in run.models and is_tall(m)}
+    tall = {n: m for n, m in chosen.items() if n in run.models and len(m.output_scale) > len(m.input_scale)}
+    published = {n: published_bounds(m, run.models[n]) for n, m in tall.items()}  # these contain the identity
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
     text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
@@ -57,11 +58,6 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(figure, axes[0, 0], 3)
     return figure, text
-
-
-def is_tall(model: UncertainModel) -> bool:
-    """Tell whether there are more outputs than inputs, where the published output forms contain the identity."""
-    return len(model.output_scale) > len(model.input_scale)
 
 
 def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tuple[Array, Array]]:

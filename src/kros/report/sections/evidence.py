@@ -97,7 +97,7 @@ def models(facts: Facts) -> Section | None:
             values = [entry.get(channel, {}).get(what) for entry in errors.values()]
             columns.append(Column(f"{what} (%)", values, words(channel), best=True))
     caption = (
-        "Simulation of every held-out episode from its first state, error in percent of the largest value, over units"
+        "Simulation of held-out episodes from their first state, error in percent of the largest value, over units"
     )
     return Section("models", "Models", [text], tables=[build(caption, columns)], figure="free_run")
 
@@ -167,9 +167,7 @@ def run(facts: Facts) -> Section:
     timing = facts.get("timing_s", {})
     times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
-    text = (
-        "metrics.json holds all numbers of this page, study.json all settings; both give the same results again with "
-    )
+    text = "metrics.json holds all numbers of this page, study.json all settings; the same results come again with "
     text += f"{', '.join(versions)} and Python {platform.python_version()}."
     table = build("Time; a stage that was up to date counts with its own time", times)
     return Section("run", "Run", [text], tables=[table])

@@ -39,9 +39,8 @@ def units(facts: Facts) -> Section | None:
         *_scores(names, scores),
         Column("phase (°)", [None if p is None else math.degrees(p) for p in phases]),
     ]
-    count = (
-        f"{len(shown)} of {len(facts.get('units'))} units{in_condition(home)}, flagged ones and largest errors first"
-    )
+    order = f"units{in_condition(home)}, flagged ones and largest errors first"
+    count = f"{len(shown)} of {len(facts.get('units'))} {order}"
     table = build(f"{count}; errors in percent of the largest value", columns, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
     text += [_SCORES, *(_flagged(r) for r in rows[: DRAWING.units] if r["outlier"])] if rows else []
@@ -73,11 +72,9 @@ def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list
     keys = {"(dB)": "score", "detectable change of gain (%)": "detectable"}
     return [
         Column(
-            f"{condition_label(condition)} {title}".strip(),
-            [scores.get((unit, condition), {}).get(key) for unit in names],
-            "outlier score",
+            f"{condition_label(c)} {title}".strip(), [scores.get((u, c), {}).get(key) for u in names], "outlier score"
         )
-        for condition in dict.fromkeys(c for _, c in scores)
+        for c in dict.fromkeys(c for _, c in scores)
         for title, key in keys.items()
     ]
 

@@ -37,7 +37,7 @@ from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, largest_entries, scaled_levels
-from .score import OutlierScore, Status, room_db
+from .score import OutlierScore, Status
 from .tail import Flags, excesses, margins, separate
 
 Array = npt.NDArray[Any]
@@ -256,7 +256,7 @@ def score_outliers(
     form, rate = as_form(form), float(false_alarm_rate)
     if not 0 < rate < 1:
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
-    rows = _scored(len(freqs))
+    rows = scored_rows(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     scales = balance(G)
     if output_scale is not None or input_scale is not None:
@@ -280,12 +280,8 @@ def score_outliers(
     )
 
 
-def scored_frequencies(freqs_hz: Array) -> Array:
-    """Return the frequencies that scores look at, where they are given more."""
-    return np.asarray(freqs_hz[_scored(len(freqs_hz))])
-
-
-def _scored(count: int) -> Array:
+def scored_rows(count: int) -> Array:
+    """Return the rows of frequencies that scores look at, where they are given more."""
     return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
 
 
@@ -336,7 +332,7 @@ class Comparison:
         smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
         if score.outlier:
             status = Status.OUTLIER
-        elif room_db(bound_db, smallest) >= 0:
+        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
             status = Status.OK
         return replace(
             score,
@@ -367,20 +363,18 @@ def _population(
     """Checked responses, names and frequencies."""
     listed: Any = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in cast(Any, responses)]
     ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
-    freqs = np.asarray(freqs_hz, float)
-    for name, one in zip(ids, listed, strict=False):
-        if one.shape != listed[0].shape:
-            raise DimensionError(
-                f"Outlier scores: unit {name} has a response of shape {one.shape}, unit {ids[0]} one of shape "
-                f"{listed[0].shape}; "
-                "bring all units to the same frequencies and channels."
-            )
+    freqs, shapes = np.asarray(freqs_hz, float), [one.shape for one in listed]
+    other = next((k for k, shape in enumerate(shapes[: len(ids)]) if shape != shapes[0]), None)
+    if other is not None:
+        raise DimensionError(
+            f"Outlier scores: unit {ids[other]} has a response of shape {shapes[other]}, unit {ids[0]} one of shape "
+            f"{shapes[0]}; bring all units to the same frequencies and channels."
+        )
     G = check_responses(np.asarray(listed))
     if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
         raise DataError(
-            f"Outlier scores: need at least three units, one id each, and one frequency for each response; found "
-            f"{len(G)} units, {len(ids)} ids, "
-            f"{freqs.size} frequencies for {G.shape[1]}."
+            "Outlier scores: need at least three units, one id each, and one frequency for each response; found "
+            f"{len(G)} units, {len(ids)} ids, {freqs.size} frequencies for {G.shape[1]}."
         )
     if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
         raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
@@ -393,7 +387,6 @@ def _require_finite(G: Array, ids: tuple[str, ...], freqs: Array) -> None:
     if len(bad):
         unit, row, i, j = bad[0]
         raise DataError(
-            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, "
-            f"entry ({i}, {j}), and not finite at "
-            f"{len(bad)} places in all; leave the unit out, or look at its model."
+            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, entry "
+            f"({i}, {j}), and not finite at {len(bad)} places in all; leave the unit out, or look at its model."
         )

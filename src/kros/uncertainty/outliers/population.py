@@ -13,7 +13,7 @@ from ...core.work import Work
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors, IdentifiedModels
 from ..settings import QuantifySettings
-from .model import OutlierModel, score_outliers, scored_frequencies
+from .model import OutlierModel, score_outliers, scored_rows
 from .recorded import Recorded
 from .score import OutlierScore
 from .tail import LEAST_SCORES
@@ -38,9 +38,8 @@ def score_population(
         found[places[condition]] = outliers
         for score, count in zip(outliers.scores, samples, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
-            seconds = (
-                count * scored[condition].sample_period_s * (1 + len(keys) / len(used))
-            )  # episodes that are held out, like the others
+            held_out = 1 + len(keys) / len(used)  # episodes that are held out are as long as the others
+            seconds = count * scored[condition].sample_period_s * held_out
             rows.append(score_row(score, condition, len(keys) + len(used), seconds))
     return found, rows
 
@@ -49,7 +48,8 @@ def score_condition(
     factors: EpisodeFactors, models: ModelSet, settings: QuantifySettings
 ) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
-    freqs = scored_frequencies(models.frequencies(settings.n_freqs))
+    freqs = models.frequencies(settings.n_freqs)
+    freqs = freqs[scored_rows(len(freqs))]
     recorded = Recorded.of(factors, models, freqs)
     evidence = list(recorded.units.values())
     responses, ids = recorded.response(evidence), models.unit_ids
@@ -72,15 +72,9 @@ def score_condition(
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
-    row = {
-        "unit": score.unit,
-        "condition": condition,
-        "score": score.score_db,
-        "threshold": score.threshold_db,
-        "outlier": score.outlier,
-    }
-    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db")}
-    row |= {"status": score.status, "detectable": score.detectable_percent}
+    row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db}
+    same = ("outlier", "freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "status")
+    row |= {key: getattr(score, key) for key in same} | {"detectable": score.detectable_percent}
     row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
     needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}
     return row | {"episodes": episodes, "recorded_s": recorded_s} | needed

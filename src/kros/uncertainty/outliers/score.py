@@ -11,8 +11,6 @@ from dataclasses import dataclass, fields
 from enum import StrEnum
 from typing import Any
 
-import numpy as np
-
 from ..settings import OUTLIER
 
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
@@ -104,15 +102,3 @@ class OutlierScore:
         values |= dict.fromkeys(unknown, float("inf"))
         values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
         return cls(**values | {"threshold_db": threshold_db, "status": Status(content["status"])})
-
-
-def room_db(detectable_db: float, detectable_percent: float) -> float:
-    """Return by how much a bound could be higher before the absence of an alarm means nothing, dB."""
-    if not (np.isfinite(detectable_db) and np.isfinite(detectable_percent)):
-        return float("-inf")
-    return float(
-        min(
-            OUTLIER.largest_db - detectable_db,
-            20 * np.log10(OUTLIER.largest_percent / max(detectable_percent, np.finfo(float).tiny)),
-        )
-    )

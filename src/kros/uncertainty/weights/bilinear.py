@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from ...core.errors import ConfigError
 from ...core.lti import StateSpace
+from ...core.norms import to_continuous
 from ..settings import SET
 from .residuals import Residuals
 
@@ -53,30 +54,17 @@ class BilinearAxis:
         def units(freqs_hz: Array, rows: Array) -> Array:
             return residuals.units(self.continuous_hz(freqs_hz), rows)
 
-        systems = None
-        if residuals.systems is not None:
-            systems = self.discrete(residuals.systems[0]), self.discrete(residuals.systems[1])
-        nominal = residuals.nominal
-        return replace(
-            residuals,
-            nominal=lambda freqs_hz: nominal(self.continuous_hz(freqs_hz)),
-            units=units,
-            systems=systems,
-            proven=False,
-        )
+        def nominal(freqs_hz: Array) -> Array:
+            return residuals.nominal(self.continuous_hz(freqs_hz))
+
+        base, others = residuals.systems or (None, None)
+        systems = None if base is None or others is None else (self.discrete(base), self.discrete(others))
+        return replace(residuals, nominal=nominal, units=units, systems=systems, proven=False)
 
     def continuous(self, system: StateSpace) -> StateSpace:
         """Return the continuous system with the same response at mapped frequencies."""
-        n = system.n_states
-        inverse = np.linalg.inv(system.A + np.eye(n))
-        scale = 2 / np.sqrt(self.period_s)
-        return StateSpace(
-            2 / self.period_s * (inverse @ (system.A - np.eye(n))),
-            scale * (inverse @ system.B),
-            scale * (system.C @ inverse),
-            system.D - system.C @ inverse @ system.B,
-            0.0,
-        )
+        mapped, rate = to_continuous(system), 2 / self.period_s
+        return StateSpace(rate * mapped.A, np.sqrt(rate) * mapped.B, np.sqrt(rate) * mapped.C, mapped.D, 0.0)
 
     def discrete(self, system: StateSpace) -> StateSpace:
         """Return the discrete system, or batch, with the same response at mapped frequencies."""

@@ -203,7 +203,7 @@ def _residual(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
 
 
 def _remainder(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
-    """Return what a form leaves out, the unit minus what `forms.rebuild` makes of the residual."""
+    """Return the remainder of a form: the unit minus what `forms.rebuild` makes of the residual."""
     E = _residual(form, G, Gp)
     if not form.inverse:
         return (Gp - G) - (E @ G if form in OUTPUT_SIDE else G @ E)

@@ -21,7 +21,7 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Residuals of scaled units against a nominal, or what the form leaves out, as functions of frequency, Hz."""
+    """Residuals of scaled units against a nominal, or remainders of the form, as functions of frequency, Hz."""
 
     form: Form
     nominal: Callable[[Array], Array]  # response (frequency, p, m)
@@ -74,16 +74,13 @@ class Residuals:
 
     def deciding(self, freqs_hz: Array, block: int) -> Array:
         """Return the units that are the largest at some frequency, by singular value or by an entry; all if few."""
-        best: tuple[Array, Array] | None = None
         if len(self) <= block:
             return np.arange(len(self))
+        largest, who = [], []
         for rows in self.blocks(block):
             E = self.of(rows).at(freqs_hz)
             entries = np.moveaxis(np.abs(E).reshape(*E.shape[:2], -1), 2, 0)
             sizes = np.concatenate([sigma_max(E)[None], entries])
-            largest, who = sizes.max(axis=1), rows[sizes.argmax(axis=1)]
-            if best is not None:
-                who = np.where(largest > best[0], who, best[1])
-                largest = np.maximum(largest, best[0])
-            best = largest, who
-        return np.unique(best[1]) if best is not None else np.arange(0)
+            largest.append(sizes.max(axis=1))
+            who.append(rows[sizes.argmax(axis=1)])
+        return np.unique(np.take_along_axis(np.array(who), np.argmax(largest, axis=0)[None], axis=0))

@@ -185,9 +185,7 @@ def check_population(population: Population, allow_single: bool = False) -> None
     """Check what needs no reading: not empty, no duplicates, a state, a measured state, more than one unit."""
     check_structure(population.columns, population.episodes)
     if not population.measured:
-        problem = (
-            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with"
-        )
+        problem = f"No state of {list(population.states)} is measured, so an observer has nothing to correct with"
         raise DataError(f"{problem}; declare measured = true for at least one.")
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]

@@ -9,7 +9,6 @@ from typing import Any
 from ..core.errors import ConfigError
 
 _ALLOWED = frozenset(" _-.,:;+()[]%/^=@°·²³")  # beside letters and digits of any script
-_LONGEST = 80
 _C_WORDS = re.compile(
     "auto|break|case|char|const|continue|default|do|double|else|enum|extern|float|for|goto|if|inline|int|long|register|"
     "restrict|return|short|signed|sizeof|static|struct|switch|typedef|union|unsigned|void|volatile|while|main"
@@ -28,7 +27,7 @@ def plain(text: object) -> str:
     >>> plain("N*m"), plain("x */ system(0) /*")
     ('N·m', 'x ·/ system(0) /·')
     """
-    shown = str(text)[:_LONGEST].replace("*", "·")
+    shown = str(text)[:80].replace("*", "·")
     return "".join(c if c.isalnum() or c in _ALLOWED else "_" for c in shown) or "_"
 
 

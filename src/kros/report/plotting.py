@@ -53,13 +53,11 @@ def plot(result: Any, **options: Any) -> Figure:
     >>> len(kros.report.plot(motors).axes)  # position, velocity, current and voltage
     4
     """
-    name = next(
-        (t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None
-    )
+    kinds = (t.__name__ for t in type(result).__mro__ if t.__module__.startswith("kros."))
+    name = next((kind for kind in kinds if kind in PLOTS), None)
     if name is None:
-        raise ConfigError(
-            f"Plot: got a {type(result).__name__}; give one of {', '.join(PLOTS)}, or render a run folder."
-        )
+        known_kinds = ", ".join(PLOTS)
+        raise ConfigError(f"Plot: got a {type(result).__name__}; give one of {known_kinds}, or render a run folder.")
     module, _, function = PLOTS[name].partition(":")
     draw = getattr(import_module(f"{__package__}.figures.{module}".rstrip(".")), function)
     known = list(signature(draw).parameters)[1:]

@@ -105,7 +105,8 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     if form is Form.INVERSE_ADDITIVE:
         return entries_last(multiply(multiply(inverse, difference), pseudo_inverse_first(G)))
     left = form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
-    other = (first if form.inverse else second) if paper else difference
+    whole = first if form.inverse else second
+    other = whole if paper else difference
     product = multiply(inverse, other) if left else multiply(other, inverse)
     if paper:
         one = np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))

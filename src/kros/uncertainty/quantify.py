@@ -215,7 +215,9 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
             "record more units in the condition that feeds synthesis."
         )
     nominal = choose_unit(first, units, settings)
-    tasks = [partial(quantify_kind, models.models(kind), units, settings, nominal) for kind in models.kinds]
+    options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
+    every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
+    tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
     return UncertainModels(
         models=models,
@@ -239,12 +241,6 @@ def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) 
             f"Quantify: nominal {settings.nominal!r} is not among the units {', '.join(units)}; name one of them."
         )
     return settings.nominal
-
-
-def quantify_kind(models: ModelSet, units: list[str], settings: QuantifySettings, nominal: str) -> UncertainModel:
-    """Quantify one kind of model over the pooled units."""
-    options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
-    return bound_systems(models, Form(settings.form), models.frequencies(settings.n_freqs), options)
 
 
 def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:

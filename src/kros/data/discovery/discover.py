@@ -294,17 +294,12 @@ def _examined(
     retained = read_csv_folder(source, mapping)
     prepare: tuple[dict[str, Any], ...] = ()
     if examined.resample_s is not None:
-        prepare = (_resampling(examined),)
+        step = {"step": "resample", "period_s": examined.resample_s, "max_gap_s": examined.max_gap_s}
+        prepare = ({key: value for key, value in step.items() if value is not None},)
         findings.append(_unevenness(population, source, examined))
     findings = [*findings, *_too_few(retained)]
     reading, nan = _reading(retained, source), bool(examined.nan)
     return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), nan, reading)
-
-
-def _resampling(examined: Examined) -> dict[str, Any]:
-    """Return the step that brings uneven time to one period."""
-    step = {"step": "resample", "period_s": examined.resample_s, "max_gap_s": examined.max_gap_s}
-    return {key: value for key, value in step.items() if value is not None}
 
 
 def _unevenness(population: Population, source: Path, examined: Examined) -> str:

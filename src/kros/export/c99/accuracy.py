@@ -57,17 +57,13 @@ class Accuracy:
     def of(cls, files: Mapping[str, str], observer: Observer, held_out: HeldOut, track: str | None) -> Accuracy:
         """Compile the files of an export and run both."""
         y, u, own = held_out.y, held_out.u, observer.own(held_out.parameters)
-        wanted = (
-            run_observer(observer, y, u, own)
-            if track is None
-            else track_parameter(observer, y, u, own, track).estimates
-        )
+        tracked = None if track is None else track_parameter(observer, y, u, own, track)
+        wanted = run_observer(observer, y, u, own) if tracked is None else tracked.estimates
         wanted, found = wanted[..., : len(observer.recorded)], np.empty((*y.shape[:2], len(observer.recorded)))
         found[0] = wanted[0]
         measured = [observer.lifting.states[i] for i in observer.measured]
-        y_factor, u_factor, x_factor = (
-            recorded_factors(observer, names) for names in (measured, observer.inputs, observer.recorded)
-        )
+        channels = measured, observer.inputs, observer.recorded
+        y_factor, u_factor, x_factor = (recorded_factors(observer, names) for names in channels)
         with tempfile.TemporaryDirectory() as name:
             for file, text in files.items():
                 Path(name, file).write_text(text)
@@ -78,17 +74,12 @@ class Accuracy:
         apart, size = _rms(found - wanted), np.std(wanted, axis=(0, 1))
         errors = _rms(wanted - held_out.states), _rms(found - held_out.states)
         loss = 100 * (errors[1] / np.maximum(errors[0], 1e-300) - 1)
-        return cls(
-            y[..., 0].size,
-            float(np.max(apart / np.maximum(size, 1e-300))),
-            dict(zip(observer.recorded, loss.tolist(), strict=True)),
-        )
+        difference = float(np.max(apart / np.maximum(size, 1e-300)))
+        return cls(y[..., 0].size, difference, dict(zip(observer.recorded, loss.tolist(), strict=True)))
 
     def content(self) -> dict[str, Any]:
         """Return what a manifest holds of it, rounded: compilers differ in the last digits."""
-        loss = {
-            name: round(value, 3) + 0.0 if np.isfinite(value) else None for name, value in self.loss_percent.items()
-        }
+        loss = {n: round(value, 3) + 0.0 if np.isfinite(value) else None for n, value in self.loss_percent.items()}
         return {"samples": self.samples, "difference": float(f"{self.difference:.0e}"), "loss_percent": loss}
 
 

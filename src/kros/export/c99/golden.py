@@ -11,7 +11,6 @@ import numpy.typing as npt
 from ...observer import Observer
 
 Array = npt.NDArray[np.float64]
-SAMPLES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,12 +24,11 @@ class Golden:
     size: Array  # (n_recorded,)
     passes: int
     last_status: npt.NDArray[Any]  # (n_samples,)
-    sure: npt.NDArray[
-        Any
-    ]  # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
+    # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
+    sure: npt.NDArray[Any]
 
     @classmethod
-    def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES, tolerance: float = 0.0) -> Golden:
+    def of(cls, observer: Observer, track: str | None = None, count: int = 64, tolerance: float = 0.0) -> Golden:
         """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
@@ -48,18 +46,13 @@ class Golden:
             running = observer.start(factor * y[0])
             if track is not None:
                 running.track(track)
-            found = [
-                (np.asarray(running.step(*sample)), int(running.status))
-                for _ in range(passes)
-                for sample in zip(factor * y, factor * u, strict=True)
-            ]
-            return np.array([x for x, _ in found[:count]])[:, : len(observer.recorded)], np.array(
-                [s for _, s in found], np.uint32
-            )
+            samples = [*zip(factor * y, factor * u, strict=True)] * passes
+            steps = [(np.asarray(running.step(*sample)), int(running.status)) for sample in samples]
+            x_hat = np.array([x for x, _ in steps[:count]])[:, : len(observer.recorded)]
+            return x_hat, np.array([s for _, s in steps], np.uint32)
 
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
         sure = ~np.stack([turned[:count], turned[-count:]])
-        return cls(
-            y, u, x_hat, status[:count], np.maximum(np.abs(x_hat).max(axis=0), 1e-300), passes, status[-count:], sure
-        )
+        size = np.maximum(np.abs(x_hat).max(axis=0), np.finfo(float).tiny)
+        return cls(y, u, x_hat, status[:count], size, passes, status[-count:], sure)

@@ -115,13 +115,9 @@ def to_modes(observer: Observer) -> Array | None:
 def _modes(A: Array) -> Array:
     """Return the coordinates of the modes of a matrix; the identity where their vectors are nearly alike."""
     values, vectors = np.linalg.eig(A)
-    columns = [
-        part
-        for i, v in enumerate(values)
-        if v.imag >= 0
-        for part in ([vectors[:, i].real, vectors[:, i].imag] if v.imag else [vectors[:, i].real])
-    ]
-    basis = np.array(columns).T
+    upper = [i for i, v in enumerate(values) if v.imag >= 0]
+    parts = [[vectors[:, i].real, vectors[:, i].imag][: 1 + bool(values[i].imag)] for i in upper]
+    basis = np.array([part for pair in parts for part in pair]).T
     if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > RULE.alike:
         return np.eye(len(A))
     return np.asarray(np.linalg.inv(basis))

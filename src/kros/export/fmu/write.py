@@ -89,10 +89,8 @@ def export_fmu(
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
     texts = fmu_files(Source.of(observer, name, precision, track), fmi, guid)
-    packed: dict[str, bytes] = {
-        file: text.encode()
-        for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
-    }
+    every = {**texts, **sources, "documentation/README.md": files["README.md"]}
+    packed = {file: text.encode() for file, text in every.items()}
     write_bytes(out, _archive(packed | compiled(packed, name, fmi)))
     return out
 

@@ -79,11 +79,8 @@ def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str
     assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in entry.items() if v) for n, entry in sensor.items()}
     texts = [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
     tried = doublings(facts).get(facts.deployed, {})
-    parts = [
-        _NEEDS[kind].format(value).replace("of < ", "below ")
-        for kind, value in tried.items()
-        if kind in _NEEDS and ">" not in value
-    ]
+    reached = {kind: value for kind, value in tried.items() if kind in _NEEDS and ">" not in value}
+    parts = [_NEEDS[kind].format(value).replace("of < ", "below ") for kind, value in reached.items()]
     return [*texts, f"The error doubles with {joined(parts).replace(' and ', ' or ')}."] if parts else texts
 
 

@@ -69,7 +69,7 @@ class EstimatorSettings(Settings):
         description="age of a gap in which what stands for a measurement comes half as near to the fallback, in longest delays",
     )
     halves: tuple[float, ...] = Field(
-        (0.3, 1.0, 3.0, 10.0, 100.0),
+        (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
         description="ages of a gap at which the fallback counts one half for a hidden state, in longest delays; training chooses",
     )
     recoveries: tuple[float, ...] = Field(

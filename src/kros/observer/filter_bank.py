@@ -1,4 +1,4 @@
-r"""What makes an observer a filter bank: how it starts, and what stands for measurements that are missing.
+r"""What makes an observer a filter bank: how it starts, and what replaces missing measurements.
 
 While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its internal
 states are the filters z of measurements and inputs, whose estimate is given then, and the filters w of inputs alone with
@@ -48,7 +48,7 @@ class FilterBank:
     recovery : ndarray, shape (n,)
         mu of every recorded state, between zero and one.
     reach : ndarray, shape (q,)
-        Largest distance between what stands for a missing measurement and the fallback, at level zero.
+        Largest distance between the substitute of a missing measurement and the fallback, at level zero.
 
     Raises
     ------
@@ -128,7 +128,7 @@ class Gaps:
             values[rows] = 0.0
 
     def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
-        """Put measurements (batch, q) and what stands for missing ones into states (batch, n), and bridge gaps that end."""
+        """Put measurements (batch, q) and substitutes of missing ones into states (batch, n), and bridge gaps that end."""
         self.held = (x[:, self.fallback] + self.offset)[:, self.measured]
         reach = (1 - self.bank.level(self.age)[:, self.measured]) * self.bank.reach
         near = np.clip(x[:, self.measured] - self.held, -reach, reach)

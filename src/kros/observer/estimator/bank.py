@@ -35,7 +35,7 @@ class Bank:
 
     @classmethod
     def of(cls, channels: Channels, length: float, settings: EstimatorSettings) -> Bank:
-        """Return the bank for a median episode of so many samples."""
+        """Return the bank for a median episode of this length in samples."""
         lags = () if channels.recent else settings.lags(length)
         starts = () if channels.recent else (*settings.start, *lags)
         return cls(len(channels), channels.linear, channels.nonlinear, settings.blocks(length), lags, starts)

@@ -1,4 +1,4 @@
-r"""What is certain about a filter bank as it runs: nothing that it estimates is fed back.
+r"""What is certain about a filter bank at run time: nothing that it estimates is fed back.
 
 While measurements arrive, the error of its estimate is the residual of its regression on what was recorded, plus what the filters make of noise,
 
@@ -62,7 +62,9 @@ def linear_estimate(
     assert observer.bank is not None
     own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
     if delay_of(observer.sensor):
-        raise SynthesisError("not certified for the set of plants: measurements arrive late, which the set leaves out.")
+        raise SynthesisError(
+            "not certified for the set of plants: measurements arrive late, and the set has none that do."
+        )
     size, first = n + observer.bank.filters, q + modelled.n_states
     weights = np.hstack([observer.A, observer.B])[:size]
     signals = _signals(modelled, observer.inputs)
@@ -89,7 +91,7 @@ def linear_estimate(
 
 
 def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
-    """Return what stands behind the states in [theta(x); u; gamma(u, x)]."""
+    """Return the columns after the states of [theta(x); u; gamma(u, x)]."""
     functions, of_inputs = ([f.text for f in formulas] for formulas in (lifting.formulas, lifting.input_formulas))
     return [*functions, *inputs, *of_inputs]
 
@@ -106,7 +108,7 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:
-    """Return the certificate of a filter bank as it runs."""
+    """Return the certificate of a filter bank at run time."""
     n = len(observer.recorded)
     noise = noise_response(observer)
     error = scales.error[:n, None]

@@ -66,7 +66,7 @@ class EstimatorSettings(Settings):
     half: float = Field(
         1.0,
         gt=0,
-        description="age of a gap in which what stands for a measurement comes half as near to the fallback, in longest delays",
+        description="age of a gap at which the substitute of a measurement may differ half as much from the fallback, in longest delays",
     )
     halves: tuple[float, ...] = Field(
         (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
@@ -93,7 +93,7 @@ class EstimatorSettings(Settings):
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 
     def lags(self, length: float) -> tuple[float, ...]:
-        """Return the time constants of the lags in samples, for a median episode of so many samples."""
+        """Return the time constants of the lags in samples, for a median episode of this length in samples."""
         last = self.last_lag * length
         count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - 1e-9)))
         return tuple(last / self.lag_ratio**i for i in range(count, -1, -1))

@@ -1,12 +1,14 @@
 r"""What is certain about a filter bank at run time: nothing that it estimates is fed back.
 
-While measurements arrive, the error of its estimate is the residual of its regression on what was recorded, plus what the filters make of noise,
+While measurements arrive, the error of its estimate is the residual of its regression on what was recorded, plus what
+the filters make of noise,
 
 .. math:: e_{k+1} = \omega_k - \sum_i F_i\, n_{k-i}, \qquad
           \|e\|_2 \le \gamma\, (\|\omega\|_2^2 + \|n\|_2^2)^{1/2},
 
-with :math:`\gamma` the H-infinity norm of [1, F], signals divided by their sizes. It holds for every machine and has no assumption on slopes for noise
-that lifted functions do not feel. The bound for recorded signals is the largest error on a unit that was left out of the regression.
+with :math:`\gamma` the H-infinity norm of [1, F], signals divided by their sizes. It holds for every machine and has
+no assumption on slopes for noise that lifted functions do not feel. The bound for recorded signals is the largest
+error on a unit that was left out of the regression.
 """
 
 from __future__ import annotations
@@ -129,7 +131,7 @@ def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCe
 def left_out_bound(
     observer: ObserverData, sizes: Array, units: Sequence[str], errors: Array, worst_percent: Mapping[str, float]
 ) -> SignalBound:
-    """Return the bound on every state's RMS error: the largest on a unit that was left out, and beside it the errors (units, n) of training."""
+    """Return the bound on RMS errors, the largest of left-out units, beside the errors (units, n) of training."""
     worst = np.array([worst_percent[name] for name in observer.recorded]) * sizes / 100
     bound = np.maximum(worst, errors.max(axis=0))
     each = np.repeat(bound[None], len(units), axis=0)

@@ -1,9 +1,10 @@
 r"""Ridge regression of all states on the bank, its penalty chosen on units and episodes that are left out.
 
-Rows :math:`\xi_k` of the bank, divided by their sizes, have principal directions and singular values :math:`\sigma_i`. In whitened directions the
-penalty of the bank's own coefficients is :math:`\lambda / \sigma_i^2`. Rows with target zero say how far an entry may be wrong. Moments of units,
-conditions and parts of the episodes are summed once; leaving some out is a difference of moments. Units often follow the same references: errors are
-those of coefficients that know neither the unit nor its episodes.
+Rows :math:`\xi_k` of the bank, divided by their sizes, have principal directions and singular values
+:math:`\sigma_i`. In whitened directions the penalty of the bank's own coefficients is :math:`\lambda / \sigma_i^2`.
+Rows with target zero say how far an entry may be wrong. Moments of units, conditions and parts of the episodes are
+summed once; leaving some out is a difference of moments. Units often follow the same references: errors are those of
+coefficients that know neither the unit nor its episodes.
 """
 
 from __future__ import annotations
@@ -157,7 +158,7 @@ class Design:
             yield key, self.bank.rows(v, at), targets, weights
 
     def signals(self, some: int, length: int) -> Array:
-        """Return the channels of some episodes side by side, cut to a length and to the shortest, shape (n_samples, batch, channels)."""
+        """Return the channels of some episodes, cut to one length, shape (n_samples, batch, channels)."""
         found = []
         for key in self.recordings.some(some).keys:
             batch = self.recordings.read(key)
@@ -266,7 +267,7 @@ class Moments:
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
     def known(self, group: Group) -> npt.NDArray[np.bool_]:
-        """Return which groups know neither the units nor the episodes of one; where that leaves none in its condition, not the units, or not the episodes."""
+        """Return the groups without units and episodes of one; if none is left in its condition, without either."""
         alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         for known in (folds & parts, folds, parts):
@@ -286,7 +287,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """Coefficients of all states on a bank, in the channels' units, with errors of coefficients that know neither unit nor episodes."""
+    """Coefficients of all states on a bank, in the channels' units, with errors on units and episodes left out."""
 
     design: Design
     coefficients: Array  # (p, n)
@@ -298,7 +299,7 @@ class Readout:
 
     @classmethod
     def of(cls, design: Design) -> Readout:
-        """Fit all states: conditions count inversely to their errors, and the penalty of a state is best on what is left out."""
+        """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
         weights, penalties = condition_weights(moments, whitening), design.settings.penalties

@@ -20,7 +20,7 @@ from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
-    from .mixed_norms.optimal import mixed
+    from .mixed_norms.mixed import mixed
     from .problem.observer_problem import ObserverProblem
     from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
@@ -43,7 +43,7 @@ _HOME = {
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
     "kalman": "riccati.kalman",
-    "mixed": "mixed_norms.optimal",
+    "mixed": "mixed_norms.mixed",
     "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",

@@ -174,6 +174,15 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).",
         "kros.data.TrueChannel",
     ),
+    (
+        "Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known "
+        "load, with LoadSettings.",
+        "kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load",
+    ),
+    (
+        "The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.",
+        "kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current",
+    ),
 )
 
 

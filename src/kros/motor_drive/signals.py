@@ -1,49 +1,43 @@
-r"""Loads as signals: what a known load asks of a machine, and which part of any load a position measurement can tell.
+r"""Loads as signals: what a mounted load asks of a machine, and which part of a load a position measurement shows.
 
 A drive under integral control stands at its target whatever it carries. The torque tau_0 that it holds at the start
-leaves no trace in positions and targets, then or later: tau and tau - tau_0 look the same. What can be seen is the
-change since the start, and with a leak, which keeps estimates from drifting, its high-passed part
+leaves no trace in positions and targets: tau and tau - tau_0 look the same. What can be seen is the change since the
+start, and with a leak, which keeps estimates from drifting, its high-passed part
 
 .. math:: \tau_s(k) = p\,\tau_s(k-1) + \tau(k) - \tau(k-1), \qquad \tau_s(0) = 0, \quad p = e^{-T/T_\ell},
 
-with the time T_l after which a constant load is forgotten. `AngleLoad` brings the level back where the load is fixed to
-an angle.
+with the time T_l after which a constant load is forgotten.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, DataError
 
 Array = npt.NDArray[np.float64]
-_ORDER = 4
 
 
 def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
-    """Return signals without what is faster than a corner, and without delay: Butterworth, forward and backward."""
+    """Return signals below a corner without delay: Butterworth of order four, forward and backward."""
     from scipy.signal import butter, sosfiltfilt
 
-    if not 0 < corner_hz < 0.5 / sample_period_s:
-        raise ConfigError(
-            f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {0.5 / sample_period_s:g} Hz."
-        )
-    filtered: Array = sosfiltfilt(
-        butter(_ORDER, corner_hz, fs=1 / sample_period_s, output="sos"), np.asarray(signal, dtype=float), axis=0
-    )
-    return filtered
+    top = 0.5 / sample_period_s
+    if not 0 < corner_hz < top:
+        raise ConfigError(f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {top:g} Hz.")
+    sections = butter(4, corner_hz, fs=1 / sample_period_s, output="sos")
+    return np.asarray(sosfiltfilt(sections, np.asarray(signal, dtype=float), axis=0))
 
 
 def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float) -> Array:
     """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`."""
     from scipy.signal import lfilter
 
-    signal = np.asarray(signal, dtype=float)
-    changed: Array = lfilter(
-        [1.0, -1.0], [1.0, -float(np.exp(-sample_period_s / level_s))], signal - signal[:1], axis=0
-    )
-    return changed
+    signal, pole = np.asarray(signal, dtype=float), float(np.exp(-sample_period_s / level_s))
+    return np.asarray(lfilter([1.0, -1.0], [1.0, -pole], signal - signal[:1], axis=0))
 
 
 def known_load(
@@ -62,8 +56,7 @@ def known_load(
         Recorded; its second difference is low-passed without delay.
     sample_period_s : float
     moment : float
-        Mass times gravity times lever arm, in any unit of torque, or divided by the torque constant: then the load is
-        in units of current.
+        Mass times gravity times lever arm, in any unit of torque, or over the torque constant: then in units of current.
     inertia : float
         Of the load, the same unit times s^2/rad.
     angle_rad : float
@@ -85,3 +78,37 @@ def known_load(
         acceleration[1:-1] = np.diff(position, n=2, axis=0) / sample_period_s**2
         load = load + inertia * low_passed(acceleration, corner_hz, sample_period_s)
     return np.asarray(load, dtype=float)
+
+
+@dataclass(frozen=True)
+class LoadAccuracy:
+    """Errors of a load estimate, low-passed, in units of the load."""
+
+    floor_rms: float  # Of the estimate on episodes without load
+    error_rms: float  # Under load
+    load_rms: float  # Of the load itself
+
+    @property
+    def ratio(self) -> float:
+        """Error under load to the floor."""
+        return self.error_rms / self.floor_rms
+
+    @property
+    def percent(self) -> float:
+        """Error under load in percent of the load."""
+        return 100 * self.error_rms / self.load_rms
+
+
+def load_accuracy(
+    estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
+) -> LoadAccuracy:
+    """Judge estimates of the load, shape (n_samples, batch), against known ones."""
+    truth = np.asarray(load, dtype=float)
+    loaded = np.any(truth != 0, axis=0)
+    if loaded.all() or not loaded.any():
+        count = f"{int(loaded.sum())} of {len(loaded)}"
+        raise DataError(f"Load accuracy: needs episodes with and without load, found {count} with load.")
+    slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
+    error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
+    signals = error[:, ~loaded], error[:, loaded], slow[:, loaded]
+    return LoadAccuracy(*(float(np.sqrt(np.mean(signal**2))) for signal in signals))

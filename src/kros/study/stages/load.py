@@ -22,17 +22,8 @@ from ...data.population import EpisodeKey
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import (
-    AngleLoad,
-    LoadCalibration,
-    calibrate_load,
-    calibrate_torque,
-    known_load,
-    load_from_current,
-    load_observer,
-)
-from ...motor_drive.from_current import load_accuracy
-from ...motor_drive.signals import low_passed
+from ...motor_drive import AngleLoad, LoadSettings, TorqueScale, known_load, load_observer
+from ...motor_drive.signals import load_accuracy, low_passed
 from ...observer import Observer, run_observer
 from ..config import LoadConfig
 from ..engine.context import Context
@@ -60,8 +51,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     facts: dict[str, dict[str, Any]] = {}
     for kind, lifting in study.liftings().items():
         try:
-            calibration = study.calibration(lifting)
-            observer = load_observer(f"{kind}/load", calibration, study.context.population.inputs)
+            observer, left_out = study.observer(f"{kind}/load", lifting)
             observer = replace(observer, seen=seen_by(context.identified, observer.measured))
         except KrosError as error:
             facts[f"{kind}/load"] = {"status": "failed", "reason": str(error)}
@@ -71,8 +61,8 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
         estimate = run_observer(
             observer, study.measured(study.test), study.test.inputs, study.parameters(observer, study.test)
         )
-        found = study.level(observer, calibration, estimate)
-        facts[f"{kind}/load"] = {"order": observer.internal, "episodes_left_out": len(calibration.left_out)}
+        found = study.level(observer, estimate)
+        facts[f"{kind}/load"] = {"order": observer.internal, "episodes_left_out": len(left_out)}
         rows.append(study.row(f"{kind}/load", found))
         curves[f"{kind}/load"] = found
     for name in (f"{kind}/{_UNAWARE}" for kind in study.liftings() if f"{kind}/{_UNAWARE}" in observers):
@@ -182,24 +172,17 @@ class LoadStudy:
         lifting = made.lifting if isinstance(made, Observer) else made
         return batch.parameters if lifting.parameters else None
 
-    def calibration(self, lifting: Lifting) -> LoadCalibration:
-        """What the known load says."""
-        return calibrate_load(
-            lifting,
-            self._measured,
-            self.train,
-            self.truth[0],
-            self.places[1],
-            self.config.level_s,
-            REAL_HZ,
-            self.config.limit,
-        )
+    def observer(self, name: str, lifting: Lifting) -> tuple[Observer, tuple[int, ...]]:
+        """Estimator of the load, and the episodes that are left out."""
+        settings = LoadSettings(self.places[1], self.config.level_s, REAL_HZ, self.config.limit)
+        inputs = self.context.population.inputs
+        return load_observer(name, lifting, self._measured, inputs, self.train, self.truth[0], settings)
 
-    def level(self, observer: Observer, calibration: LoadCalibration, estimate: Array) -> Array:
+    def level(self, observer: Observer, estimate: Array) -> Array:
         """Load estimates with their level."""
         angle, current = self.places
         limit = np.inf if self.config.limit is None else self.config.limit
-        leveled = AngleLoad(calibration.level_s, self.dt, limit=limit)
+        leveled = AngleLoad(self.config.level_s, self.dt, limit=limit)
         seen = estimate[..., observer.lifting.states.index("load")]
         return leveled.run(seen, estimate[..., current], self.test.states[..., angle]).load
 
@@ -211,8 +194,7 @@ class LoadStudy:
             estimate = run_observer(observer, y, batch.inputs, self.parameters(observer, batch))
             errors.append(batch.states[..., current] - estimate[..., current])
         loaded = [i for i, k in enumerate(self.train.keys) if k.condition == self.config.condition]
-        scale = calibrate_torque(errors[0][:, loaded], self.truth[0][:, loaded], self.dt)
-        return load_from_current(errors[1], 0.0, scale)
+        return TorqueScale.calibrated(errors[0][:, loaded], self.truth[0][:, loaded], self.dt).load(errors[1])
 
     def row(self, name: str, estimate: Array) -> dict[str, Any]:
         """Errors of an estimate for the metrics."""

@@ -86,8 +86,10 @@ def mixed(
         options = f"gamma = {gamma}, time_limit_s = {time_limit_s}, max_states = {max_states}"
         raise ConfigError(f"Mixed synthesis: {options} should all be positive.")
     start = time.perf_counter()
-    design = _for_observer if isinstance(plant, ObserverProblem) else _for_plant
-    result = design(plant, gamma, max_states, time_limit_s)  # type: ignore[operator]
+    if isinstance(plant, ObserverProblem):
+        result = _for_observer(plant, gamma, max_states, time_limit_s)
+    else:
+        result = _for_plant(plant, gamma, max_states, time_limit_s)
     return replace(result, solve_s=time.perf_counter() - start)
 
 

@@ -102,8 +102,9 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     for block in programme.blocks:
         unit = np.broadcast_to(np.eye(block.constant.shape[-1]), (1, *block.constant.shape))
         lifted.append(Block(block.constant, np.concatenate([block.basis, unit])))
-    worst = max(float(-np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
-    point = np.append(np.clip(start, -0.9 * programme.box, 0.9 * programme.box), 1.5 * max(worst, 0.0) + 1.0)
+    worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
+    inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
+    point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
     extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]), programme.end)
     outcome = _follow(extended, point, 1e-9, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
@@ -130,7 +131,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         except np.linalg.LinAlgError:
             break
         eigenvalues = programme.spectrum(roots, x, direction)
-        decrement = float(np.sqrt(max(-gradient @ direction, 0.0)))
+        decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
         if not np.isfinite(decrement):
             break
         if eigenvalues.max(initial=0.0) <= 1:

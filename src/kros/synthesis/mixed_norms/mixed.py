@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -86,11 +87,9 @@ def mixed(
         options = f"gamma = {gamma}, time_limit_s = {time_limit_s}, max_states = {max_states}"
         raise ConfigError(f"Mixed synthesis: {options} should all be positive.")
     start = time.perf_counter()
-    if isinstance(plant, ObserverProblem):
-        result = _for_observer(plant, gamma, max_states, time_limit_s)
-    else:
-        result = _for_plant(plant, gamma, max_states, time_limit_s)
-    return replace(result, solve_s=time.perf_counter() - start)
+    of_observer = isinstance(plant, ObserverProblem)
+    design = partial(_for_observer, plant) if of_observer else partial(_for_plant, plant)  # type: ignore[arg-type]
+    return replace(design(gamma, max_states, time_limit_s), solve_s=time.perf_counter() - start)
 
 
 def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:

@@ -106,7 +106,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     fitted = segments.first(count - held_segments(count, data.keys))
     start, problem, error = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
-    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V, np.inf).score)
+    common = refine_pooled(start, one_model, error)
     problem = _around(problem, one_model, common)
     path, rows = _path(data, problem, common)
     choice = _choose(rows, options)

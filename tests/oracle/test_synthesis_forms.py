@@ -5,11 +5,11 @@ import pytest
 from members import perturbed
 
 from kros.core import StateSpace, block_diagonal, gain, hinf_norm
-from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2
+from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.plants import generalized_plant
 from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.certificate import certify, density
-from kros.synthesis.worst_case.unit_check import unit_error
+from kros.synthesis.worst_case.unit_check import unit_error, unit_ratios
 from kros.uncertainty import Form, rebuild, residual
 
 DT, N, M = 0.05, 3, 2
@@ -238,10 +238,7 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
         nominal, np.eye(2)[:1], gain(size * np.eye(2), DT), gain(np.eye(2), DT), [1, 1], [1, 1], [1e-3], form=form
     )
     K = worst_case_h2(case, fit=Constant).controller
-    table = check_units(case, K, units, ["a", "b", "c", "d"])
-    assert table.holds
-    assert np.all(table.density_ratio <= 1)
-    assert [row["unit"] for row in table.rows()] == ["a", "b", "c", "d"]
+    assert all(np.all(ratio <= 1) and len(ratio) == 4 for ratio in unit_ratios(case, K, units))
     k = 2
     response = units[k].frequency_response(freqs) - nominal.frequency_response(freqs)
     S = case.error_system(K).frequency_response(freqs)[..., 2:4]
@@ -249,4 +246,4 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     small = ObserverProblem(
         nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form
     )
-    assert not check_units(small, K, units).holds  # the check can fail
+    assert unit_ratios(small, K, units)[0].max() > 1  # the check can fail

@@ -183,6 +183,11 @@ REMOVED: tuple[tuple[str, str], ...] = (
         "The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.",
         "kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current",
     ),
+    (
+        "Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has "
+        "bound_holds.",
+        "kros.synthesis.UnitCheck kros.synthesis.check_units",
+    ),
 )
 
 

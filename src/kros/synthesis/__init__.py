@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from .riccati.h2 import h2
     from .riccati.hinf import hinf
     from .riccati.kalman import kalman
-    from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
 
 _HOME = {
@@ -38,8 +37,6 @@ _HOME = {
     "ResidualProblem": "residual_shaped.residual_h2",
     "Status": "result",
     "Synthesis": "result",
-    "UnitCheck": "worst_case.unit_check",
-    "check_units": "worst_case.unit_check",
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
     "kalman": "riccati.kalman",
@@ -56,8 +53,6 @@ __all__ = [
     "ResidualProblem",
     "Status",
     "Synthesis",
-    "UnitCheck",
-    "check_units",
     "h2",
     "hinf",
     "kalman",

@@ -35,7 +35,7 @@ from ...core.norms import hinf_norm
 from ...uncertainty.forms import Form, as_form
 from ...uncertainty.weights.cover import Structure
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant, partitioned
+from ..generalized_plant import GeneralizedPlant, split
 from ..result import Injection
 from .interconnect import interconnect
 from .uncertainty_location import LOCATIONS, UncertaintyLocation
@@ -360,7 +360,7 @@ class ObserverProblem:
         system = interconnect(
             {"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs
         )
-        return partitioned(system, w, {"z": self.performance.n_outputs})
+        return split(system, sum(w.values()), self.performance.n_outputs)
 
     def error_system(self, controller: StateSpace) -> StateSpace:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""

@@ -94,7 +94,7 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     """Run the stages and return processor time, s, and the largest memory after each, GB."""
     import kros
     from kros.data.survey import survey
-    from kros.identify.calibrate import calibrate
+    from kros.identify.calibration import calibrate
     from kros.identify.identify import identify
     from kros.identify.presets import resolve_lifting, resolve_phase
     from kros.identify.settings import CalibrationSettings, LiftingSettings

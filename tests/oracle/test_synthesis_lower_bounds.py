@@ -277,7 +277,7 @@ def test_a_perturbation_that_is_held_keeps_what_is_proven(form):
         delta = contractions[channels.nearest(theta)]
     else:
         N = case.N.frequency_response(theta_hz)
-        X = Ball.of(N, np.broadcast_to(np.eye(a, dtype=complex), (60, a, a)))
+        X = Ball.of(N, np.broadcast_to(np.eye(a, dtype=complex), (60, a, a)), b)
         X = X.center + X.left @ contractions[channels.nearest(theta)] @ X.right
         delta = np.linalg.solve(np.eye(b) + X @ N, X)
     assert np.linalg.norm(delta, 2, axis=(-2, -1)).max() <= 1 + 1e-9
@@ -305,7 +305,7 @@ def test_correlated_channels_stay_above_what_is_proven_as_matrices(size):
     diagonal = proven[:, :, None] ** 2 * np.eye(2)
     for share in np.linspace(-1, 1, 21):
         f = (theta + share * half) / (2 * np.pi)
-        average = Ball.of(case.N.frequency_response(f), case.M.frequency_response(f)).average()
+        average = Ball.of(case.N.frequency_response(f), case.M.frequency_response(f), case.W_L.n_inputs).average()
         assert np.linalg.eigvalsh(average - diagonal)[:, 0].min() >= -1e-12
     if size < 1e-3:
         assert np.all(proven >= 0.98 * seen)
@@ -327,7 +327,7 @@ def test_filters_are_lowered_by_the_least_ratio_and_no_further():
     shaping = Shaping(high, None, two)
 
     def ball(f):
-        return Ball.of(case.N.frequency_response(f), case.M.frequency_response(f))
+        return Ball.of(case.N.frequency_response(f), case.M.frequency_response(f), case.W_L.n_inputs)
 
     def remainder(f):
         L, Q = left.frequency_response(f), case.remainder_right.frequency_response(f)

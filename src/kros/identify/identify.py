@@ -24,8 +24,7 @@ from ..data.population import EpisodeKey, Population
 from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
-from .calibrate import calibrate
-from .calibration import PhaseCalibration
+from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
 from .factors import (
     Factor,

@@ -17,19 +17,18 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import IdentificationError
-from ...core.linalg import radius_text
+from ...core.linalg import qr_triangle, radius_text
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
-from ..edmd import KoopmanMatrices
+from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
 from ..ranges import Ranges
 from .gauss_newton import Evaluate, GaussNewton, Solution
 from .metric import ResponsePrior
 from .model import Refinement, TradeOff, TrainingData
 from .options import RefineOptions
-from .pooled import matrices_of, normalised, refine_pooled, start_pooled
-from .problem import RefinementProblem
-from .segments import held_segments, read_segments
+from .problem import OneStep, RefinementProblem
+from .segments import Segments, held_segments, read_segments
 from .validation_set import require_bounded, trade_off
 
 log = logging.getLogger(__name__)
@@ -113,11 +112,11 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     log.info("prior of strength %g chosen, held-out score %.4g", rows[choice].strength, rows[choice].score)
     final = replace(problem, segments=segments).with_prior(rows[choice].strength)
     solution = _settle(final, path[choice])
-    models = matrices_of(solution.V, final)
+    models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
     return models, Refinement(
-        pooled=matrices_of(common, problem),
+        pooled=problem.matrices(common),
         strength=rows[choice].strength,
         trade_off=(trade_off(data, problem, common, np.inf), *rows),
         sigma=problem.sigma,
@@ -129,7 +128,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
 
 def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
     """Return the problem of all units with errors in units of those of the pooled model, and a prior around it."""
-    options, pooled = problem.options, matrices_of(common, problem)
+    options, pooled = problem.options, problem.matrices(common)
     prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
@@ -202,3 +201,70 @@ def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> No
                 f"Refinement: the model of unit {unit} has spectral radius {radius_text(value)}, not below "
                 f"{radius_text(1 - margin)}; use a stronger prior."
             )
+
+
+def start_pooled(
+    data: TrainingData, segments: Segments, options: RefineOptions
+) -> tuple[Array, RefinementProblem, Array]:
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
+    lifting, rows = data.lifting, data.rows
+    n, nl = lifting.n_states, lifting.n_lifted
+    R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
+    p = R.shape[-1] - nl
+    matrices = edmd(R, nl, options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin))
+    T = _whitening(R[:p, :p], int(data.factor.n_samples[rows].sum()))
+    V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
+    one_step = OneStep.of(data.factor, T, n, rows)
+    problem = RefinementProblem(lifting, data.parameters, segments, T, np.ones(n), one_step, options)
+    normal = problem.of_one_model(rows).run(V)
+    with np.errstate(invalid="ignore"):
+        error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
+    error = np.clip(np.where(np.isfinite(error), error, 1.0), options.least_error, 1.0)
+    return V, replace(problem, sigma=error**options.balance), error
+
+
+def refine_pooled(V: Array, problem: RefinementProblem, error: Array) -> Array:
+    """Fit one model to all units, horizons growing, on some segments and at last on all; shape (n_lifted, p)."""
+    options = problem.options
+    count = max(2, -(-options.pooled_segments // problem.segments.n_units))
+    few = replace(problem, segments=problem.segments.first(count), sigma=error**options.first_balance)
+    for horizon in options.horizons:
+        stage = few.at(horizon)
+        V = options.search.minimise(stage.evaluate, stage.finite, V).V
+    V = _stabilised(V, few)
+    edged = normalised(replace(few, sigma=problem.sigma), V)
+    edged = replace(problem, sigma=edged.sigma, edged=True)
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, V).V[0])
+
+
+def _stabilised(V: Array, problem: RefinementProblem) -> Array:
+    """Bring a model inside the edge: by shorter rows of lifted functions, which free runs ignore, else by its penalty."""
+    n, edged = problem.lifting.n_states, replace(problem, edged=True)
+    if np.isfinite(problem.evaluate(V)).all():
+        for share in np.linspace(1.0, 0.0, 21):
+            trial = V.copy()
+            trial[:, n:] *= share
+            if problem.admissible(trial).all():
+                return trial
+        trial = problem.options.search.minimise(edged.evaluate, problem.finite, V).V
+        if problem.admissible(trial).all():
+            return trial
+    raise IdentificationError(
+        f"Refinement of the pooled model: free runs over {problem.options.horizons[-1]} samples diverge or the model "
+        "is unstable; omit lifting functions that grow, or set identify.refine = false."
+    )
+
+
+def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
+    """Return the problem with errors in units of those of a pooled model V, and with a soft edge of stability."""
+    normal, least = problem.run(V), problem.options.least_error
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, least**2))
+    return replace(problem, sigma=problem.sigma * size, edged=True)
+
+
+def _whitening(R11: Array, n_samples: int) -> Array:
+    """T with ``(R11 T)^T (R11 T) = n_samples I``; a direction that the data do not excite keeps its size."""
+    size = np.maximum(np.linalg.norm(R11, axis=0), np.finfo(float).tiny)
+    _, values, right = np.linalg.svd(R11 / size)
+    values = np.maximum(values, len(values) * np.finfo(float).eps * values[0])
+    return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])

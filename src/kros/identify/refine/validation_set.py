@@ -14,7 +14,6 @@ from ..edmd import KoopmanMatrices
 from ..free_run import free_run
 from .metric import peak_residual_db
 from .model import TradeOff, TrainingData
-from .pooled import matrices_of
 from .problem import RefinementProblem
 
 Array = npt.NDArray[np.float64]
@@ -75,7 +74,7 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
 def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:
     """Return accuracy on held-out training episodes, and uncertainty, of models (unit, n_lifted, p) or one for all."""
     rows, count = data.rows, len(data.keys)
-    models = matrices_of(np.broadcast_to(V, (count, *V.shape[-2:]))[rows], problem)
+    models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
     last = [episodes[-1] for episodes in data.keys.values()]
     values = {name: given[rows] for name, given in data.parameters.items()}
     rms, top, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])

@@ -15,7 +15,7 @@ from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.survey import RecordingFacts
 from ...identify import PhaseCalibration
-from ...identify.calibrate import segments_of
+from ...identify.calibration import segments_of
 from ...observer import Observer
 from ..config import StudyConfig, validate_config
 from ..engine.store import Store

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ...identify import PhaseCalibration
-from ...identify.calibrate import calibrate
+from ...identify.calibration import calibrate
 from ..engine.context import Context
 
 

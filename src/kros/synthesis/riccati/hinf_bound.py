@@ -199,9 +199,10 @@ def _families(side: Side, half: Half, states: Array, inputs: Array) -> list[Sign
     U, s, Wt = np.linalg.svd(basis @ (basis.T @ states @ half.P))
     for r in {int(np.sum(s > cut * s[0])) for cut in _CUTS if s[0] > 0}:
         # Signals that reach no state are none, so what is left of them moves by itself.
-        back = Wt[:r].T / s[:r]
-        signals = evaluated(side, U[:, :r], (s[:r, None] * Wt[:r]) @ M @ back, G @ back)
-        families += [] if signals is None else [signals]
+        for unit in (s[:r], s[:1]):  # signals of states of one size, and as the matrix has them
+            back = Wt[:r].T / unit
+            signals = evaluated(side, U[:, :r] * (s[:r] / unit), (unit[:, None] * Wt[:r]) @ M @ back, G @ back)
+            families += [] if signals is None else [signals]
     return families
 
 

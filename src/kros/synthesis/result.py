@@ -46,10 +46,9 @@ class Status(str, Enum):
         The optimum of the stated problem, verified: norms recomputed, loop stable.
     CERTIFIED
         Verified and its guarantee recomputed; the distance to the optimum is at most `gap_percent` (where it is known).
-        To narrow it raise the order of the weights or the number of refinements.
     INACCURATE
-        The solver stopped early (time limit, or reduced accuracy), but what it returned passed the same verification.
-        Raise the time limit, or add measurement noise and penalty, to come closer to the optimum.
+        The solver stopped early, but its result passed the same verification. Raise the time limit, or add measurement
+        noise and penalty, to come closer to the optimum.
 
     Examples
     --------
@@ -121,11 +120,8 @@ class Synthesis:
         for name, kind in (("status", Status), ("injection", Injection)):
             object.__setattr__(self, name, member(kind, getattr(self, name), f"Synthesis {self.method}: the {name}"))
         if self.gap_percent is not None and not self.gap_percent >= 0:
-            raise SynthesisError(
-                f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained "
-                f"({self.gap_percent:.6g} %); "
-                "no result claims that. Please report the problem that led here."
-            )
+            problem = f"a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %)"
+            raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")
 
     def save(self, folder: Path) -> None:
         """Write `synthesis.json` and `arrays.npz`."""
@@ -139,12 +135,9 @@ class Synthesis:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "synthesis")
         values: dict[str, Any] = {name: content.get(name) for name in _PLAIN}
-        values |= {
-            "status": Status(content["status"]),
-            "injection": Injection(content["injection"]),
-            "notes": tuple(content["notes"]),
-        }
-        return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
+        values["notes"] = tuple(content["notes"])
+        A, B, C, D = (arrays[name] for name in "ABCD")
+        return cls(controller=StateSpace(A, B, C, D, content["dt"]), **values)
 
 
 def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
@@ -154,15 +147,9 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
     if lower is None:
         return None, None, ("No lower bound could be proven.",)
     if lower > value * (1 + _ROUNDING):
-        log.error("Lower bound %.9g above the attained value %.9g: it is dropped.", lower, value)
-        return (
-            None,
-            None,
-            (
-                f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please "
-                "report this problem.",
-            ),
-        )
+        problem = f"a lower bound of {lower:.9g} above the attained {value:.9g} was dropped"
+        log.error("Internal error: %s", problem)
+        return None, None, (f"Internal error: {problem}; please report this problem.",)
     lower = min(lower, value)
     return lower, 100 * (value / lower - 1), ()
 

@@ -37,10 +37,8 @@ from .observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
 
-_LEAST_NOISE, _LEAST_PENALTY = (
-    1e-3,
-    3e-2,
-)  # in matrix inequalities: share of the measured channel's range, weight of the scaled correction
+# In matrix inequalities: share of the measured channel's range, weight of the scaled correction.
+_LEAST_NOISE, _LEAST_PENALTY = 1e-3, 3e-2
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
@@ -53,13 +51,8 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
     whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
-    blocks = {
-        "error": whole,
-        "W_p": problem.performance,
-        "W_u": problem.input_weight,
-        "W_L": problem.W_L,
-        "W_R": problem.W_R,
-    }
+    blocks = {"error": whole, "W_p": problem.performance, "W_u": problem.input_weight}
+    blocks |= {"W_L": problem.W_L, "W_R": problem.W_R}
     inputs = {"w1": m, "w2": problem.W_L.n_inputs}
     error = {"error": eye(n)} | ({} if location.at_input else {"W_L": eye(n)})
     drive = {"u": -J} | ({"W_L": B} if location.at_input else {})

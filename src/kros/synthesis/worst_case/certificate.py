@@ -91,10 +91,8 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol
     """Return the mean of a density over all frequencies and the quadrature error."""
     problem.require_sound()
     if not errors.is_stable():
-        raise SynthesisError(
-            f"Certificate: the nominal observer loop has spectral radius {float(errors.spectral_radius()):.9g}; no "
-            "bound is finite."
-        )
+        radius = float(errors.spectral_radius())
+        raise SynthesisError(f"Certificate: the nominal loop has spectral radius {radius:.9g}; no bound is finite.")
     rate = 2 * np.pi * problem.nominal.dt
     return circle_mean(lambda theta: of(problem, errors, theta / rate), _log_poles(problem, errors), rtol)
 
@@ -145,11 +143,8 @@ def circle_mean(
     values, errors = _panels(density, left, right)
     while errors.sum() > rtol * values.sum():
         if len(values) > max_panels:
-            raise SynthesisError(
-                f"Integrating the spectral density: relative error {errors.sum() / values.sum():.2g} after "
-                f"{len(values)} panels, asked for {rtol:.2g}; "
-                "a weight or the loop has poles extremely close to the unit circle."
-            )
+            error = f"relative error {errors.sum() / values.sum():.2g} after {len(values)} panels, above {rtol:.2g}"
+            raise SynthesisError(f"Integrating the density: {error}; poles are extremely close to the unit circle.")
         split = errors > min(0.5 * errors.max(), rtol * values.sum() / len(values))
         middle = np.where(left[split] > 0, np.sqrt(left[split] * right[split]), right[split] / 4)
         new_left = np.concatenate([left[split], middle])
@@ -183,9 +178,7 @@ def _panels(density: Callable[[Array], Array], left: Array, right: Array) -> tup
     angles[linear] = right[linear, None] * (1 + _ALL) / 2
     values = density(angles.ravel()).reshape(angles.shape)
     if not np.isfinite(values).all():
-        raise SynthesisError(
-            "Integrating the spectral density: it is not finite; is the uncertain set well posed and the loop stable?"
-        )
+        raise SynthesisError("Integrating the density: it is not finite; is the set well posed and the loop stable?")
     weighted = np.where(linear[:, None], values * right[:, None] / 2, values * angles * half[:, None])
     integral = weighted[:, : len(_NODES)] @ _WEIGHTS
     return integral, np.abs(integral - weighted[:, len(_NODES) :] @ _ROUGH_WEIGHTS)

@@ -114,19 +114,11 @@ def worst_case_h2(
 def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis:
     radius = problem.error_system(controller).largest_pole()
     if radius >= 1:
-        raise SynthesisError(
-            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of "
-            "the weights."
-        )
-    return Synthesis(
-        method="worst_case_h2",
-        controller=controller,
-        status=Status.INACCURATE,
-        injection=problem.injection,
-        spectral_radius=radius,
-        solver="riccati",
-        notes=("A design alone, without certificate.",),
-    )
+        loop = f"the loop has spectral radius {radius:.9g}"
+        raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
+    facts: dict[str, Any] = {"injection": problem.injection, "spectral_radius": radius, "solver": "riccati"}
+    notes = ("A design alone, without certificate.",)
+    return Synthesis("worst_case_h2", controller, Status.INACCURATE, **facts, notes=notes)
 
 
 def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:

@@ -208,7 +208,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "estimator.order",
         "data.prepare",
         "data.source",
-        "identify.kinds",
+        "identify.model_set",
         "load.limit",
     )
     values = (

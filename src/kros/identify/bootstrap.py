@@ -3,14 +3,10 @@
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
     per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
 
-Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn
-with replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of
-the variance, too little with few episodes (Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat.
-Assoc. 83, 1988).
-
-What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated
-parameters stay as they are, and so does a bias that all episodes share (regularisation, least squares on noisy or
-closed-loop recordings): no resampling sees it.
+Whole episodes are drawn, since samples of one episode depend on each other. Of E episodes E - 1 are drawn with
+replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the
+variance (Rao and Wu, J. Am. Stat. Assoc. 83, 1988). The prior, its centre, `alpha` and the calibrated parameters stay
+as they are; a bias that all episodes share is not seen.
 
 Symbols
 -------
@@ -82,24 +78,9 @@ class ModelSamples:
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     """Draw episodes with replacement, E - 1 of E, and return how much each counts.
 
-    Parameters
-    ----------
-    n_episodes : sequence of int
-        Episodes of every unit, at least two.
-    draws : int
-        At least two.
-    seed : int
-        A unit's draws depend on the seed and its row alone.
-
-    Returns
-    -------
-    ndarray, shape (unit, draw, max(n_episodes))
-        Zero where a unit has fewer episodes; each draw sums to the unit's number of episodes.
-
-    Raises
-    ------
-    DataError
-        With fewer than two episodes or draws.
+    The result has the shape (unit, draw, max(n_episodes)), zero where a unit has fewer episodes; each draw sums to the
+    unit's number of episodes. A unit's draws depend on the seed and its row alone. With fewer than two episodes or
+    draws a DataError is raised.
 
     Examples
     --------

@@ -55,16 +55,12 @@ class PhaseSpec:
     measured: str = "velocity"  # speed that follows it
     parameter: str = "phase"  # its name in formulas
     settle: float = 0.005  # share of an episode left out at the start of a segment, in which the loop settles
-    steady: float = (
-        20.0  # constant speed would take longer than one part in so many of the episode to reach its maximum
-    )
+    steady: float = 20.0  # a constant speed takes longer than one in so many parts of the episode to its maximum
     least_speed: float = 0.1  # of the largest commanded one, below which friction hides the disturbance
     least_periods: float = 5.0  # of the disturbance in a segment
     least_samples: float = 4.0  # in a period
     speed_tolerance: float = 0.02  # share within which segments have one speed, and one lag
-    least_concentration: float = (
-        0.8  # mean resultant length below which the log warns of segments or lags that disagree
-    )
+    least_concentration: float = 0.8  # mean resultant below which the log warns of segments or lags that disagree
 
 
 @dataclass(frozen=True)
@@ -227,10 +223,8 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     lag = float(np.angle(doubled)) / 2
     lag = lag - np.pi if lag >= 0 else lag
     if np.abs(doubled) < spec.least_concentration:
-        problem = (
-            f"lags differ so much between units (resultant {np.abs(doubled):.2f}) that some may be on the wrong branch"
-        )
-        log.warning("phase calibration: %s", problem)
+        text = "phase calibration: lags differ so much (resultant %.2f) that some units may be on the wrong branch"
+        log.warning(text, np.abs(doubled))
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})
 
 

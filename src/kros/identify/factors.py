@@ -96,15 +96,10 @@ def triangular(rows: Array) -> Array:
 def combine(factors: Factor) -> Factor:
     """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n).
 
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.identify import combine, episode_factors
-    >>> from kros.lifting import Lifting
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
-    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
-    >>> combine(episode_factors(motors, keys, Lifting(motors.states))).R.shape[0]
-    2
+    >>> rows = np.random.default_rng(0).normal(size=(3, 49, 2))  # three episodes of [x, u]
+    >>> parts = Factor(np.linalg.qr(rows, mode="r"), np.abs(rows).max(axis=1), np.full(3, 49))
+    >>> combine(parts).R.shape, int(combine(parts).n_samples)
+    ((2, 2), 147)
     """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
@@ -121,24 +116,8 @@ def episode_factors(
 ) -> Factor:
     """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
 
-    Parameters
-    ----------
-    population : Population
-    keys : mapping of str to sequence of EpisodeKey
-        Episodes of every unit.
-    lifting : Lifting
-    parameters : mapping of str to array_like, shape (unit,), optional
-        The lifting's parameters, in the order of `keys`.
-
-    Returns
-    -------
-    Factor
-        Batch (unit, episode) in the order of `keys`; zero where a unit has fewer episodes than others.
-
-    Raises
-    ------
-    DataError
-        When there are no episodes at all.
+    The batch is (unit, episode) in the order of `keys`, zero where a unit has fewer episodes than others; `parameters`
+    of the lifting have the shape (unit,). Without any episode a DataError is raised.
 
     Examples
     --------

@@ -20,8 +20,7 @@ from ..data.survey import RecordingFacts
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
-from .kinds import KINDS, kinds_for
-from .model_set import ModelSet
+from .model_set import KINDS, ModelSet, kinds_for
 from .refine.model import Refinement
 
 Array = npt.NDArray[np.float64]

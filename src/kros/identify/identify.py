@@ -35,8 +35,7 @@ from .factors import (
     require_independent,
 )
 from .identified import EpisodeFactors, IdentifiedModels
-from .kinds import ModelKind, kinds_for
-from .model_set import ModelSet
+from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .ranges import Ranges
 from .refine import Refinement, RefineOptions, refine_population
@@ -133,17 +132,13 @@ def _check_conditions(base: IdentifiedModels) -> None:
     facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
-            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; "
-            "set data.identify_on to another one."
+            f"Identifying in condition {facts.identify_on!r}: none of its units could be calibrated; set "
+            "data.identify_on to another one."
         )
     elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
     if elsewhere:
-        log.warning(
-            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not "
-            "compared with the others. Where conditions stand for units, give all the same one.",
-            ", ".join(elsewhere),
-            facts.identify_on,
-        )
+        text = "Units %s were not recorded in condition %r, which feeds synthesis, and take no part in it"
+        log.warning(text, ", ".join(elsewhere), facts.identify_on)
 
 
 def _begin(

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
 
-from ...identify.kinds import kind_of
+from ...identify.model_set import kind_of
 from ..task import split_name
 
 log = logging.getLogger(__name__)

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from ..edmd import KoopmanMatrices
 from ..factors import Factor, combine
 from .model import Refinement, TrainingData
-from .options import RefineOptions
 from .problem import OneStep, RefinementProblem
+from .search import RefineOptions
 from .segments import read_segments, segment_owners
 from .sensitivity import normal_equations
 

@@ -23,11 +23,10 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor
 from ..ranges import Ranges
-from .gauss_newton import Evaluate, GaussNewton, Solution
 from .metric import ResponsePrior
 from .model import Refinement, TradeOff, TrainingData
-from .options import RefineOptions
 from .problem import OneStep, RefinementProblem
+from .search import Evaluate, GaussNewton, RefineOptions, Solution
 from .segments import Segments, held_segments, read_segments
 from .validation_set import require_bounded, trade_off
 
@@ -54,9 +53,8 @@ def refine_population(
         Training episodes of every unit; the last one of each validates the strength of the prior.
     lifting : Lifting
     parameters : mapping of str to ndarray, shape (unit,)
-        The lifting's parameters, in the order of `keys`.
     factor : Factor
-        Of ``[Psi | Theta_plus]`` for this lifting, the batch over units in the order of `keys` (see `lifted_factor`).
+        Of ``[Psi | Theta_plus]`` for this lifting, the batch over units in the order of `keys`.
     pooled : ndarray of bool, shape (unit,), optional
         Units that make the pooled model and choose the strength; all by default. The others get the same prior.
     options : RefineOptions, optional
@@ -64,8 +62,7 @@ def refine_population(
     Returns
     -------
     models : KoopmanMatrices
-        A (unit, n, n) and B (unit, n, m): stable linear models with a bounded re-lifted free run on every training
-        episode.
+        Stable linear models with a bounded re-lifted free run on every training episode.
     refinement : Refinement
 
     Raises

@@ -30,7 +30,7 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor
 from .metric import ResponsePrior
-from .options import RefineOptions
+from .search import RefineOptions
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
 

@@ -146,8 +146,7 @@ def tree_of(expression: Any) -> Tree:
     if name == "DiracDelta":  # the slope of a sign is zero almost everywhere
         return "number", 0.0
     if name not in FUNCTIONS:
-        remedy = f"write the formula with {', '.join(sorted(FUNCTIONS))}"
-        raise ConfigError(f"Formula node {expression!r}: no numerical evaluation is known; {remedy}.")
+        raise ConfigError(f"Formula node {expression!r}: is none of {', '.join(sorted(FUNCTIONS))}.")
     return name, tree_of(expression.args[0])
 
 
@@ -155,5 +154,4 @@ def _real(number: Any) -> float:
     try:
         return float(number)
     except TypeError as error:
-        remedy = "keep roots and logarithms of positive quantities"
-        raise ConfigError(f"Formula node {number!r}: is not a real number; {remedy}.") from error
+        raise ConfigError(f"Formula node {number!r}: is not a real number.") from error

@@ -12,10 +12,9 @@ Examples
 """
 
 from ..core.removed import refusing
-from .from_current import TorqueScale
 from .level import AngleLoad
 from .observer import LoadSettings, load_observer
-from .signals import known_load
+from .signals import TorqueScale, known_load
 
 __all__ = ["AngleLoad", "LoadSettings", "TorqueScale", "known_load", "load_observer"]
 __getattr__ = refusing(__name__)

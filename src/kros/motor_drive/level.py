@@ -7,12 +7,10 @@ seen part gives c by least squares as soon as the machine turns,
 .. math:: \hat c_k = \Bigl(\sum_j \psi_j \psi_j^T T + \epsilon I\Bigr)^{-1} \sum_j \psi_j \hat\tau_s(j) T, \qquad
           \hat\tau = \hat\tau_s + (\varphi - \psi)^T \hat c .
 
-Fast and unexpected loads pass as they are seen, and without load c stays near zero.
-
-A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where
-the total current comes out beyond the limit, the excess is taken off the load, and forgotten as slowly as levels are.
-If that would move the load by more than `trusted` from what c says of the angle, it is no load: changes are counted
-again from there, and what excess remains is taken off what the unloaded machine needs.
+A controller at its limit holds its integrator back. Where the total current comes out beyond the limit, the excess is
+taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from what c
+says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the
+unloaded machine needs.
 """
 
 from __future__ import annotations
@@ -134,6 +132,5 @@ class RunningAngleLoad:
     def _coefficients(self) -> Array:
         """Solve the normal equations of c, two by two."""
         (a, b), (_, d) = self._gram
-        return np.stack([d * self._right[0] - b * self._right[1], a * self._right[1] - b * self._right[0]]) / (
-            a * d - b * b
-        )
+        first, second = self._right
+        return np.stack([d * first - b * second, a * second - b * first]) / (a * d - b * b)

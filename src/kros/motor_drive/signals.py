@@ -7,6 +7,9 @@ start, and with a leak, which keeps estimates from drifting, its high-passed par
 .. math:: \tau_s(k) = p\,\tau_s(k-1) + \tau(k) - \tau(k-1), \qquad \tau_s(0) = 0, \quad p = e^{-T/T_\ell},
 
 with the time T_l after which a constant load is forgotten.
+
+*The paper's estimate* (section IV-E.2) is the current's error of an observer of the unloaded machine under load, ``tau =
+K (i - i_hat)``. An observer that knows the current under load hides the load.
 """
 
 from __future__ import annotations
@@ -112,3 +115,50 @@ def load_accuracy(
     error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
     signals = error[:, ~loaded], error[:, loaded], slow[:, loaded]
     return LoadAccuracy(*(float(np.sqrt(np.mean(signal**2))) for signal in signals))
+
+
+@dataclass(frozen=True)
+class TorqueScale:
+    """Torque of a current's error.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.motor_drive import TorqueScale
+    >>> known = np.sin(2 * np.pi * 0.5 * 0.001 * np.arange(8000))  # N m
+    >>> scale = TorqueScale.calibrated(0.1 + known / 50, known, 0.001)
+    >>> round(scale.torque_constant), round(scale.bias, 3), round(float(scale.load(0.3)), 6)
+    (50, 0.1, 10.0)
+    """
+
+    torque_constant: float  # torque per unit of current
+    bias: float  # error of the current without load, in units of current
+    residual_percent: float  # what is left of the known load, low-passed, in percent of its standard deviation
+
+    @classmethod
+    def calibrated(
+        cls,
+        error: npt.ArrayLike,
+        known: npt.ArrayLike,
+        sample_period_s: float,
+        corner_hz: float = 5.0,
+        skip: int = 300,
+    ) -> TorqueScale:
+        """Return the scale from measured minus estimated current and the torque of a known load, (n_samples, ...).
+
+        Least squares with a bias on signals low-passed without delay, without `skip` samples at the start. A DataError
+        says when the known load does not change, or the error does not follow it.
+        """
+        x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
+        dx, dt = x - x.mean(), t - t.mean()
+        if not dt @ dt > 0 or not dx @ dt > 0:
+            found = f"deviations {t.std():.3g} and {x.std():.3g} and covariance {dx @ dt / len(t):.3g}"
+            raise DataError(f"Torque constant: the current's error should follow the load, found {found}; check signs.")
+        constant = float(dx @ dt / (dx @ dx))
+        rest = dt - constant * dx
+        residual = float(100 * np.sqrt(rest @ rest / (dt @ dt)))
+        return cls(constant, float(x.mean() - t.mean() / constant), residual)
+
+    def load(self, error: npt.ArrayLike) -> Array:
+        """Return the load's torque, ``K (i - i_hat - bias)``, from measured minus estimated current."""
+        return self.torque_constant * (np.asarray(error, dtype=float) - self.bias)

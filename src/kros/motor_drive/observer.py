@@ -79,10 +79,8 @@ def load_observer(
 
     Raises
     ------
-    DimensionError
-        When shapes do not fit, or a state is named "load".
-    DataError
-        When recordings of a kind are missing, or all reach the limit.
+    DimensionError, DataError
+        When shapes do not fit, recordings of a kind are missing, or all reach the limit.
 
     Examples
     --------

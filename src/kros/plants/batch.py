@@ -33,14 +33,6 @@ T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
 class SimulatedPopulation(Generic[T]):
     """Recordings and what is true about them.
 
-    Parameters
-    ----------
-    population : Population
-        Ready for identification, as a reader yields it.
-    raw : Population
-        As recorded, before preparation; the same as `population` where a plant needs none.
-    truth : object with ``as_dict()``
-
     Examples
     --------
     >>> from kros.plants import DcMotorPopulation
@@ -49,9 +41,9 @@ class SimulatedPopulation(Generic[T]):
     ['001', '002']
     """
 
-    population: Population
-    raw: Population
-    truth: T
+    population: Population  # ready for identification, as a reader yields it
+    raw: Population  # as recorded, before preparation; the same where a plant needs none
+    truth: T  # with ``as_dict()``
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +55,7 @@ class SimulatedEpisodes:
     def __call__(self, key: EpisodeKey) -> Array:
         """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
         if key not in self.parts:
-            known = f"the simulation has {len(self.parts)} episodes, first {next(iter(self.parts), None)}"
-            raise DataError(f"Asked for {key}; {known}; take keys from population.episodes.")
+            raise DataError(f"Asked for {key}; the simulation has no such episode; take keys from population.episodes.")
         return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> SimulatedEpisodes:

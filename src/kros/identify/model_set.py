@@ -28,35 +28,6 @@ Array = npt.NDArray[np.float64]
 class ModelSet:
     """Koopman (or linear) models of all units, identified in one condition.
 
-    Parameters
-    ----------
-    name : str
-        Kind of model, for example ``koopman_edmd``.
-    condition : str
-    lifting : Lifting
-    channels : tuple of Channel
-    sample_period_s : float
-    unit_ids : tuple of str
-    A : ndarray, shape (unit, n, n)
-    B : ndarray, shape (unit, n, m)
-    parameters : mapping of str to ndarray, shape (unit,)
-        Per-unit parameters of the lifting.
-    residual_covariance : ndarray, shape (unit, n, n)
-        Covariance of the one-step residual on the training episodes.
-    output_scale : ndarray, shape (n,)
-        Range of every lifted state over the pooled training episodes; uncertainty and weights work in these units.
-    input_scale : ndarray, shape (m,)
-    alpha : float or None
-        Tikhonov coefficient, where there is one.
-    alpha_in_ranges : bool
-        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings'
-        units.
-    status : tuple of str
-        Per unit ``ok``, or what is wrong.
-    longest_s : float or None, s
-        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is
-        not known.
-
     Examples
     --------
     >>> import kros
@@ -66,22 +37,22 @@ class ModelSet:
     ((2, 3, 3), True, True)
     """
 
-    name: str
+    name: str  # kind of model, for example ``koopman_edmd``
     condition: str
     lifting: Lifting
     channels: tuple[Channel, ...]
     sample_period_s: float
     unit_ids: tuple[str, ...]
-    A: Array
-    B: Array
-    parameters: Mapping[str, Array]
-    residual_covariance: Array
-    output_scale: Array
-    input_scale: Array
-    alpha: float | None = None
-    alpha_in_ranges: bool = False
-    status: tuple[str, ...] = field(default=())
-    longest_s: float | None = None
+    A: Array  # (unit, n, n)
+    B: Array  # (unit, n, m)
+    parameters: Mapping[str, Array]  # of the lifting, (unit,)
+    residual_covariance: Array  # (unit, n, n), of the one-step residual on the training episodes
+    output_scale: Array  # (n,), range of every lifted state over the pooled training episodes
+    input_scale: Array  # (m,)
+    alpha: float | None = None  # Tikhonov coefficient, where there is one
+    alpha_in_ranges: bool = False  # whether alpha is for channels divided by the ranges or for the recordings' units
+    status: tuple[str, ...] = field(default=())  # per unit ``ok``, or what is wrong
+    longest_s: float | None = None  # longest episode, below whose inverse the models know no frequency, where known
 
     def __repr__(self) -> str:
         units = f"{len(self.unit_ids)} units in condition {self.condition!r}"

@@ -64,11 +64,9 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     each = KoopmanMatrices(models.A[rows], models.B[rows])
     _, _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
     for which, state in np.argwhere(~(reached <= bound)):
-        name, size = data.lifting.states[state], reached[which, state]
-        raise IdentificationError(
-            f"Refinement: the free run over {keys[which]} reaches {size:.3g} times the range of {name!r}, beyond "
-            f"{bound:g}; use functions that stay bounded, leave the episode out, or set identify.refine = false."
-        )
+        size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
+        remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
+        raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
 
 
 def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:

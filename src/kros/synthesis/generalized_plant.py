@@ -37,25 +37,6 @@ class GeneralizedPlant:
             +----------->|  K  |----------------+      u = + K y
                          +-----+
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-    B1 : ndarray, shape (n, n_w)
-    B2 : ndarray, shape (n, n_u)
-    C1 : ndarray, shape (n_z, n)
-    C2 : ndarray, shape (n_y, n)
-    D11 : ndarray, shape (n_z, n_w)
-    D12 : ndarray, shape (n_z, n_u)
-    D21 : ndarray, shape (n_y, n_w)
-    D22 : ndarray, shape (n_y, n_u)
-    dt : float, s
-        Sampling period; 0 means continuous time.
-    n_w1 : int, optional
-        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default
-        all.
-    n_z1 : int, optional
-        For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
-
     Raises
     ------
     DimensionError
@@ -73,18 +54,18 @@ class GeneralizedPlant:
     True
     """
 
-    A: Array
-    B1: Array
-    B2: Array
-    C1: Array
-    C2: Array
-    D11: Array
-    D12: Array
-    D21: Array
-    D22: Array
-    dt: float
-    n_w1: int | None = None
-    n_z1: int | None = None
+    A: Array  # (n, n)
+    B1: Array  # (n, n_w)
+    B2: Array  # (n, n_u)
+    C1: Array  # (n_z, n)
+    C2: Array  # (n_y, n)
+    D11: Array  # (n_z, n_w)
+    D12: Array  # (n_z, n_u)
+    D21: Array  # (n_y, n_w)
+    D22: Array  # (n_y, n_u)
+    dt: float  # s; 0 means continuous time
+    n_w1: int | None = None  # for `mixed`: so many disturbances are w1 (performance), the others w2; default all
+    n_z1: int | None = None  # for `mixed`: so many outputs are z1, the others z2; default all
 
     def __post_init__(self) -> None:
         for name in _MATRICES:

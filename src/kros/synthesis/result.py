@@ -66,33 +66,6 @@ class Status(str, Enum):
 class Synthesis:
     """A verified correction filter and its certificate.
 
-    Parameters
-    ----------
-    method : str
-        Name of the method, for example ``worst_case_h2``.
-    controller : StateSpace
-        The filter K, ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``.
-    status : Status
-    injection : Injection
-    h2_norm : float or None
-        H2 norm of the closed loop from w (or w1) to z (or z1), recomputed.
-    hinf_norm : float or None
-        H-infinity norm of the closed loop from w (or w2) to z (or z2), recomputed.
-    worst_case_h2 : float or None
-        Certified H2 norm for every member of the uncertain set.
-    lower_bound : float or None
-        No controller of this kind does better.
-    gap_percent : float or None
-        ``100 (value / lower_bound - 1)``.
-    quadrature_error : float or None
-        Estimated error of `worst_case_h2`, already included in it.
-    spectral_radius : float or None
-        Of the nominal closed loop (for continuous systems the largest real part). It says nothing about robustness.
-    solve_s : float
-        Time of the numerical solution, without the fitting of weights.
-    solver : str
-    notes : tuple of str
-
     Examples
     --------
     >>> from kros.synthesis import kalman
@@ -101,18 +74,18 @@ class Synthesis:
     ('kalman', 'optimal', 0.5)
     """
 
-    method: str
-    controller: StateSpace
+    method: str  # for example ``worst_case_h2``
+    controller: StateSpace  # ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``
     status: Status
     injection: Injection = Injection.NONE
-    h2_norm: float | None = None
-    hinf_norm: float | None = None
-    worst_case_h2: float | None = None
-    lower_bound: float | None = None
-    gap_percent: float | None = None
-    quadrature_error: float | None = None
-    spectral_radius: float | None = None
-    solve_s: float = 0.0
+    h2_norm: float | None = None  # of the closed loop from w (or w1) to z (or z1), recomputed
+    hinf_norm: float | None = None  # of the closed loop from w (or w2) to z (or z2), recomputed
+    worst_case_h2: float | None = None  # certified for every member of the uncertain set
+    lower_bound: float | None = None  # no controller of this kind does better
+    gap_percent: float | None = None  # ``100 (value / lower_bound - 1)``
+    quadrature_error: float | None = None  # of `worst_case_h2`, already included in it
+    spectral_radius: float | None = None  # of the nominal loop (continuous: the largest real part)
+    solve_s: float = 0.0  # s, without the fitting of weights
     solver: str = ""
     notes: tuple[str, ...] = ()
 

@@ -52,43 +52,6 @@ _WEIGHTS = ("W_L", "W_R", "W_u", "W_p", "remainder_left", "remainder_right")
 class ObserverProblem:
     """What an observer must be good at: a nominal model, an uncertain set around it, measurement noise.
 
-    Parameters
-    ----------
-    nominal : StateSpace
-        Nominal model; only `A` (n, n), `B` (n, m) and `dt` are used, the state being the full lifted state.
-    C : ndarray, shape (q, n)
-        Selects the measured outputs from the lifted state.
-    W_L : StateSpace
-        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of
-        inputs. Diagonal, scalar and full weights are all sound, since Delta has no structure.
-    W_R : StateSpace
-        Right weight; stable. As many inputs as E has columns, any number of outputs.
-    input_scale : ndarray, shape (m,)
-        Physical size of each input; scaled input = input / scale.
-    output_scale : ndarray, shape (n,)
-        Physical size of each (lifted) state.
-    noise : ndarray, shape (q,)
-        Standard deviation of the white measurement noise per sample, in the units of y; positive.
-    n_original : int, optional
-        The first `n_original` states are the original ones; the rest are lifted functions with no weight. Default all.
-    W_u : StateSpace, (m, m), optional
-        Weight of the scaled inputs; default identity: white scaled inputs of unit variance.
-    W_p : ndarray, shape (p, n), or StateSpace, optional
-        Performance weight on the error in physical units; default ``1 / output_scale`` on the original states.
-    correction_penalty : float
-        Small weight of the scaled correction; used where the problem is singular without it.
-    remainder_left : StateSpace, (n, n), optional
-        Left weight of the additive remainder on scaled states.
-    remainder_right : StateSpace, (m, m), optional
-        Right weight of the additive remainder on scaled inputs.
-    injection : Injection or its name
-        Where the correction enters.
-    process_noise : ndarray, shape (n,), optional
-        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default
-        none.
-    form : Form or str
-        Form of the uncertainty; default inverse input multiplicative, as in the paper.
-
     Raises
     ------
     DimensionError
@@ -104,22 +67,22 @@ class ObserverProblem:
     ('inverse_input_multiplicative', 'state')
     """
 
-    nominal: StateSpace
-    C: Array
-    W_L: StateSpace
-    W_R: StateSpace
-    input_scale: Array
-    output_scale: Array
-    noise: Array
-    n_original: int | None = None
-    W_u: StateSpace | None = None
-    W_p: Array | StateSpace | None = None
-    correction_penalty: float = 1e-3
-    remainder_left: StateSpace | None = None
-    remainder_right: StateSpace | None = None
-    injection: Injection = Injection.STATE
-    process_noise: Array | None = None
-    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
+    nominal: StateSpace  # only A (n, n), B (n, m) and dt are used, the state being the full lifted state
+    C: Array  # (q, n), selects the measured outputs from the lifted state
+    W_L: StateSpace  # left weight of ``E = W_L Delta W_R`` on scaled signals, stable; as many outputs as E has rows
+    W_R: StateSpace  # right weight, stable; as many inputs as E has columns
+    input_scale: Array  # (m,), physical size of each input
+    output_scale: Array  # (n,), physical size of each (lifted) state
+    noise: Array  # (q,), standard deviation of the white measurement noise per sample, in the units of y
+    n_original: int | None = None  # the first states are the original ones, the rest have no weight; default all
+    W_u: StateSpace | None = None  # (m, m), of the scaled inputs; default white inputs of unit variance
+    W_p: Array | StateSpace | None = None  # (p, n), on the error; default ``1 / output_scale`` on the original states
+    correction_penalty: float = 1e-3  # of the scaled correction, where the problem is singular without it
+    remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
+    remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
+    injection: Injection = Injection.STATE  # where the correction enters
+    process_noise: Array | None = None  # (n,), standard deviation of white noise on every state per sample
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)

@@ -43,21 +43,6 @@ _NEGLIGIBLE = 1e-12
 class ResidualProblem:
     """Problem of a residual-shaped observer: error dynamics, residuals of a population, measurement noise.
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Error dynamics of the original states (`mean_error_dynamics` in `kros.observer.residual.one_step`).
-    C : ndarray, shape (q, n)
-        Selects the measured states.
-    spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`residual_spectra` in
-        `kros.observer.residual.one_step`), physical units.
-    noise : ndarray, shape (q,)
-        Standard deviation of the measurement noise.
-    scale : ndarray, shape (n,)
-        Range of every state; norms are of errors in these units.
-    dt : float, s
-
     Raises
     ------
     DimensionError
@@ -73,12 +58,12 @@ class ResidualProblem:
     (1, 65, 1, 1)
     """
 
-    A: Array
-    C: Array
-    spectra: Spectra
-    noise: Array
-    scale: Array
-    dt: float
+    A: Array  # (n, n), error dynamics of the original states
+    C: Array  # (q, n), selects the measured states
+    spectra: Spectra  # (unit, f, n, n), complex: cross spectral density of every unit's one-step residual
+    noise: Array  # (q,), standard deviation of the measurement noise
+    scale: Array  # (n,), range of every state; norms are of errors in these units
+    dt: float  # s
 
     def __post_init__(self) -> None:
         for name in ("A", "C", "noise", "scale"):

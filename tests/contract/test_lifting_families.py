@@ -9,7 +9,7 @@ from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
-from kros.lifting.c_code import c_code
+from kros.lifting.program import c_code
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
 PHASE = (0.2, 0.9)

@@ -19,7 +19,7 @@ from kros.identify import (
     episode_weights,
 )
 from kros.identify.bootstrap import bootstrap_refined, one_step_deviations
-from kros.identify.ranges import Ranges
+from kros.identify.factors import Ranges
 from kros.identify.refine import GaussNewton, Refinement, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
 from kros.identify.refine.metric import ResponsePrior

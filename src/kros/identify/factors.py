@@ -10,6 +10,10 @@ Symbols
 x, u : states (n_samples, n) and inputs (n_samples, m)
 g, v : parameter-free functions, sigma(w; q) = M(q) g(w) and gamma(u, w; q) = N(q) v(u, w) (see `lifting.Separation`)
 R    : upper triangular factor, (n_columns, n_columns)
+
+Everything is identified in channels divided by their ranges (`Ranges`), so that units of measure change nothing. With the
+ranges of the lifted states and of the inputs as diagonal matrices X and U, ``z = X^-1 x``, ``A_z = X^-1 A X`` and ``B_z =
+X^-1 B U``. Only a regularisation, a threshold or a penalty sees the difference.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +30,7 @@ from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
-from .edmd import relative_pivots
+from .edmd import KoopmanMatrices, edmd, relative_pivots
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -203,3 +208,52 @@ def require_independent(factor: Factor, names: Sequence[str], units: Sequence[st
             f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
             f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Ranges of a model's channels."""
+
+    outputs: Array  # (n_lifted,)
+    inputs: Array  # (m,)
+
+    @classmethod
+    def of(cls, factor: Factor, n_lifted: int, rows: Any = slice(None)) -> Ranges:
+        """Return the largest magnitudes in the training of some units; one for a channel that is always zero."""
+        peak = factor.peak[rows].max(axis=0)
+        peak = np.where(peak > 0, peak, 1.0)
+        return cls(peak[:n_lifted], peak[n_lifted:])
+
+    @property
+    def inverse(self) -> Ranges:
+        """Ranges that lead back."""
+        return Ranges(1 / self.outputs, 1 / self.inputs)
+
+    def sizes(self, lifting: Lifting, recorded: tuple[str, ...]) -> dict[str, float]:
+        """Return the ranges by name: of states, lifted functions, recorded inputs and functions of these."""
+        names = (*lifting.names, *recorded, *lifting.input_functions)
+        return dict(zip(names, np.concatenate([self.outputs, self.inputs]).tolist(), strict=True))
+
+    def normalise(self, models: KoopmanMatrices) -> KoopmanMatrices:
+        """Return models of channels divided by the ranges, batched."""
+        x, u = self.outputs, self.inputs
+        return KoopmanMatrices(models.A * x / x[:, None], models.B * u / x[:, None])
+
+    def restore(self, models: KoopmanMatrices) -> KoopmanMatrices:
+        """Return models of the channels as recorded from those of channels divided by the ranges."""
+        return self.inverse.normalise(models)
+
+    def triangles(self, R: Array) -> Array:
+        """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
+        return np.asarray(R / np.concatenate([self.outputs, self.inputs, self.outputs]))
+
+    def factor(self, factor: Factor) -> Factor:
+        """Return the same with what else a factor holds."""
+        ends = factor.input_range
+        peak = factor.peak / np.concatenate([self.outputs, self.inputs])
+        ends = None if ends is None else ends / self.inputs[: ends.shape[-1]]
+        return replace(factor, R=self.triangles(factor.R), peak=peak, input_range=ends)
+
+    def edmd(self, R: Array, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
+        """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""
+        return self.restore(edmd(self.triangles(R), len(self.outputs), alpha))

@@ -28,6 +28,7 @@ from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
 from .factors import (
     Factor,
+    Ranges,
     combine,
     lifted_factor,
     reduce_episode,
@@ -37,7 +38,6 @@ from .factors import (
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
-from .ranges import Ranges
 from .refine import Refinement, RefineOptions, refine_population
 from .refine.metric import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings

@@ -19,7 +19,7 @@ from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
-from .ranges import Ranges
+from .factors import Ranges
 
 Array = npt.NDArray[np.float64]
 

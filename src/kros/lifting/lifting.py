@@ -99,14 +99,8 @@ class Lifting:
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
         """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
 
-        Parameters
-        ----------
-        sizes : mapping of str to float
-            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is
-            the way back.
+        Sizes are by name of a state or an input, or text of a function; what is not named keeps its unit.
 
-        Examples
-        --------
         >>> metres = Lifting(("x",), ("x**2",))
         >>> kilometres = metres.in_sizes({"x": 1000.0, "x**2": 1e6})
         >>> metres.lift([[3000.0]]).tolist(), kilometres.lift([[3.0]]).tolist()
@@ -234,23 +228,10 @@ class Lifting:
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and
-        are infinite where a slope is, or where a function jumps or is not defined.
+        Interval arithmetic on the derivatives, rounded outwards: the bounds (p, n_window) hold between any two points
+        of the box, and are infinite where a slope is, or where a function jumps or is not defined. Ranges are numbers
+        or pairs (lower, upper) by name; what is not named may be anything.
 
-        Parameters
-        ----------
-        box : mapping of str to (lower, upper) or number
-            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its
-            quantity.
-        parameters : mapping of str to number or (lower, upper)
-            A parameter that is not named may be anything.
-
-        Returns
-        -------
-        lower, upper : ndarray, shape (p, n_window)
-
-        Examples
-        --------
         >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
         array([[100.]])
         """

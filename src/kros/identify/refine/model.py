@@ -17,8 +17,7 @@ from ...data.population import Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
-from ..factors import Factor
-from ..ranges import Ranges
+from ..factors import Factor, Ranges
 from .segments import Keys
 
 Array = npt.NDArray[np.float64]

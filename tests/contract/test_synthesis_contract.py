@@ -1,4 +1,5 @@
-"""One contract for all observer syntheses: what the result claims is recomputed here from the result and the problem alone."""
+"""One contract for all observer syntheses: what the result claims is recomputed here from the result and the problem
+alone."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,5 @@
-"""All six forms: the interconnection is the perturbed plant, the bound holds for every perturbation and is close to the worst one found."""
+"""All six forms: the interconnection is the perturbed plant, the bound holds for every perturbation and is close to
+the worst one found."""
 
 import numpy as np
 import pytest
@@ -128,7 +129,8 @@ def test_interconnection_is_the_perturbed_plant(form, injection):
 
 @pytest.mark.parametrize("form", Form)
 def test_plant_is_minimal(form):
-    """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer) are gone."""
+    """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer)
+    are gone."""
     case = problem(form, 1)
     system = generalized_plant(case).open_loop()
     n = system.n_states
@@ -146,7 +148,8 @@ def contraction(x, b, a):
 
 
 def worst_found(rng, T, N_, M_, norm="fro", noise=None, starts=15, steps=40):
-    """Search over perturbations with orthonormal rows or columns: to the polar factor of the gradient, from many random starts, best kept."""
+    """Search over perturbations with orthonormal rows or columns: to the polar factor of the gradient, from many
+    random starts, best kept."""
     b, a = T.shape[1], M_.shape[0]
     noise = np.zeros((len(T), 0)) if noise is None else noise
     best = 0.0
@@ -202,7 +205,8 @@ def test_designs_of_every_form_are_certified(form):
 
 
 def test_performance_weight_with_states():
-    """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is crossed."""
+    """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is
+    crossed."""
     base = problem(Form.INPUT_MULTIPLICATIVE, 6, "diagonal", remainder=False)
     slow = block_diagonal(
         [StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.2]]), np.array([[0.05]]), DT)] * N

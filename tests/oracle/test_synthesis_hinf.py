@@ -1,4 +1,5 @@
-"""H-infinity synthesis against published optima, closed forms, coprime-factor theory and a slow linear matrix inequality."""
+"""H-infinity synthesis against published optima, closed forms, coprime-factor theory and a slow linear matrix
+inequality."""
 
 import cvxpy as cp
 import numpy as np
@@ -111,7 +112,8 @@ def scherer(C1, D12):
 
 
 def coprime(A, B, C, dt):
-    """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z = (y, u)."""
+    """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z
+    = (y, u)."""
     n, m, p = len(A), B.shape[1], C.shape[0]
     return GeneralizedPlant(
         A,
@@ -134,7 +136,8 @@ def random_plant(rng, n, dt):
 
 
 def slow_optimum(p):
-    """Optimum by the projected bounded-real inequalities (Gahinet and Apkarian, 1994), solved by an interior-point method."""
+    """Optimum by the projected bounded-real inequalities (Gahinet and Apkarian, 1994), solved by an interior-point
+    method."""
     n, n_w, _, n_z, _ = p.sizes
     R, S, gamma = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True), cp.Variable()
 
@@ -228,7 +231,8 @@ def test_scalar_output_feedback_closed_form(a):
 
 @pytest.mark.parametrize("dt", [0.0, 1e-3])
 def test_normalised_coprime_factors(dt):
-    # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order and size.
+    # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order
+    # and size.
     rng = np.random.default_rng(7)
     solve = solve_discrete_are if dt > 0 else solve_continuous_are
     for _ in range(15):
@@ -297,7 +301,8 @@ def test_lightly_damped_open_loop_where_a_grid_fails(gap, angle):
 
 @pytest.mark.parametrize("seed", [1, 2, 11])
 def test_bounds_hold_in_all_coordinates(seed):
-    """Slow poles that disturbances hardly reach, in units of measure of many sizes: no bound lies above what another frame attains."""
+    """Slow poles that disturbances hardly reach, in units of measure of many sizes: no bound lies above what another
+    frame attains."""
     rng = np.random.default_rng(seed)
     n, faint = 10, 1e-6
     A = np.diag(np.concatenate([[1 - 1e-6, 1 - 1e-6, 1 - 1e-5], rng.uniform(-0.9, 0.99, n - 3)]))

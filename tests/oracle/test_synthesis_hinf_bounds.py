@@ -1,4 +1,5 @@
-"""Lower bounds of H-infinity synthesis lie below every norm that a controller attains, and meet the optimum where the plant is well posed."""
+"""Lower bounds of H-infinity synthesis lie below every norm that a controller attains, and meet the optimum where the
+plant is well posed."""
 
 from dataclasses import replace
 
@@ -12,7 +13,8 @@ NOISES = (1e-7, 1e-6, 1e-5, 1e-4)
 
 
 def small_noise(noise=1e-6, dt=0.0):
-    """Two states, a cheap control and a nearly perfect measurement: fast and slow modes far apart in the Hamiltonian matrices."""
+    """Two states, a cheap control and a nearly perfect measurement: fast and slow modes far apart in the Hamiltonian
+    matrices."""
     A = np.array([[-0.5, -0.3], [1.1, 0.3]])
     A = A if dt == 0 else np.eye(2) + 0.3 * A
     C1, zero = [[1.1, -1.2], [0, 0]], np.zeros((2, 2))
@@ -36,7 +38,8 @@ def drawn(rng, dt, noise, penalty):
 
 
 def attained_by_others(plant):
-    """Smallest norm on the plant of controllers that were designed for noisier measurements and dearer controls, where rounding is no matter."""
+    """Smallest norm on the plant of controllers that were designed for noisier measurements and dearer controls, where
+    rounding is no matter."""
     best = np.inf
     for factor in (1e2, 1e4):
         for penalty in (1.0, factor):

@@ -70,7 +70,8 @@ def others(problem, found, rng, count=6):
 
 
 def test_a_lightly_damped_population():
-    """An open-loop observer guarantees 24.81, whatever the order of the shaping filters; the bound lies below, and is worth something."""
+    """An open-loop observer guarantees 24.81, whatever the order of the shaping filters; the bound lies below, and is
+    worth something."""
     case = stored("lightly_damped_population")
     nothing = certify(case, gain(np.zeros((4, 1)), case.nominal.dt))[0]
     assert nothing == pytest.approx(24.81, abs=0.005)
@@ -85,7 +86,8 @@ def test_a_lightly_damped_population():
 
 @pytest.mark.parametrize("angle", [0.4, 1.9, 3.0])
 def test_a_peak_between_the_points_of_the_grid_lowers_the_filter(angle):
-    """The filter exceeds the spectrum (a constant) at its resonance alone, which is a hundredth of the grid's step wide."""
+    """The filter exceeds the spectrum (a constant) at its resonance alone, which is a hundredth of the grid's step
+    wide."""
     case = small_problem()
     channels = Channels(case, design_grid(case), apart=True)
     peak = resonance(1 - 1e-5, angle, size=5.0, feed=0.5)
@@ -177,6 +179,10 @@ def test_a_wrong_riccati_solution_proves_nothing_false(monkeypatch, factor):
     assert found is None or found <= np.trace(Z @ P @ Z.T)
 
 
+TWO = block_diagonal([resonance(0.99, 1.0, 0.3, 0.1), gain([[0.2]], DT)])
+REST = gain([[0.1, 0.05], [0.0, 0.1]], DT)
+
+
 # --- whole designs
 
 
@@ -187,9 +193,9 @@ def test_a_wrong_riccati_solution_proves_nothing_false(monkeypatch, factor):
         {"injection": Injection.INPUT},
         {"W_L": resonance(0.999, 1.3, 0.4, 0.1)},
         {"form": "input_multiplicative", "W_R": resonance(0.995, 0.7, 2.0, 0.2)},
-        {"form": "additive", "W_L": block_diagonal([resonance(0.99, 1.0, 0.3, 0.1), gain([[0.2]], DT)]), "W_R": gain([[1.0], [0.5]], DT)},
+        {"form": "additive", "W_L": TWO, "W_R": gain([[1.0], [0.5]], DT)},
         {"form": "inverse_output_multiplicative", "W_L": FULL, "W_R": gain(np.eye(2), DT)},
-        {"remainder_left": gain([[0.1, 0.05], [0.0, 0.1]], DT), "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
+        {"remainder_left": REST, "remainder_right": gain([[1.0]], DT), "W_L": gain([[0.01]], DT)},
     ],
     ids=["plain", "input", "resonant", "resonant chain", "additive", "full weight", "correlated remainder"],
 )  # fmt: skip
@@ -284,7 +290,8 @@ def test_a_perturbation_that_is_held_keeps_what_is_proven(form):
 
 @pytest.mark.parametrize("size", [1e-4, 0.01, 0.3])
 def test_correlated_channels_stay_above_what_is_proven_as_matrices(size):
-    """The average of a set whose channels are correlated, at any place of an arc, minus the diagonal that is proven there: no negative eigenvalue."""
+    """The average of a set whose channels are correlated, at any place of an arc, minus the diagonal that is proven
+    there: no negative eigenvalue."""
     case = small_problem(form="inverse_output_multiplicative", W_L=FULL, W_R=gain(np.eye(2), DT))
     channels = Channels(case, design_grid(case), apart=True)
     rng = np.random.default_rng(2)
@@ -332,7 +339,8 @@ def test_filters_are_lowered_by_the_least_ratio_and_no_further():
 
 @pytest.mark.parametrize("pole", [1.0, 1.02, 3.0])
 def test_a_state_that_grows_but_is_seen_has_a_bound(pole):
-    """One unstable state, measured with noise: the scalar Riccati equation has a closed form, whatever drives the machine."""
+    """One unstable state, measured with noise: the scalar Riccati equation has a closed form, whatever drives the
+    machine."""
     q, r = 0.3, 0.7  # variances of what drives the state and of the measurement
     b = r * (1 - pole**2) - q
     error = (-b + np.sqrt(b**2 + 4 * q * r)) / 2  # p = pole^2 p r / (p + r) + q

@@ -1,4 +1,5 @@
-"""Mixed synthesis: the inequalities against Riccati optima and recomputed norms, on general plants and on drive-like observers."""
+"""Mixed synthesis: the inequalities against Riccati optima and recomputed norms, on general plants and on drive-like
+observers."""
 
 import re
 from dataclasses import replace
@@ -117,7 +118,8 @@ def by_clarabel(inequalities):
     return cp.Problem(cp.Minimize(inequalities.objective() @ x), constraints).solve(solver="CLARABEL")
 
 
-# Seed, states, gamma, and the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program, computed once).
+# Seed, states, gamma, and the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program,
+# computed once).
 SMALL = [
     (0, 2, 0.0822, 1.636558),
     (1, 3, 0.076, 0.1355849),
@@ -130,7 +132,8 @@ SMALL = [
 
 @pytest.mark.parametrize(("seed", "n", "gamma", "upper"), SMALL)
 def test_between_a_lower_bound_and_a_long_filter(seed, n, gamma, upper):
-    """One Lyapunov matrix for both channels costs at most half of the optimum here, and no controller is below the bound."""
+    """One Lyapunov matrix for both channels costs at most half of the optimum here, and no controller is below the
+    bound."""
     plant = two_channel(np.random.default_rng(seed), n=n)
     free, _ = free_optimum(plant)
     found = mixed(plant, gamma=gamma)
@@ -225,7 +228,8 @@ def test_truncation_error_is_within_its_bound():
 
 
 def fixed_at(c, share):
-    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it below c."""
+    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it
+    below c."""
     b = 0.5
     A, B1, C1 = np.diag([0.9, b]), np.zeros((2, 3)), np.zeros((3, 2))
     B1[0, 0] = C1[0, 0] = 1.0

@@ -1,4 +1,5 @@
-"""Worst-case H2: the certificate against brute force, quadrature against closed forms, the design against a game by hand."""
+"""Worst-case H2: the certificate against brute force, quadrature against closed forms, the design against a game by
+hand."""
 
 from importlib import import_module
 
@@ -175,7 +176,8 @@ def test_error_system_is_the_formula():
 @pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
 @pytest.mark.parametrize("seed", [0, 1])
 def test_certificate_covers_random_members_of_the_set(injection, seed):
-    """Simulate the definition itself: random plants G (I - W_L Delta W_R)^-1 per frequency, error density summed over a fine grid."""
+    """Simulate the definition itself: random plants G (I - W_L Delta W_R)^-1 per frequency, error density summed over
+    a fine grid."""
     case = problem(seed, injection)
     found = worst_case_h2(case)
     assert found.status is Status.CERTIFIED
@@ -204,7 +206,8 @@ def test_certificate_covers_random_members_of_the_set(injection, seed):
 
 
 def test_exact_when_the_set_is_a_scaled_identity():
-    """W_L = w I with scalar constants: the worst spectrum is white of size (w / (1 - w))^2, so the Kalman filter for it is the answer."""
+    """W_L = w I with scalar constants: the worst spectrum is white of size (w / (1 - w))^2, so the Kalman filter for
+    it is the answer."""
     w = 0.3
     case = problem(2, W_L=gain(w * np.eye(2), DT), W_R=gain(np.eye(2), DT))
     found = worst_case_h2(case, fit=lambda f, m, dt, **_: Fitted(gain([[m.max()]], dt)))
@@ -250,7 +253,8 @@ def test_process_noise_enters_design_and_certificate():
 
 @pytest.mark.parametrize(("radius", "refused"), [(0.999, False), (1.0, True), (1.5, True)])
 def test_a_design_alone_that_does_not_settle_is_refused(monkeypatch, radius, refused):
-    """Nothing certifies it, so the radius of its loop is all that stands between it and its user; on the circle it does not settle either."""
+    """Nothing certifies it, so the radius of its loop is all that stands between it and its user; on the circle it
+    does not settle either."""
     case = ObserverProblem(
         StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], DT),
         [[1.0]],

@@ -1,4 +1,4 @@
-"""The observer problem of an uncertain model: everything is taken over, and what does not belong together is refused."""
+"""The observer problem of an uncertain model: nothing is lost, and what does not belong together is refused."""
 
 from dataclasses import replace
 
@@ -66,11 +66,6 @@ def test_units_of_measure_change_nothing(models, uncertain):
 def test_models_of_another_population_are_refused(models, uncertain):
     with pytest.raises(SynthesisError, match="not the nominal that the uncertain set surrounds"):
         ObserverProblem.from_uncertain(replace(models, A=0.9 * models.A), uncertain, [1e-3])
-
-
-def test_a_nominal_that_is_no_unit_is_refused(models, uncertain):
-    with pytest.raises(SynthesisError, match="'pooled' is none of the models' units"):
-        ObserverProblem.from_uncertain(models, replace(uncertain, nominal_id="pooled"), [1e-3])
 
 
 def test_entrywise_weights_are_refused(models):

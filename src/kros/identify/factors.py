@@ -11,9 +11,9 @@ x, u : states (n_samples, n) and inputs (n_samples, m)
 g, v : parameter-free functions, sigma(w; q) = M(q) g(w) and gamma(u, w; q) = N(q) v(u, w) (see `lifting.Separation`)
 R    : upper triangular factor, (n_columns, n_columns)
 
-Everything is identified in channels divided by their ranges (`Ranges`), so that units of measure change nothing. With the
-ranges of the lifted states and of the inputs as diagonal matrices X and U, ``z = X^-1 x``, ``A_z = X^-1 A X`` and ``B_z =
-X^-1 B U``. Only a regularisation, a threshold or a penalty sees the difference.
+Everything is identified in channels divided by their ranges (`Ranges`), so that units of measure change nothing. With
+the ranges of the lifted states and of the inputs as diagonal matrices X and U, ``z = X^-1 x``, ``A_z = X^-1 A X`` and
+``B_z = X^-1 B U``. Only a regularisation, a threshold or a penalty sees the difference.
 """
 
 from __future__ import annotations

@@ -8,8 +8,8 @@ seen part gives c by least squares as soon as the machine turns,
           \hat\tau = \hat\tau_s + (\varphi - \psi)^T \hat c .
 
 A controller at its limit holds its integrator back. Where the total current comes out beyond the limit, the excess is
-taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from what c
-says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the
+taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from what
+c says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the
 unloaded machine needs.
 """
 

@@ -8,8 +8,8 @@ start, and with a leak, which keeps estimates from drifting, its high-passed par
 
 with the time T_l after which a constant load is forgotten.
 
-*The paper's estimate* (section IV-E.2) is the current's error of an observer of the unloaded machine under load, ``tau =
-K (i - i_hat)``. An observer that knows the current under load hides the load.
+*The paper's estimate* (section IV-E.2) is the current's error of an observer of the unloaded machine under load,
+``tau = K (i - i_hat)``. An observer that knows the current under load hides the load.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def known_load(
         Recorded; its second difference is low-passed without delay.
     sample_period_s : float
     moment : float
-        Mass times gravity times lever arm, in any unit of torque, or over the torque constant: then in units of current.
+        Mass times gravity times lever arm, in any unit of torque, or over the torque constant, in units of current.
     inertia : float
         Of the load, the same unit times s^2/rad.
     angle_rad : float

@@ -234,7 +234,7 @@ def refine_pooled(V: Array, problem: RefinementProblem, error: Array) -> Array:
 
 
 def _stabilised(V: Array, problem: RefinementProblem) -> Array:
-    """Bring a model inside the edge: by shorter rows of lifted functions, which free runs ignore, else by its penalty."""
+    """Bring a model inside the edge: by shorter rows of lifted functions, which free runs ignore, or by a penalty."""
     n, edged = problem.lifting.n_states, replace(problem, edged=True)
     if np.isfinite(problem.evaluate(V)).all():
         for share in np.linspace(1.0, 0.0, 21):

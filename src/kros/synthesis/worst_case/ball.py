@@ -1,6 +1,7 @@
 r"""The uncertain set per frequency: a matrix ball, its worst element and its average.
 
-With ``N = W_R W_L``, ``||N|| < 1`` and ``X = Delta (I - N Delta)^-1``, completing the square in ``||Delta|| <= 1`` gives
+With ``N = W_R W_L``, ``||N|| < 1`` and ``X = Delta (I - N Delta)^-1``, completing the square in ``||Delta|| <= 1``
+gives
 
     { X : ||Delta|| <= 1 } = { X_c + R_l Theta R_r : ||Theta|| <= 1 },
     X_c = N^H (I - N N^H)^-1,   R_l = (I - N^H N)^(-1/2),   R_r = (I - N N^H)^(-1/2).

@@ -9,8 +9,8 @@ it adds by the triangle inequality since the same input drives both. The noise i
 does that of the mean error ``bar e``, which a constant in the estimate leaves. Delta is any frequency-wise contraction,
 causal or not: the bound is for that set, and an upper bound for causal perturbations.
 
-The mean over the circle is taken on panels, logarithmic in frequency and refined around the poles, with a linear panel at
-DC. Each panel carries the Gauss-Legendre rules of 7 and 10 points; panels where these disagree most are halved.
+The mean over the circle is taken on panels, logarithmic in frequency and refined around the poles, with a linear panel
+at DC. Each panel carries the Gauss-Legendre rules of 7 and 10 points; panels where these disagree most are halved.
 """
 
 from __future__ import annotations

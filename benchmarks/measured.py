@@ -22,7 +22,7 @@ from kros.data import EpisodeBatch, Population, split_episodes
 from kros.design.estimators import make_learned
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Recordings, identify_estimator, run_observer
+from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
 from kros.study import Stage, load_config
 
 START = 50  # samples
@@ -44,13 +44,15 @@ def main() -> None:
         hidden = [i for i, name in enumerate(population.states) if name not in population.measured]
         found = []
         for unit in population.unit_ids:
-            found.append(errors(population, unit, lifting, hidden))
+            found.append(errors(population, unit, lifting, hidden, config.estimator))
             show(population, unit, hidden, found[-1])
         show(population, "mean", hidden, np.mean(found, axis=0))
         show(population, "worst", hidden, np.max(found, axis=0))
 
 
-def errors(population: Population, unit: str, lifting: Lifting, hidden: list[int]) -> np.ndarray:
+def errors(
+    population: Population, unit: str, lifting: Lifting, hidden: list[int], settings: EstimatorSettings
+) -> np.ndarray:
     """Return RMS errors on a unit left out, shape (hidden, 4): estimator and learned, of all samples and of the first."""
     others = population.select([u for u in population.unit_ids if u != unit])
     train = tuple(k for split in split_episodes(others).values() for k in split.train)
@@ -58,7 +60,7 @@ def errors(population: Population, unit: str, lifting: Lifting, hidden: list[int
     measured = tuple(population.states.index(name) for name in population.measured)
     recordings = Recordings.of(train, training.read_one)
     observer = identify_estimator(
-        "estimator", lifting, measured, population.inputs, recordings, population.sample_period_s
+        "estimator", lifting, measured, population.inputs, recordings, population.sample_period_s, settings=settings
     ).observer
     learned = make_learned(training, lifting, measured)
     test = [k for split in split_episodes(population.select([unit])).values() for k in split.test]

@@ -149,7 +149,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
 def test_a_gap_in_a_straight_line_is_bridged_exactly(exact, gap):
     observer = exact[0].observer
     assert observer.bank is not None
-    bank = replace(observer.bank, shares=np.zeros_like(observer.bank.shares), forget=np.ones(3), reach=np.zeros(1))
+    bank = replace(observer.bank, half=np.full(3, 1e12), forget=np.ones(3), reach=np.zeros(1))
     A, B = observer.A.copy(), observer.B.copy()
     A[-3:], B[-3:] = 0.0, 0.0  # inputs say nothing: the last measurement is held, and misses a straight line linearly
     observer = replace(observer, bank=bank, A=A, B=B)

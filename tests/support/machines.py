@@ -70,7 +70,7 @@ MACHINES = {
 
 
 def filters(functions=GEAR, cut=False):
-    """A filter bank with two filters, one of inputs alone, and shares of the fallback that rise with the level of losses."""
+    """A filter bank with two filters, one of inputs alone, and an age of gaps for every state."""
     parameters = ("phase",) if functions else ()
     fallback = tuple(f"{name}_from_inputs" for name in STATES)
     states = (*STATES, "filter_1", "filter_2", "input_filter_1", *fallback)
@@ -89,10 +89,8 @@ def filters(functions=GEAR, cut=False):
         2,
         start,
         np.array([0.99, 0.9, 0.5]),
-        5.0,
-        0.8,
-        np.array([0.0, 0.3, 1.0]),
-        np.array([[0, 0, 0], [0.5, 0.2, 1], [1, 0.4, 1]]),
+        np.array([5.0, 8.0, 2.0]),
+        np.array([0.8, 0.9, 0.99]),
         np.array([0.05]),
     )
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)

@@ -141,8 +141,8 @@ def test_an_observer_that_nobody_could_read_is_not_written(tmp_path: Path) -> No
 def filters(**changes: Any) -> Observer:
     """A filter bank of one filter, and no filter of inputs."""
     lifting = Lifting(("position", "filter_1", "position_from_inputs"), (), (), ("torque",), ("1",))
-    bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "half": 5.0, "recovery": 0.5} | changes
-    own = FilterBank(**{"levels": np.array([0.0, 1.0]), "shares": np.array([[0.0], [1.0]]), "reach": np.ones(1)} | bank)
+    bank = {"filters": 1, "start": np.ones((3, 5)), "forget": np.ones(1), "half": np.ones(1), "recovery": np.ones(1)}
+    own = FilterBank(**{**bank, "reach": np.ones(1)} | changes)
     none = gain(np.zeros((3, 1)), 0.01)
     return Observer(
         "f", lifting, 0.5 * np.eye(3), np.ones((3, 2)), (0,), ("torque",), none, Injection.STATE, 0.01, bank=own
@@ -161,7 +161,7 @@ def test_a_filter_bank_goes_through_its_file(tmp_path: Path) -> None:
     ("changes", "error", "match"),
     [
         ({"forget": np.array([1.5])}, DataError, "between 0 and 1"),
-        ({"levels": np.array([0.5, 0.5])}, DataError, "should increase"),
+        ({"half": np.zeros(1)}, DataError, "half positive"),
         ({"start": np.ones((2, 5))}, DimensionError, "start"),
         ({"filters": 4}, DimensionError, "at most 1 filters"),
     ],

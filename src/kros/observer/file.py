@@ -232,25 +232,12 @@ def _bank(found: Any, n: int, columns: int, measured: int, where: str) -> Filter
     if found is None:
         return None
     _known(found, FilterBank.__dataclass_fields__, f"{where}: filter_bank")
-    count = len(found["levels"]) if isinstance(found["levels"], list) else 0
     recorded = len(found["forget"]) if isinstance(found["forget"], list) else 0
-    shapes = {"forget": (1, recorded), "levels": (1, count), "reach": (1, measured)}
-    rows = {k: matrix([found[k]], shape, f"{where}: filter_bank.{k}")[0] for k, shape in shapes.items()}
+    counts = {"forget": recorded, "half": recorded, "recovery": recorded, "reach": measured}
+    rows = {k: matrix([found[k]], (1, count), f"{where}: filter_bank.{k}")[0] for k, count in counts.items()}
     start = matrix(found["start"], (n, columns), f"{where}: filter_bank.start")
-    shares = matrix(found["shares"], (count, recorded), f"{where}: filter_bank.shares")
     _require(type(found["filters"]) is int, f"{where}: filter_bank.filters should be a whole number", found["filters"])
-    for name in ("half", "recovery"):
-        _require(_is_finite(found[name]), f"{where}: filter_bank.{name} should be a number", found[name])
-    return FilterBank(
-        found["filters"],
-        start,
-        rows["forget"],
-        float(found["half"]),
-        float(found["recovery"]),
-        rows["levels"],
-        shares,
-        rows["reach"],
-    )
+    return FilterBank(found["filters"], start, **rows)
 
 
 def _guard(found: Any, n: int, order: int, where: str) -> Guard | None:

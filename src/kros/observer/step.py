@@ -155,13 +155,6 @@ class Steps:
             self._fresh &= False if moving is None else ~moving.all(axis=0)
         self._origins.follow(self.near)
 
-    def alternatives(self, y: Array, u: Array, missing: Flags) -> tuple[Array, Array, Array]:
-        """Take a step as a filter bank, and return what filters and fallback estimate, (batch, n) each, and the level (batch,)."""
-        gaps = self._gaps
-        assert gaps is not None
-        self.step(y, u, missing)
-        return gaps.filtered, gaps.expected, gaps.level
-
     def _guarded(self, moving: Flags | None) -> Flags | None:
         """Return which observers and machines take the step, shape (observer, batch): none that wait, and none that would leave the bounds."""
         following = self._following

@@ -254,9 +254,8 @@ class Source:
         own, o = self.observer.bank, self.observer
         if own is None:
             return None
-        first, places = len(o.recorded), list(o.measured)
+        first = len(o.recorded)
         z = slice(first, first + own.filters)
-        slopes = np.diff(own.shares, axis=0) / np.diff(own.levels)[:, None]
         return {
             "filters": own.filters,
             "first": first,
@@ -264,15 +263,12 @@ class Source:
             "start": self.sums(self.realised.start),
             "forget": self.numbers(own.forget),
             "reach": self.numbers(own.reach),
-            "half": self.precision.literal(own.half),
-            "recovery": self.precision.literal(own.recovery),
-            "levels": self.numbers(own.levels[:-1]),
-            "shares": self.matrix(own.shares[:-1]),
-            "slopes": self.matrix(slopes),
+            "half": self.numbers(own.half),
+            "recovery": self.numbers(own.recovery),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
             "one": self.precision.literal(1.0),
-            "measured": places,
+            "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
     def monitor(self) -> dict[str, Any] | None:

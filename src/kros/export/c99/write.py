@@ -164,7 +164,7 @@ def c_files(
         else sum(len(row) for key in ("model", "correction") for row in context["tracked"][key])
     )
     bank = context["bank"]
-    begins = 0 if bank is None else sum(map(len, bank["start"])) + 2 * sum(map(len, bank["shares"]))
+    begins = 0 if bank is None else sum(map(len, bank["start"])) + 3 * len(bank["forget"])
     watched = 0 if observer.monitor is None else observer.monitor.limits.size
     largest = (
         None
@@ -250,7 +250,7 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
         + context["delay"] * context["m"]
     )
     reals += context["n"] + context["order"] + 2 if context["tracked"] else 0
-    reals += context["recorded"] + 1 + context["q"] * (context["bank"]["filters"] + 1) if context["bank"] else 0
+    reals += 2 * context["recorded"] + context["q"] * (context["bank"]["filters"] + 1) if context["bank"] else 0
     reals += context["q"] * context["monitor"]["bands"] * 3 + 1 if context["monitor"] else 0
     words = context["m"] + sum(bool(context[name]) for name in ("delay", "monitor")) + 2
     words += 1 if context["monitor"] and context["monitor"]["conditions"] else 0

@@ -270,7 +270,7 @@ def assembled(
     model[at, at] += 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
-    bank = FilterBank(r, start, np.ones(n), 1.0, 0.0, np.array([0.0, 1.0]), np.zeros((2, n)), reach)
+    bank = FilterBank(r, start, np.ones(n), np.ones(n), np.zeros(n), reach)
     none = gain(np.zeros((len(A), len(channels.measured))), sample_period_s)
     own_values = {p: v for p, v in parameters.items() if p in widened.parameters}
     return Observer(
@@ -291,5 +291,5 @@ def assembled(
 def settle_samples(filters: Filters, fallback: Filters, bank: FilterBank | None) -> int:
     """Return the samples after which what a disturbance left is below one percent: five of the slowest time constants."""
     poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in (filters, fallback)]
-    slowest = max([*poles, bank.recovery if bank is not None else 0.0])
+    slowest = max([*poles, *(bank.recovery if bank is not None else ())])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

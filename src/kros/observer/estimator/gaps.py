@@ -1,4 +1,4 @@
-"""What training says of gaps: how fast a fallback forgets, and when it is better than the filters."""
+"""What training says of gaps: how fast the fallback forgets, and from which age on it is better than the filters."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ import numpy.typing as npt
 
 from ..filter_bank import FilterBank
 from ..observer import Observer
-from ..step import Steps
+from ..simulate import run_observer
 from .regression import Recordings
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+_NEVER = 1e12  # samples: an age that no gap has
 
 
 def training(
@@ -34,8 +35,6 @@ def training(
 
 def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> Array:
     """Return the factor rho of every recorded state by which its distance from the estimate of inputs alone persists from sample to sample."""
-    from ..simulate import run_observer
-
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
     n, at = len(observer.recorded), list(observer.measured)
     estimates = run_observer(observer, shown[..., at], inputs, observer.own(parameters))
@@ -51,72 +50,53 @@ def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSe
     return rhos[np.argmin(score, axis=0)]
 
 
-def losses(rng: np.random.Generator, shape: tuple[int, int, int]) -> Flags:
-    """Return which measurements are missing: independent or in bursts, differing from episode to episode; half of the time all arrive."""
-    n_samples, batch, _ = shape
-    missing = np.zeros(shape, dtype=bool)
+def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
+    """Return samples (n_samples, batch) that are missing: independently of one another, or in gaps of log-uniform lengths as those between them."""
+    missing = np.zeros((n_samples, batch), dtype=bool)
     for i in range(batch):
-        share, mean = rng.choice([0.1, 0.3, 0.5, 0.7, 0.9]), np.exp(rng.uniform(0, np.log(max(2, n_samples / 4))))
-        state = False
-        leave = 1 / max(mean, 1 / (1 - share)) if i % 2 else 1 - share
-        enter = leave * share / (1 - share) if i % 2 else share
-        chance = rng.random(n_samples)
-        for k in range(1, n_samples):
-            state = bool(chance[k] >= leave) if state else bool(chance[k] < min(enter, 1.0))
-            missing[k, i] = state
-        quiet = np.arange(n_samples) % max(8, n_samples // 4) < max(2, n_samples // 16)
-        missing[quiet, i] = False
+        if i % 2:
+            lengths = np.exp(rng.uniform(0, np.log(max(2, n_samples / 2)), n_samples)).astype(int)
+            missing[1:, i] = np.repeat(np.arange(n_samples) % 2 == 1, lengths)[: n_samples - 1]
+        else:
+            missing[1:, i] = rng.random(n_samples - 1) < rng.uniform(0.1, 0.95)
     return missing
 
 
 def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
-    """Return the filter bank with the forgetting, level and shares that make errors under simulated losses least."""
+    """Return the filter bank with the forgetting, and the ages of gaps that make errors of hidden states under simulated losses least."""
     bank = observer.bank
     assert bank is not None
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
     n, at = len(observer.recorded), list(observer.measured)
-    missing = losses(np.random.default_rng(settings.seed), shown[..., at].shape)
-    y = np.where(missing, np.nan, shown[..., at])
-    levels = np.append(0.0, np.geomspace(settings.lowest_level, 1.0, settings.levels))
-    bank = replace(
-        bank, forget=forgetting(observer, recordings, settings), levels=levels, shares=np.zeros((len(levels), n))
+    longest = settings.blocks(recordings.length)[-1]
+    missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
+    half = np.full(n, _NEVER)
+    half[at] = settings.half * longest
+    forget, recovery = (
+        forgetting(observer, recordings, settings),
+        np.exp(-1 / (longest * np.array(settings.recoveries))),
     )
-    tried = []
-    recovery = float(np.exp(-1 / max(1.0, settings.recovery * settings.longest)))
-    for half in settings.halves:
-        one = replace(bank, half=half * settings.longest, recovery=recovery)
-        main, fallback, level = alternatives(replace(observer, bank=one), y, inputs, parameters)
-        shares = best_shares(states, main, fallback, level, levels)
-        shares[:, at] = 0.0  # they stand for measurements, near the fallback
-        one = replace(one, shares=shares)
-        estimate = main + one.share(level) * (fallback - main)
-        error = np.mean((estimate - states)[level > 0] ** 2, axis=0)
-        tried.append((float(np.log(np.maximum(error, np.finfo(float).tiny)).mean()), one))
-    return min(tried, key=lambda pair: pair[0])[1]
+    silent = replace(observer, bank=replace(bank, forget=forget, half=half))
+    y = np.where(missing[..., None], np.nan, shown[..., at])
+    estimates = run_observer(silent, y, inputs, observer.own(parameters))
+    T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(longest * np.array(settings.halves), recovery))
+    errors = blended_errors(states, estimates[..., :n], estimates[..., -n:], missing, forget, T, mu)
+    best = np.argmin(errors, axis=0)
+    half, recovery = np.where(half == _NEVER, T[best, 0], half), mu[best, 0]
+    return replace(bank, forget=forget, half=half, recovery=recovery)
 
 
-def alternatives(observer: Observer, y: Array, u: Array, parameters: dict[str, Array]) -> tuple[Array, Array, Array]:
-    """Return what the filters and the fallback estimate under losses, (n_samples, batch, n) each, and the level (n_samples, batch)."""
-    n, batch = len(observer.recorded), y.shape[1]
-    steps = Steps([observer], batch, observer.values(observer.own(parameters), (batch,)))
-    steps.begin(y[0], u=u[0])
-    main, fallback, level = np.zeros((len(y), batch, n)), np.zeros((len(y), batch, n)), np.zeros((len(y), batch))
-    main[0] = fallback[0] = steps.x[0, :, :n]
-    for k in range(len(y) - 1):
-        main[k + 1], fallback[k + 1], level[k + 1] = steps.alternatives(y[k], u[k], ~np.isfinite(y[k]))
-    return main, fallback, level
-
-
-def best_shares(states: Array, main: Array, fallback: Array, level: Array, levels: Array) -> Array:
-    """Return shares between zero and one, none at level zero, that make ``main + beta(level) (fallback - main)`` closest to the states."""
-    hats = np.maximum(0.0, np.array([np.interp(level, levels, row) for row in np.eye(len(levels))[1:]]))
-    found = np.zeros((len(levels), states.shape[-1]))
-    for j in range(states.shape[-1]):
-        apart = fallback[..., j] - main[..., j]
-        X = (hats * apart).reshape(len(hats), -1)
-        t = (states[..., j] - main[..., j]).reshape(-1)
-        gram = X @ X.T
-        found[1:, j] = np.linalg.solve(
-            gram + 1e-9 * np.trace(gram) * np.eye(len(gram)) + 1e-300 * np.eye(len(gram)), X @ t
-        )
-    return np.clip(found, 0.0, 1.0)
+def blended_errors(
+    states: Array, filtered: Array, from_inputs: Array, missing: Flags, forget: Array, half: Array, recovery: Array
+) -> Array:
+    """Return the mean logarithms of the mean squared errors of episodes (c, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
+    x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
+    for k, lost in enumerate(missing[:-1]):
+        count = np.where(lost, count + 1, 0.0)
+        age = np.maximum(np.where(lost, age, recovery * age), count)
+        level = (age**2 / (age**2 + half**2))[..., None]
+        fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
+        x = filtered[k + 1] + level * (fallback - filtered[k + 1])
+        squares += (x - states[k + 1]) ** 2
+    return np.log(squares / len(missing) + np.finfo(float).tiny).mean(axis=1)

@@ -167,7 +167,7 @@ class Design:
 
     @cached_property
     def sample(self) -> tuple[Array, Array]:
-        """Thinned rows of the bank with every delay, and weights that sum to one."""
+        """Thinned rows of the bank, and weights that sum to one."""
         parts = list(self.rows(self.recordings.some(150), self.settings.sample))
         weights = np.concatenate([w for *_, w in parts])
         return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()

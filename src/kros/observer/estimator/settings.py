@@ -63,29 +63,31 @@ class EstimatorSettings(Settings):
         ge=1,
         description="how many times less an error of a measured state counts in the reduction than one of a hidden state",
     )
-    halves: tuple[float, ...] = Field(
-        (0.3, 1.0, 3.0, 10.0),
-        description="ages of a gap at level one half that are tried, in longest delays; the level decides how far the fallback counts",
-    )
-    recovery: float = Field(
-        0.3,
+    half: float = Field(
+        1.0,
         gt=0,
-        description="time constant in which the age of a gap falls when measurements return, in longest delays",
+        description="age of a gap in which what stands for a measurement comes half as near to the fallback, in longest delays",
+    )
+    halves: tuple[float, ...] = Field(
+        (0.3, 1.0, 3.0, 10.0, 100.0),
+        description="ages of a gap at which the fallback counts one half for a hidden state, in longest delays; training chooses",
+    )
+    recoveries: tuple[float, ...] = Field(
+        (0.3, 3.0, 30.0),
+        description="time constants in which the age of a gap falls when measurements return, in longest delays; training chooses",
     )
     room: float = Field(
         0.25,
         ge=0,
         description="share of its range in training by which the estimate of a hidden state may leave it; it is cut off there",
     )
-    levels: int = Field(8, ge=2, description="levels of a gap at which shares of the fallback are fitted")
-    lowest_level: float = Field(0.01, gt=0, lt=1, description="the lowest of these levels")
     reach: float = Field(
         0.25,
         ge=0,
         description="share of a measurement's range by which its estimate may differ from the fallback where it is missing",
     )
     gap_samples: int = Field(
-        2000, ge=100, description="samples of an episode on which losses are simulated in training"
+        20_000, ge=100, description="samples of an episode on which losses are simulated in training"
     )
     gap_episodes: int = Field(12, ge=1, description="episodes on which losses are simulated")
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")

@@ -56,7 +56,6 @@ def identify(
     test: Iterable[str] | None = None,
     on_nan: str = "error",
     calibration: PhaseCalibration | CalibrationSettings | Mapping[str, Any] | None = None,
-    facts: RecordingFacts | None = None,
     work: Work | None = None,
     **settings: Any,
 ) -> IdentifiedModels:
@@ -76,8 +75,6 @@ def identify(
         What is done with episodes that hold NaN or infinity.
     calibration : mapping or PhaseCalibration, optional
         How the lifting's parameter ``phase`` is calibrated, as ``[calibrate]`` of a study, or its known values.
-    facts : RecordingFacts, optional
-        Of a `survey` that was made already.
     work : Work, optional
         Where it runs.
     **settings
@@ -104,9 +101,8 @@ def identify(
     remedy = "read recordings with kros.read, or make a population of arrays with kros.from_arrays"
     require_kind(population, Population, "Identify", remedy)
     chosen, work = IdentifySettings.of(settings, "Identify"), work or Work()
-    if facts is None:
-        check_usable(population, test, identify_on, single_allowed=True)
-        population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
+    check_usable(population, test, identify_on, single_allowed=True)
+    population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
     known = calibration if isinstance(calibration, PhaseCalibration) else None
     declared = CalibrationSettings.of({} if known is not None else calibration or {}, "Calibrate")
     if not isinstance(lifting, Lifting):
@@ -114,16 +110,20 @@ def identify(
     spec = resolve_phase(declared, population, lifting) if known is None else None
     if spec is not None:
         known = calibrate(population, facts, spec, work)
-    base = IdentifiedModels(population, facts, lifting, known)
+    return with_models(IdentifiedModels(population, facts, lifting, known), chosen, work)
+
+
+def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) -> IdentifiedModels:
+    """Return surveyed recordings, with a known lifting and its calibration, with their models."""
     _check_conditions(base)
-    begun = {c: _begin(base, c, chosen, work) for c in base.conditions}  # refined while others are identified
+    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, Refinement]()
     for condition, (recorded, models, refining) in begun.items():
         better, refinements = refining()
         factors[condition] = recorded
         sets |= {base.place(m.name, condition): m for m in (*models, *better)}
         refined |= refinements
-    refined_kinds = tuple(kind.name for kind in kinds_for(lifting, refined=True)) if chosen.refine else ()
+    refined_kinds = tuple(kind.name for kind in kinds_for(base.lifting, refined=True)) if settings.refine else ()
     return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
 
 

@@ -66,7 +66,7 @@ class ModelSet:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the model's inputs, the columns of `B`: the recorded ones, then the lifting's input functions."""
+        """Names of the model's inputs, the columns of `B`: recorded inputs, then the lifting's input functions."""
         return self.recorded_inputs + self.lifting.input_functions
 
     @property

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from ...identify.identify import identify
+from ...identify.identified import IdentifiedModels
+from ...identify.identify import with_models
 from ..engine.context import Context
 from . import calibrate
 
 
 def run(context: Context) -> None:
     """Identify and save."""
-    found = identify(
-        context.population,
-        context.lifting,
-        calibration=calibrate.load(context),
-        facts=context.facts,
-        work=context.work,
-        **dict(context.config.identify),
-    )
-    found.save_models(context.store.draft())
+    base = IdentifiedModels(context.population, context.facts, context.lifting, calibrate.load(context))
+    with_models(base, context.config.identify, context.work).save_models(context.store.draft())

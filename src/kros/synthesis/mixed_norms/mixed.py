@@ -70,7 +70,7 @@ def mixed(
     ConfigError
         When an option is out of range.
     SynthesisError
-        When the plant is not regular, when gamma is shown to be out of reach (with the least that is not), or when the
+        When the plant is not regular, when gamma is proven to be out of reach (with the least that is not), or when the
         controller does not survive verification (with the reason).
 
     Examples

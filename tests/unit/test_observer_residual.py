@@ -54,7 +54,7 @@ def test_residual_that_can_be_predicted(tone):
 
 
 def test_no_residual():
-    with pytest.raises(SynthesisError, match="nothing to shape"):
+    with pytest.raises(SynthesisError, match="zero or not finite"):
         residual_h2(ResidualProblem(A, C, np.zeros((1, 65, 2, 2), complex), NOISE, SCALE, DT))
 
 

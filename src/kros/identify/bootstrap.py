@@ -35,16 +35,8 @@ Array = npt.NDArray[np.float64]
 class ModelSamples:
     """Models of resampled episodes around an estimate.
 
-    Parameters
-    ----------
-    unit_ids : tuple of str
-    estimate : KoopmanMatrices
-        A (unit, n, n) and B (unit, n, m).
-    samples : KoopmanMatrices
-        A (unit, draw, n, n) and B (unit, draw, n, m).
-    linear : bool
-        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a
-        response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
+    Samples that are `linear` are first-order steps: they have the right spread, but what follows from them nonlinearly,
+    such as a response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
 
     Examples
     --------
@@ -57,8 +49,8 @@ class ModelSamples:
     """
 
     unit_ids: tuple[str, ...]
-    estimate: KoopmanMatrices
-    samples: KoopmanMatrices
+    estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
+    samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
     linear: bool = False
 
     def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
@@ -116,11 +108,6 @@ def bootstrap_edmd(
     weights : ndarray, shape (unit, draw, episode)
         See `episode_weights`.
     unit_ids : sequence of str, optional
-        Numbers by default.
-
-    Returns
-    -------
-    ModelSamples
 
     Raises
     ------

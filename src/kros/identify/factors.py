@@ -41,15 +41,6 @@ _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 class Factor:
     """Reduced data of one or more episodes, or a batch of such reductions.
 
-    Parameters
-    ----------
-    R : ndarray, shape (..., n_columns, n_columns)
-    peak : ndarray, shape (..., n + n_basis + m + n_input_basis)
-        Largest magnitude of every column at k.
-    n_samples : ndarray, shape (...)
-    input_range : ndarray, shape (..., 2, m), optional
-        Smallest and largest value of every recorded input.
-
     Examples
     --------
     >>> import numpy as np
@@ -60,10 +51,10 @@ class Factor:
     ((2, 2), 147)
     """
 
-    R: Array
-    peak: Array
-    n_samples: npt.NDArray[np.int64]
-    input_range: Array | None = None
+    R: Array  # (..., n_columns, n_columns)
+    peak: Array  # (..., n + n_basis + m + n_input_basis), largest magnitude of every column at k
+    n_samples: npt.NDArray[np.int64]  # (...)
+    input_range: Array | None = None  # (..., 2, m), smallest and largest value of every recorded input
 
     @classmethod
     def stack(cls, factors: Sequence[Factor]) -> Factor:

@@ -114,17 +114,8 @@ def delays(names: Names, depth: Annotated[int, Field(ge=1, le=MAX_DELAY)]) -> Fo
 def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     """Return ``exp(-s**2/2)`` for every centre c, of the scaled distance ``s**2 = sum_i ((q_i - c_i)/length_i)**2``.
 
-    Parameters
-    ----------
-    names : sequence of str
-        Quantities, or formulas, that span the space; d of them.
-    centres : array_like, shape (n_centres, d)
-        In the units of the quantities; see `kmeans_centres`.
-    length : float or sequence of float, shape (d,)
-        Length scale of every quantity, in its unit.
+    Of d quantities, or formulas, the centres (n, d) and lengths, one or (d,), are in their units; see `kmeans_centres`.
 
-    Examples
-    --------
     >>> radial(["position", "velocity"], [[0.5, 0]], [0.1, 2])
     ('exp(-(((position - 0.5)/0.1)**2 + (velocity/2)**2)/2)',)
     """
@@ -140,13 +131,8 @@ def fourier_features(names: Names, n: Count, length: Lengths, seed: int) -> Form
 
     The kernel is ``exp(-s**2/2)`` with the scaled distance s, as in `radial`, whose other parameters it has too.
 
-    References
-    ----------
-    A. Rahimi and B. Recht, "Random features for large-scale kernel machines", Advances in Neural Information Processing
-    Systems 20, 2007.
+    Source: A. Rahimi and B. Recht, "Random features for large-scale kernel machines", NeurIPS 20, 2007.
 
-    Examples
-    --------
     >>> from kros.lifting import fourier_features
     >>> len(fourier_features(["angle", "rate"], n=20, length=[0.5, 2.0], seed=0))
     20
@@ -161,15 +147,10 @@ def fourier_features(names: Names, n: Count, length: Lengths, seed: int) -> Form
 
 @checked
 def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
-    """Return the means of n clusters, shape (n, d), the best of some starts, in units of standard deviations.
+    """Return the means of n clusters, shape (n, d), of data (n_samples, d), the best of some starts.
 
-    Parameters
-    ----------
-    data : array_like, shape (n_samples, d)
-    n, seed, starts : int
+    Distances count in units of standard deviations.
 
-    Examples
-    --------
     >>> from kros.lifting import kmeans_centres
     >>> sorted(kmeans_centres([[0.0], [0.2], [9.0], [9.2]], n=2, seed=0).round(9).ravel().tolist())
     [0.1, 9.1]

@@ -37,18 +37,6 @@ class LoadAndCurrent(NamedTuple):
 class AngleLoad:
     """Fill in the level of loads that are fixed to an angle.
 
-    Parameters
-    ----------
-    level_s : float, s
-        Of the load observer (`LoadSettings`).
-    sample_period_s : float
-    settling_s : float, s
-        Time at full swing (sin^2 of one half) after which half of c is used.
-    limit : float
-        Of the current; infinite where there is none.
-    trusted : float
-        Most that a load at the current's limit differs from what the angle says, as a share of the limit.
-
     Examples
     --------
     >>> import numpy as np
@@ -59,11 +47,11 @@ class AngleLoad:
     (3000, 1)
     """
 
-    level_s: float
+    level_s: float  # s; of the load observer (`LoadSettings`)
     sample_period_s: float
-    settling_s: float = 0.1
-    limit: float = np.inf
-    trusted: float = 0.5
+    settling_s: float = 0.1  # s; time at full swing (sin^2 of one half) after which half of c is used
+    limit: float = np.inf  # of the current
+    trusted: float = 0.5  # most that a load at the limit differs from what the angle says, as a share of the limit
 
     def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
         """Return loads and currents with their levels, for signals of shape (n_samples, batch).

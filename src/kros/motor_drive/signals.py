@@ -56,7 +56,6 @@ def known_load(
     Parameters
     ----------
     position : array_like, shape (n_samples, ...), rad
-        Recorded; its second difference is low-passed without delay.
     sample_period_s : float
     moment : float
         Mass times gravity times lever arm, in any unit of torque, or over the torque constant, in units of current.
@@ -65,7 +64,7 @@ def known_load(
     angle_rad : float
         Position at which the mass hangs at rest.
     corner_hz : float
-        Of the acceleration.
+        Up to which the second difference of the position counts, low-passed without delay.
 
     Examples
     --------

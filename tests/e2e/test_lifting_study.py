@@ -43,13 +43,7 @@ methods = ["worst_case_h2"]
 baselines = ["open_loop", "kalman_tuned"]
 """
 INPUTS = ("target_position", "target_velocity")
-GIVEN = (
-    "sin(100*position + phase)",
-    "current[-1]",
-    "target_velocity[-1]",
-    "current[-2]",
-    "target_velocity[-2]",
-)
+GIVEN = ("sin(100*position + phase)", "current[-1]", "target_velocity[-1]", "current[-2]", "target_velocity[-2]")
 INPUT_FUNCTIONS = ("current[-1]*target_velocity",)
 
 

@@ -19,11 +19,7 @@ from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 
 DELAYED = Lifting(
-    ("x", "i"),
-    ("sin(3*x + phase)", "x[-4]", "i[-1]*u[-3]"),
-    ("phase",),
-    ("u", "w"),
-    ("i*u", "cos(x[-2] + phase)*w"),
+    ("x", "i"), ("sin(3*x + phase)", "x[-4]", "i[-1]*u[-3]"), ("phase",), ("u", "w"), ("i*u", "cos(x[-2] + phase)*w")
 )
 
 

@@ -60,10 +60,7 @@ def test_generalized_plant_checks_its_shapes(one_state, changes, message):
 
 @pytest.mark.parametrize(
     ("controller", "message"),
-    [
-        (gain(np.eye(2), 1.0), "1 x 1 at 1.0 s, found 2 x 2"),
-        (gain([[1.0]], 0.5), "found 1 x 1 at 0.5 s"),
-    ],
+    [(gain(np.eye(2), 1.0), "1 x 1 at 1.0 s, found 2 x 2"), (gain([[1.0]], 0.5), "found 1 x 1 at 0.5 s")],
 )
 def test_closing_the_loop_checks_sizes_and_periods(one_state, controller, message):
     with pytest.raises(DimensionError, match=message):

@@ -26,11 +26,7 @@ def test_the_violated_assumption_is_named(one_state, changes, label):
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"tolerance": 0.0}, "tolerance should lie"),
-        ({"tolerance": 1.0}, "tolerance should lie"),
-    ],
+    ("options", "message"), [({"tolerance": 0.0}, "tolerance should lie"), ({"tolerance": 1.0}, "tolerance should lie")]
 )
 def test_options_are_checked(one_state, options, message):
     with pytest.raises(ConfigError, match=message):

@@ -26,15 +26,7 @@ from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
-from .factors import (
-    Factor,
-    Ranges,
-    combine,
-    lifted_factor,
-    reduce_episode,
-    require_excitation,
-    require_independent,
-)
+from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation, require_independent
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase

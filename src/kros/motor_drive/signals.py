@@ -136,12 +136,7 @@ class TorqueScale:
 
     @classmethod
     def calibrated(
-        cls,
-        error: npt.ArrayLike,
-        known: npt.ArrayLike,
-        sample_period_s: float,
-        corner_hz: float = 5.0,
-        skip: int = 300,
+        cls, error: npt.ArrayLike, known: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 300
     ) -> TorqueScale:
         """Return the scale from measured minus estimated current and the torque of a known load, (n_samples, ...).
 

@@ -64,7 +64,7 @@ def simulate(folder: Path, units: int, seconds: float) -> None:
     """Write recordings of drives; every block of them is drawn from a seed of its own."""
     from kros.core.artifacts import read_json
     from kros.data.population import EpisodeKey, Population, Unit
-    from kros.data.writers.parquet import write_group, write_index
+    from kros.data.readers.parquet import write_group, write_index
     from kros.plants import HarmonicDrivePopulation
 
     if (folder / "population.json").exists() and len(read_json(folder / "population.json")["units"]) == units:

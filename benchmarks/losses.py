@@ -1,4 +1,4 @@
-"""Random patterns of lost measurements on the deployed observers of finished runs.
+"""Random patterns of lost measurements on the observers of finished runs.
 
     python benchmarks/losses.py RUN RUN ... [--patterns 200]
 
@@ -47,12 +47,13 @@ def main() -> None:
     parser.add_argument("--patterns", type=int, default=200)
     options = parser.parse_args()
     for run in options.runs:
-        print(run, *tried(run, options.patterns))
+        print(run)
+        for file in [run / "observers" / "deployed.json", *sorted((run / "observers").glob("[!r]*/*.json"))]:
+            print(*tried(run, Observer.load(file), options.patterns), flush=True)
 
 
-def tried(run: Path, patterns: int) -> list[str]:
-    """Return what is printed of a run."""
-    observer = Observer.load(run / "observers" / "deployed.json")
+def tried(run: Path, observer: Observer, patterns: int) -> list[str]:
+    """Return what is printed of an observer."""
     facts = json.loads((run / "population" / "facts.json").read_text())
     population, identified = read_parquet(run / facts["recordings"]), IdentifiedModels.load(run)
     keys = [key for key in identified.facts.test if key.unit in identified.parameters]
@@ -61,7 +62,8 @@ def tried(run: Path, patterns: int) -> list[str]:
     batch = EpisodeBatch.read(population, chosen, LONGEST, identified.parameters)
     batch = batch.head(int(batch.lengths.min()))
     n, y = len(population.states), batch.states[..., list(observer.measured)]
-    settle = json.loads((run / "metrics.json").read_text())["observers"][observer.name]["design"]["settle_samples"]
+    designs = json.loads((run / "metrics.json").read_text())["observers"]
+    settle = designs[observer.name].get("settle_samples") or 5 * observer.guard.settle
     first = max(len(y) // 4, len(y) - settle)
     lost = np.stack([pattern(rng, len(y), first) for _ in chosen], axis=1)
     values = observer.own(batch.parameters)

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .core.memory import keep_freed_memory
+from .core.work import keep_freed_memory
 from .edge import NOT_MET, UNDECIDED, EdgeGroup, log_to_stderr
 
 app = typer.Typer(

@@ -1,4 +1,4 @@
-"""Every reader gives the same population: raw layout, Parquet, CSV with a mapping, arrays, a long frame, pykoop's array."""
+"""Every reader gives the same population: raw layout, Parquet, CSV, arrays, a long frame, pykoop's array."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -155,15 +155,6 @@ def test_reading_twice_gives_the_same_and_own_values(opened: Callable[[Path], Po
     np.testing.assert_array_equal(population.read(KEYS[0]), second)
 
 
-def test_arrays_given_away_are_protected() -> None:
-    mine = episode(KEYS[0])
-    population = from_arrays({KEYS[0]: mine}, CHANNELS, PERIOD)
-    with pytest.raises(ValueError, match="read-only"):
-        population.read(KEYS[0])[0, 0] = 1.0
-    mine[:] = 0.0
-    np.testing.assert_array_equal(population.read(KEYS[0]), episode(KEYS[0]))
-
-
 @pytest.mark.parametrize("opened", READERS.values(), ids=READERS.keys())
 def test_conversion_to_parquet_is_exact(opened: Callable[[Path], Population], tmp_path: Path) -> None:
     population = opened(tmp_path)
@@ -190,3 +181,12 @@ def test_simulated_drives_come_back_from_the_raw_layout(tmp_path: Path) -> None:
     for key in expected.episodes:
         worst = np.abs(back.read(key) - expected.read(key)).max(axis=0)
         assert np.all(worst < [1e-9, 1e-9, 1e-6, 1e-9, 1e-9])
+
+
+def test_arrays_given_away_are_protected() -> None:
+    mine = episode(KEYS[0])
+    population = from_arrays({KEYS[0]: mine}, CHANNELS, PERIOD)
+    with pytest.raises(ValueError, match="read-only"):
+        population.read(KEYS[0])[0, 0] = 1.0
+    mine[:] = 0.0
+    np.testing.assert_array_equal(population.read(KEYS[0]), episode(KEYS[0]))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError, KrosError
-from kros.core.work import Silent
+from kros.core.work import Progress
 from kros.data import Channel, EpisodeKey, Role, Unit, from_arrays, write_parquet
 from kros.data.population import OUTLIERS
 from kros.study import run as run_study
@@ -144,7 +144,7 @@ def left_in(out: Path) -> dict[str, bytes]:
     return found | {"metrics.json": json.dumps(metrics).encode()}
 
 
-class Ends(Silent):
+class Ends(Progress):
     """Ends a process when the first piece of a map in identification is done."""
 
     def __init__(self, process: subprocess.Popen[bytes]) -> None:

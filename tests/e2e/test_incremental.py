@@ -36,7 +36,8 @@ def computed(monkeypatch) -> dict[str, list[str]]:
     def counted(self: Work, title: str, function: Callable[..., Any], tasks: Sequence[Any]) -> Any:
         tasks = list(tasks)
         own = [task for _, task in tasks]  # behind its digest
-        found.setdefault(title, []).extend(task.unit if hasattr(task, "unit") else task[0].unit_ids[0] for task in own)
+        populations = [task[0] if isinstance(task, tuple) else task.population for task in own]
+        found.setdefault(title, []).extend(population.unit_ids[0] for population in populations)
         return map(function, tasks)
 
     monkeypatch.setattr(Work, "map", counted)

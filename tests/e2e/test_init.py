@@ -1,4 +1,4 @@
-"""`kros init` on folders as strangers have them: several dialects, oddities of spreadsheets, names in two languages; nothing is edited."""
+"""`kros init` on folders of many kinds: dialects, oddities of spreadsheets, names in two languages."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def european(path: Path, values: Array, period_s: float) -> None:
 
 
 def spreadsheet(path: Path, values: Array, period_s: float) -> None:
-    """A mark at the start, a title, quoted headers with delimiters in them, semicolons behind the numbers, timestamps, an empty line."""
+    """A mark at the start, a title, quoted headers, semicolons behind the numbers, timestamps, an empty line."""
     clock = [f"31.05.2024 12:00:{k * period_s:06.3f}".replace(".", ",") for k in range(len(values))]
     clock = [f"31.05.2024{c[10:]}" for c in clock]
     lines = ["Prüfstand 4;;;;", "", '"Uhrzeit";"Position [rad]";"Speed; motor [rad/s]";"Current [A]";"Voltage [V]"']

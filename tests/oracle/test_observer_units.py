@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from batches import batch_of
+from machines import filters
 
 from kros.core.linalg import least_squares
 from kros.core.lti import StateSpace
@@ -46,6 +47,18 @@ def test_estimates_in_other_sizes_are_the_same(injection, runtime):
     assert back.lifting == one.lifting
     for name in "AB":
         np.testing.assert_allclose(getattr(back, name), getattr(one, name), rtol=1e-12)
+
+
+def test_a_filter_bank_bridges_gaps_in_any_units():
+    one, rng = filters(), np.random.default_rng(0)
+    sizes = {"position": 0.01, "velocity": 60.0, "current": 3e3, "target": 7.0, "rate": 0.2}
+    y, u = rng.normal(size=(200, 3, 1)), rng.normal(size=(200, 3, 2))
+    y[20:60, 0], y[100:180, 1], y[rng.random((200, 3)) < 0.3] = np.nan, np.nan, np.nan
+    y[0] = 0.1
+    phase = {"phase": np.zeros(3)}
+    found = run_observer(in_sizes(one, sizes), y / sizes["position"], u / [sizes["target"], sizes["rate"]], phase)
+    wanted = run_observer(one, y, u, phase)[..., :3]
+    np.testing.assert_allclose(found[..., :3] * [0.01, 60.0, 3e3], wanted, rtol=1e-9, atol=1e-12)
 
 
 def test_a_correction_limit_goes_with_the_sizes():

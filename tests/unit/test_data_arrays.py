@@ -97,13 +97,6 @@ def test_arrays_that_do_not_fit(episode: Any, message: str) -> None:
         from_arrays({"a": [episode]}, CHANNELS, 0.1)
 
 
-def test_period_above_zero_and_unknown_key() -> None:
-    with pytest.raises(DataError, match="sampling period should be a number of seconds above zero, found 0"):
-        from_arrays({"a": [values(0)]}, CHANNELS, 0)
-    with pytest.raises(DataError, match=r"Asked for episode 9 of unit a \(default\)"):
-        from_arrays({"a": [values(0)]}, CHANNELS, 0.1).read(EpisodeKey("a", "default", "9"))
-
-
 def frame(**changes: Any) -> Any:
     pd = pytest.importorskip("pandas")
     rows = []
@@ -152,13 +145,6 @@ def test_pykoop_both_ways() -> None:
     assert to_pykoop(population).shape == (72, 4)
 
 
-def test_pykoop_rows_of_an_episode_may_be_scattered() -> None:
-    X = koopman_array()
-    shuffled = X[np.argsort(np.tile(np.arange(12), 3), kind="stable")]  # sample by sample instead of episode by episode
-    population = from_pykoop(shuffled, 1, 0.1)
-    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "3")), values(3))
-
-
 def test_pykoop_refuses() -> None:
     half = koopman_array()
     half[4, 0] = 0.5
@@ -171,3 +157,10 @@ def test_pykoop_refuses() -> None:
         from_pykoop({"a": koopman_array(), "b": koopman_array()[:, :3]}, 1, 0.1)
     with pytest.raises(DataError, match="mapping is empty"):
         from_pykoop({}, 1, 0.1)
+
+
+def test_pykoop_rows_of_an_episode_may_be_scattered() -> None:
+    X = koopman_array()
+    shuffled = X[np.argsort(np.tile(np.arange(12), 3), kind="stable")]  # sample by sample instead of episode by episode
+    population = from_pykoop(shuffled, 1, 0.1)
+    np.testing.assert_array_equal(population.read(EpisodeKey("0", "default", "3")), values(3))

@@ -6,23 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pytest
 
-from kros.data.arrow import fill, from_numpy, repeated
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.int64, np.int32])
-@pytest.mark.parametrize("n", [0, 1, 9])
-def test_numbers(dtype: type, n: int) -> None:
-    values = np.arange(2 * n, dtype=dtype)[::2]
-    assert from_numpy(values).equals(pa.array(values))
-
-
-@pytest.mark.parametrize("text", ["", "001011", "Größe"])
-def test_repeated_text(text: str) -> None:
-    array = repeated(text, 3)
-    array.validate(full=True)
-    assert array.to_pylist() == [text] * 3
+from kros.data.arrow import fill
 
 
 def test_fill_with_nulls_slices_and_chunks() -> None:

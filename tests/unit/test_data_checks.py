@@ -9,7 +9,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays
-from kros.data.checks import check_episode, check_period, check_population, scan_digests
+from kros.data.checks import check_episode, check_population, scan_digests
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")
@@ -37,17 +37,10 @@ def population(episodes: Any = None, units: tuple[Unit, ...] = ()) -> Population
 def test_non_finite(rows: slice, value: Any, found: str) -> None:
     bad = values()
     bad[rows, 1] = value
-    match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; fix the source or set data\.on_nan = \"drop_episode\"\.$"
+    advice = r"fix the source or set data\.on_nan = \"drop_episode\""
+    match = rf"^Episode 7 of unit 001011 \(load\): channel 'v' has {found}; {advice}\.$"
     with pytest.raises(DataError, match=match):
         check_episode(bad, KEY, CHANNELS)
-
-
-def test_an_input_may_be_held_and_a_machine_may_rest() -> None:
-    held, rest = values(), values()
-    held[:, 2] = 0.0
-    check_episode(held, KEY, CHANNELS)
-    rest[:] = 1.0, 2.5, 0.0
-    check_episode(rest, KEY, CHANNELS)
 
 
 @pytest.mark.parametrize("level", [0.0, 2.5, -1e9, 0.1])
@@ -76,11 +69,6 @@ def test_population_of_two_passes_and_one_does_not() -> None:
     with pytest.raises(DataError, match=r"at least two units .* found 1 \(a\).*--until identify"):
         check_population(one)
     check_population(one, allow_single=True)
-
-
-def test_outliers_do_not_count() -> None:
-    with pytest.raises(DataError, match=r"found 1 \(a\)"):
-        check_population(population(units=(Unit("b", "outliers"),)))
 
 
 def test_nothing_measured() -> None:
@@ -112,7 +100,7 @@ def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
     stuck = [np.tile([0.0, 2.5, 1.0], (20, 1)), np.tile([1.0, later, 1.0], (30, 1))]
     with pytest.raises(
         DataError,
-        match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check the sensor",
+        match=r"Unit a \(default\): state 'x' stays where it is in each of 2 episodes, in the first at 0; check",
     ):
         scan_digests(population({"a": stuck}))
 
@@ -142,7 +130,9 @@ def test_a_sample_that_cannot_be_computed_with_is_located(value: float) -> None:
         check_episode(bad, KEY, CHANNELS)
 
 
-@pytest.mark.parametrize("period", [1e-60, 1e60, 10**400])
-def test_a_period_that_cannot_be_computed_with_is_refused(period: float) -> None:
-    with pytest.raises(DataError, match="sampling period"):
-        check_period(period, "Population")
+def test_an_input_may_be_held_and_a_machine_may_rest() -> None:
+    held, rest = values(), values()
+    held[:, 2] = 0.0
+    check_episode(held, KEY, CHANNELS)
+    rest[:] = 1.0, 2.5, 0.0
+    check_episode(rest, KEY, CHANNELS)

@@ -76,16 +76,6 @@ def test_mapping_from_a_toml_file(folder: Path, tmp_path: Path) -> None:
     assert read_csv_folder(folder, str(path)).channels == read_csv_folder(folder, MAPPING).channels
 
 
-def test_exclude_and_group(folder: Path) -> None:
-    population = read_csv_folder(folder, mapping(exclude="_10|warm"))
-    assert [(k.unit, k.episode) for k in population.episodes] == [("a", "1"), ("a", "2"), ("b", "1"), ("b", "2")]
-    write(folder / "outliers" / "c_1.csv", samples(9))
-    grouped = read_csv_folder(
-        folder, mapping(files=r"(?P<group>outliers)?/?(?P<unit>[abc])[/_]\w*?(?P<episode>\d+)\.csv", exclude="warm")
-    )
-    assert [(u.id, u.group) for u in grouped.units] == [("a", ""), ("b", ""), ("c", "outliers")]
-
-
 def test_several_units_in_one_file(tmp_path: Path) -> None:
     values = np.column_stack([samples(0), samples(1)[:, 1:]])
     write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2")
@@ -120,12 +110,6 @@ def test_tab_separated_without_header(tmp_path: Path) -> None:
     table["channel"] = [{**CHANNEL[0], "column": 4}, channel[1]]
     with pytest.raises(DataError, match=r"a_1\.tsv: column 4 is asked for, found 3 columns"):
         read_csv_folder(tmp_path, table)
-
-
-def test_mapping_with_preparation_and_metadata(folder: Path) -> None:
-    population = read_csv_folder(folder, mapping(prepare=[{"step": "trim", "start": 10}], metadata={"gear_ratio": 50}))
-    assert population.read(population.episodes[0]).shape == (40, 2)
-    assert population.metadata["gear_ratio"] == 50
 
 
 def read_first(folder: Path, unit: str = "a") -> Population:
@@ -202,7 +186,7 @@ def test_another_rate(folder: Path) -> None:
         ({"files": "(?P<run>a)"}, "names the group 'run'; known groups are unit, condition, episode, group"),
         ({"time": None}, "one of time and sample_period_s"),
         ({"sample_period_s": 0.1}, "one of time and sample_period_s"),
-        ({"time": 0}, "numbered from 1, found 0"),
+        ({"time": 0}, "greater than or equal to 1, found 0"),
         ({"header": False}, "leaves columns without names, found 't'"),
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
@@ -217,29 +201,6 @@ def test_another_rate(folder: Path) -> None:
 def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         read_csv_folder(folder, mapping(**changes))
-
-
-def test_mapping_file_refuses(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="there is no such file"):
-        read_csv_folder(tmp_path, tmp_path / "mapping.toml")
-    (tmp_path / "mapping.toml").write_text("files = ")
-    with pytest.raises(ConfigError, match="not a TOML file"):
-        read_csv_folder(tmp_path, tmp_path / "mapping.toml")
-
-
-def test_states_alone_without_a_role_state_are_refused(folder: Path) -> None:
-    with pytest.raises(DataError, match="at least one channel with role 'state'"):
-        read_csv_folder(folder, mapping(channel=[CHANNEL[0]]))
-
-
-def test_files_that_cannot_be_read(folder: Path) -> None:
-    population = read_csv_folder(folder, MAPPING)
-    (folder / "b" / "cold_1.csv").unlink()
-    with pytest.raises(DataError, match=r"b/cold_1\.csv: .*there is no such file"):
-        population.read(EpisodeKey("b", "cold", "1"))
-    (folder / "b" / "cold_1.csv").write_bytes("t,pos,Größe\n".encode("latin-1"))
-    with pytest.raises(DataError, match=r"b/cold_1\.csv: its first line is not UTF-8"):
-        read_csv_folder(folder, MAPPING)
 
 
 def test_one_unit_in_two_groups(tmp_path: Path) -> None:

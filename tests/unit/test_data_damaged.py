@@ -1,4 +1,4 @@
-"""Recordings that are no recordings, or not those they are said to be: refused with a reason, in bounded time and memory."""
+"""Recordings that are none, or not those they are said to be: refused with a reason, in bounded time and memory."""
 
 import gzip
 import json
@@ -20,7 +20,6 @@ from kros.data import (
     EpisodeKey,
     Role,
     from_arrays,
-    from_frame,
     from_pykoop,
     prepare,
     read,
@@ -52,7 +51,7 @@ def scan(folder: Path, **mapping: Any) -> Any:
     return found
 
 
-# ------------------------------------------------------------------------------------------------------------------------- files of text
+# ------------------------------------------------------------------------------------------------- files of text
 @pytest.mark.parametrize(
     ("content", "found"),
     [
@@ -80,12 +79,6 @@ def test_text_that_is_no_table(tmp_path: Path, content: bytes, found: str) -> No
     (tmp_path / "a.csv").write_bytes(content)
     with pytest.raises(DataError, match=found):
         scan(tmp_path)
-
-
-def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(b'made "on monday\nby, me\n' + GOOD)
-    found = scan(tmp_path, skip_rows=2)
-    assert found.read(found.episodes[0])[1, 0] == pytest.approx(np.sin(1), abs=1e-4)
 
 
 def bomb(path: Path, line: bytes, megabytes: int) -> None:
@@ -138,30 +131,17 @@ def test_recordings_that_are_no_files(tmp_path: Path, layout: str, kind: str) ->
 def test_names_that_no_table_can_show(tmp_path: Path) -> None:
     with open(os.fsencode(tmp_path) + b"/\xff\xfea.csv", "wb") as file:
         file.write(GOOD)
-    with pytest.raises(DataError, match="UTF-8"):
+    with pytest.raises(DataError, match="printable"):
         scan(tmp_path, files=r"(?P<unit>.+)\.csv")
 
 
-# ---------------------------------------------------------------------------------------------------------------- periods, cut-offs, names
+# -------------------------------------------------------------------------------------- periods, cut-offs, names
 @pytest.mark.parametrize("period", [0, -0.01, float("nan"), float("inf"), "0.01", None, True])
 def test_periods_that_are_none(period: Any) -> None:
     with pytest.raises(DataError, match="sampling period should be a number of seconds above zero"):
         from_arrays({"a": [samples(0)]}, CHANNELS, period)
     with pytest.raises(DataError):
         from_pykoop(np.column_stack([np.zeros(80), samples(0)]), 1, period)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("time_scale", 0), ("time_scale", -1), ("time_scale", float("nan"))],
-)
-def test_numbers_of_a_mapping(tmp_path: Path, key: str, value: Any) -> None:
-    with pytest.raises(ConfigError, match=key):
-        read(tmp_path.parent, "csv", mapping={**MAPPING, key: value})
-    without = {k: v for k, v in MAPPING.items() if k != "time"}
-    for period in (0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ConfigError, match="sample_period_s"):
-            read(tmp_path.parent, "csv", mapping={**without, "sample_period_s": period})
 
 
 @pytest.mark.parametrize("cutoff", [0.0, -1.0, 50.0, 51.0, float("nan"), float("inf")])
@@ -188,7 +168,7 @@ def test_names_that_are_none(name: str) -> None:
         prepare(from_arrays({"a": [samples(0)]}, CHANNELS, 0.01), [steps.Differentiate("x", name, 5.0)])
 
 
-# --------------------------------------------------------------------------------------------------------------------------- in memory
+# ----------------------------------------------------------------------------------------------------- in memory
 @pytest.mark.parametrize(
     "values",
     [samples(0).astype(complex), samples(0).astype(str), samples(0).astype("datetime64[s]"), [[1, "2", 3]] * 9],
@@ -198,19 +178,7 @@ def test_arrays_that_hold_no_numbers(values: Any) -> None:
         from_arrays({"a": [values]}, CHANNELS, 0.01)
 
 
-def test_frames_that_hold_no_numbers() -> None:
-    import pandas as pd
-
-    good = pd.DataFrame(samples(0), columns=["x", "v", "u"]).assign(unit="a")
-    from_frame(good, CHANNELS, sample_period_s=0.01)
-    for kind in ("complex128", "str", "datetime64[ns]"):
-        with pytest.raises(DataError, match="column 'v' should hold numbers"):
-            from_frame(good.assign(v=good["v"].astype(kind)), CHANNELS, sample_period_s=0.01)
-    with pytest.raises(DataError, match="column 'v' occurs 2 times"):
-        from_frame(pd.concat([good, good[["v"]]], axis=1), CHANNELS, sample_period_s=0.01)
-
-
-# ------------------------------------------------------------------------------------------------------------------------------- Parquet
+# ------------------------------------------------------------------------------------------------------- Parquet
 @pytest.fixture
 def stored(tmp_path: Path) -> Path:
     write_parquet(
@@ -277,7 +245,7 @@ def test_files_elsewhere_are_not_read(stored: Path) -> None:
         read_parquet(stored)
 
 
-# -------------------------------------------------------------------------------------------------------------- copies, stuck, periods
+# ---------------------------------------------------------------------------------------- copies, stuck, periods
 @pytest.mark.parametrize(
     "copied",
     [
@@ -313,6 +281,7 @@ def test_a_speed_that_is_no_slope_is_said(scale: float) -> None:
     assert "'v' is the slope of 'x'" in found[0]
 
 
-def test_samples_too_far_apart_are_said() -> None:
-    noise = np.random.default_rng(0).standard_normal((500, 3))
-    assert "changes by more than" in period_alerts(noise, CHANNELS, 0.01)[0]
+def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_bytes(b'made "on monday\nby, me\n' + GOOD)
+    found = scan(tmp_path, skip_rows=2)
+    assert found.read(found.episodes[0])[1, 0] == pytest.approx(np.sin(1), abs=1e-4)

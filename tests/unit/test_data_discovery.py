@@ -12,8 +12,7 @@ from kros.core.errors import DataError
 from kros.data.discovery.dialect import look_at
 from kros.data.discovery.discover import discover
 from kros.data.discovery.filenames import infer_names
-from kros.data.discovery.measures import identifier, split_header
-from kros.data.discovery.roles import kind_of, time_scale
+from kros.data.discovery.roles import identifier, kind_of, split_header, time_scale
 
 UNITS, EPISODES = range(1, 4), range(1, 4)
 
@@ -136,7 +135,7 @@ def test_hostile_layouts_are_read_as_people_do_or_asked_about(paths, first, unit
 )
 def test_units_of_measure_in_headers(header, name, unit):
     found = split_header(header)
-    assert (found.name, found.unit) == (name, unit)
+    assert found == (name, unit)
 
 
 def test_names_of_channels_may_stand_in_formulas():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, from_arrays, read, write_parquet, write_raw
+from kros.data import Channel, Role, from_arrays, prepare, read, write_parquet, write_raw
 from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
 from kros.data.readers.opening import detect_reader
 
@@ -24,9 +24,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("sources")
     rng = np.random.default_rng(0)
     drives = {u: {"load": [rng.standard_normal((1050, 5)) for _ in range(2)]} for u in ("000001", "000002")}
-    channels = CHANNELS
-    for step in STEPS:
-        channels = step.channels_after(channels)
+    channels = prepare(from_arrays({"a": [np.ones((2, 5))]}, CHANNELS, 1e-3), STEPS).channels
     write_raw(from_arrays(drives, channels, 1e-3), root / "motor-drive-raw")
     write_parquet(
         from_arrays({u: [rng.standard_normal((9, 1))] for u in "ab"}, (Channel("x", Role.STATE, measured=True),), 0.1),
@@ -51,11 +49,6 @@ def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
     assert len(named.unit_ids) == 2
     assert found.episodes == named.episodes
     assert named.read(named.episodes[0]).shape[1] == len(named.channels)
-
-
-@pytest.mark.parametrize("name", ["empty", "other", "missing"])
-def test_nothing_fits(folders: Path, name: str) -> None:
-    assert detect_reader(folders / name) is None
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Names, selections and the split."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -64,16 +63,6 @@ def test_split_by_name_and_its_refusals() -> None:
         split_episodes(whole, ["0", "1", "2", "3"])
     with pytest.raises(DataError, match=r"unit a \(hot\) into training and test needs at least two, found 1"):
         split_episodes(population({("a", "hot"): 1}))
-
-
-@dataclass(frozen=True)
-class Counter:
-    """A source of another package, which knows nothing of preparation."""
-
-    start: float
-
-    def __call__(self, key: EpisodeKey) -> np.ndarray:
-        return self.start + np.arange(20.0).reshape(10, 2)
 
 
 def test_order_of_what_is_given_does_not_matter(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
-from kros.data.recording import Recording, estimate_period
 from kros.data.steps import Resample, lowpass
 
 KEY = EpisodeKey("a", "default", "0")
@@ -21,13 +20,6 @@ def population(values: np.ndarray, period: float = 0.1) -> Population:
 def counting(n: int = 10) -> np.ndarray:
     k = np.arange(n, dtype=float)
     return np.column_stack([k, 100 + k, 200 + k])
-
-
-def test_scale_touches_its_channels_and_their_unit() -> None:
-    scaled = prepare(population(counting()), [steps.Scale(("x",), 0.5, "rad")])
-    np.testing.assert_array_equal(scaled.read(KEY), counting() * [0.5, 1, 1])
-    assert [c.unit for c in scaled.channels] == ["rad", "", ""]
-    assert scaled.channels[0].measured
 
 
 @pytest.mark.parametrize("lag", [0, 1, 3, -1, -3])
@@ -79,7 +71,7 @@ def test_resampling_straight_lines_is_exact_at_any_rate() -> None:
     time = uneven(0.01, 500, 1)
     lines = np.column_stack([3 * time + 1, -time, 0 * time])
     for period in (0.004, 0.01, 0.025, 0.1):
-        result = Resample(period).resampled(time, lines, 0.01)
+        result = Resample(period).on_grid(time, lines, 0.01)
         grid = time[0] + period * np.arange(len(result))
         assert grid[-1] <= time[-1] + 1e-9 < grid[-1] + period + 1e-6
         np.testing.assert_allclose(result, np.column_stack([3 * grid + 1, -grid, 0 * grid]), atol=1e-12)
@@ -88,7 +80,7 @@ def test_resampling_straight_lines_is_exact_at_any_rate() -> None:
 def test_resampling_keeps_slow_and_removes_what_would_alias() -> None:
     time = np.arange(0, 20, 0.001)
     slow, fast = np.sin(2 * np.pi * 3 * time), np.sin(2 * np.pi * 97 * time)  # 97 Hz aliases to 3 Hz at 50 Hz
-    result = Resample(0.02).resampled(time, np.column_stack([slow, fast]), 0.001)
+    result = Resample(0.02).on_grid(time, np.column_stack([slow, fast]), 0.001)
     middle = slice(50, -50)
     np.testing.assert_allclose(
         result[middle, 0], np.sin(2 * np.pi * 3 * 0.02 * np.arange(len(result)))[middle], atol=5e-3
@@ -192,10 +184,3 @@ def test_steps_from_toml() -> None:
 def test_steps_from_toml_refuse(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         steps.parse_steps([table])
-
-
-@pytest.mark.parametrize("jitter", [0.0, 1e-12, 1e-5, 0.3])
-def test_the_period_is_the_median_step_in_six_digits(jitter):
-    steps = 1e-3 * (1 + jitter * np.random.default_rng(0).uniform(-1, 1, 501))
-    recording = Recording(KEY, np.zeros((502, 1)), np.concatenate([[5.0], 5.0 + np.cumsum(steps)]))
-    assert estimate_period(recording) == float(f"{np.median(np.diff(recording.time_s)):.6g}")

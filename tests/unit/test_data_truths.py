@@ -9,21 +9,10 @@ import pytest
 
 from kros.core.artifacts import read_json
 from kros.core.errors import DataError
-from kros.data import (
-    Channel,
-    EpisodeBatch,
-    Population,
-    Role,
-    from_arrays,
-    prepare,
-    read,
-    steps,
-    write_parquet,
-)
+from kros.data import Channel, EpisodeBatch, Population, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.prepare import scale_population
 from kros.data.readers.parquet import read_parquet
 from kros.data.survey import survey
-from kros.plants import PLANTS
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 TRUTH = Channel("v_true", Role.TRUTH, of="v")
@@ -110,19 +99,3 @@ def test_a_truth_is_that_of_one_state(wrong: tuple[Channel, ...]) -> None:
     rng = np.random.default_rng(0)
     with pytest.raises(DataError, match="with `of` which state"):
         from_arrays({"a": [rng.standard_normal((9, 3 + len(wrong)))]}, (*CHANNELS, *wrong), 0.1)
-
-
-@pytest.mark.parametrize("plant", ["harmonic-drive", "dc-motor"])
-def test_a_simulated_velocity_is_the_slope_of_the_position(plant: str) -> None:
-    """Its integral never leaves the measured position by more than a count and what the trapezium leaves out."""
-    population = PLANTS[plant](n_units=1, n_episodes=1, seconds=4.0, seed=5).simulate().population
-    states, true = (
-        a[0]
-        for a in (
-            population.read_parts(population.episodes[0]),
-            population.read_with_truths(population.episodes[0])[1:],
-        )
-    )
-    position, velocity = states[:, 0], true[:, 0]
-    travelled = np.concatenate([[0.0], np.cumsum(velocity[1:] + velocity[:-1])]) * population.sample_period_s / 2
-    assert np.abs(position - position[0] - travelled).max() < 1e-3 * np.ptp(position)

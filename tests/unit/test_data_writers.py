@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from kros.core.errors import ConfigError, DataError
 from kros.core.locks import locked
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
-from kros.data.readers.parquet import read_parquet
-from kros.data.writers.parquet import group_file, write_group, write_index
+from kros.data.readers.parquet import group_file, read_parquet, write_group, write_index
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
 
@@ -179,20 +178,22 @@ def test_damaged_folders(tmp_path: Path) -> None:
         read_parquet(out)
 
 
-def test_what_a_killed_writer_left_goes_and_what_it_moved_aside_comes_back(tmp_path: Path) -> None:
-    out, left = tmp_path / "population", tmp_path / ".population.kros"
-    for folder in (left / "new", left / "old"):
-        folder.mkdir(parents=True)
-        (folder / "half").write_text("done")
-    with pytest.raises(DataError, match="not empty"):
+def test_what_a_killed_writer_left_goes_and_two_at_once_are_refused(tmp_path: Path) -> None:
+    out, left = tmp_path / "population", tmp_path / ".kros.population"
+    (left / "draft").mkdir(parents=True)
+    (left / "draft" / "half").write_text("done")
+    with locked(left), pytest.raises(ConfigError, match="is at work in it"):
         write_parquet(population(), out)
-    assert (out / "half").exists()
-    assert not left.exists()
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["population"]
+    write_parquet(population(), out)
+    assert [p.name for p in tmp_path.iterdir()] == ["population"]
+    assert not (out / "half").exists()
 
 
-def test_a_folder_that_is_being_written_is_refused(tmp_path: Path) -> None:
-    (tmp_path / ".population.kros").mkdir()
-    with locked(tmp_path / ".population.kros"), pytest.raises(ConfigError, match="is at work in it"):
-        write_parquet(population(), tmp_path / "population")
-    write_parquet(population(), tmp_path / "population")
+def test_an_episode_is_read_once_and_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
+    for name, units in (("one", ("a",)), ("two", ("b", "a"))):
+        write_parquet(population(units), tmp_path / name)
+    found, key = read_parquet(tmp_path / "one"), EpisodeKey("a", "cold", "0")
+    first = found.read(key)
+    assert found.read(key) is first
+    (tmp_path / "two" / "a@cold.parquet").replace(tmp_path / "one" / "a@cold.parquet")
+    np.testing.assert_array_equal(found.read(key), population(("b", "a")).read(key))

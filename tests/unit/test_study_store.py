@@ -8,9 +8,8 @@ import pytest
 
 import kros
 from kros.core.errors import ConfigError, DataError
-from kros.core.results import Results, packed, unpacked
 from kros.core.store import digest_of
-from kros.core.work import Work
+from kros.core.work import Results, Work, packed, unpacked
 from kros.study.engine.store import Store
 
 

@@ -2,32 +2,38 @@
 
 An artifact is a folder with `arrays.npz` (no pickle) and `<kind>.json` (readable, with a schema version and a checksum
 of both). Files appear whole or not at all: they are written beside their place and moved there. What was changed since
-is not read: a file that was edited on purpose is accepted once its key ``checksum`` is removed, and its reader checks it.
+is not read. A file that was edited on purpose is accepted once its key ``checksum`` is removed; its reader checks it.
 """
 
 from __future__ import annotations
 
-import dataclasses
-import datetime
-import enum
 import hashlib
+import io
 import json
 import math
-import os
-import tempfile
-from collections.abc import Mapping
+import struct
+import tokenize
+import zipfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from . import limits
-from .archive import pack_arrays, unpack_arrays
-from .errors import DataError
-from .files import TEMPORARY, read_bytes, shortened
+from .errors import DataError, KrosError
+from .files import read_bytes, shortened, write_bytes
 
+T = TypeVar("T")
 SCHEMA = 1
 CHECKSUM = "checksum"
+_AGAIN = "write it again with the step that made it"
+_ENDING = ".npy"
+_DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
+_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError)  # of bytes that were changed
 
 
 class LoadedContent(dict[Any, Any]):
@@ -38,45 +44,21 @@ class LoadedContent(dict[Any, Any]):
         self.path = path
 
     def __missing__(self, key: Any) -> Any:
-        raise DataError(
-            f"Reading {self.path}: key {key!r} is missing, found {shortened(str(list(self)))}; write it again with "
-            "this version."
-        )
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file so that a reader sees the old content or the new, never half of it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+        problem = f"key {key!r} is missing, found {shortened(str(list(self)))}"
+        raise DataError(f"Reading {self.path}: {problem}; write it again with this version.")
 
 
 def plain(value: Any) -> Any:
-    """Turn dataclasses, enums, NumPy scalars and arrays into JSON's own types; NaN and infinity become null."""
-    if isinstance(value, enum.Enum):
-        return plain(value.value)
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if value is None or isinstance(value, str | int):
-        return value
-    if isinstance(value, Mapping):
-        return {key if type(key) is str else str(plain(key)): plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+    """Turn dataclasses, enums, dates and NumPy's arrays into JSON's own types; NaN and infinity become null."""
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=_plain)
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
-        return plain(value.tolist())
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, datetime.date | datetime.time):  # of TOML
-        return value.isoformat()
-    return str(value) if isinstance(value, Path) else value
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"{type(value).__name__} is not JSON serializable")
 
 
 def json_bytes(content: Any) -> bytes:
@@ -98,21 +80,15 @@ def read_json(path: Path) -> Any:
         return LoadedContent(content, path)
 
     try:
-        return json.loads(text.decode(), object_hook=loaded, parse_constant=_refuse, parse_float=_finite)
+        return json.loads(text.decode(), object_hook=loaded, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
-        raise DataError(
-            f"Reading {path}: not valid JSON ({shortened(str(error))}); write it again with the step that made it."
-        ) from error
-
-
-def _refuse(constant: str) -> Any:
-    raise ValueError(f"{constant} is not a number of JSON")
+        raise DataError(f"Reading {path}: not valid JSON ({shortened(str(error))}); {_AGAIN}.") from error
 
 
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text} is too large")
+        raise ValueError(f"{text} is not a number of JSON")
     return value
 
 
@@ -129,15 +105,49 @@ def with_checksum(content: Mapping[str, Any]) -> dict[str, Any]:
 
 def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
     """Refuse content of `read_json` that is not what its checksum says; False where it has none."""
-    if CHECKSUM not in content:
-        return False
-    if content[CHECKSUM] != _digest(content):
-        raise DataError(
-            f"Reading {path}: the content does not fit its checksum, so it was changed or damaged since it was "
-            "written; write it again, or "
-            f'remove the key "{CHECKSUM}" where it was edited on purpose.'
-        )
-    return True
+    if CHECKSUM in content and content[CHECKSUM] != _digest(content):
+        problem = "the content does not fit its checksum, so it was changed or damaged since it was written"
+        advice = f'write it again, or remove the key "{CHECKSUM}" where it was edited on purpose'
+        raise DataError(f"Reading {path}: {problem}; {advice}.")
+    return CHECKSUM in content
+
+
+def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Return an .npz of arrays, without pickle and not compressed."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}{_ENDING}", date_time=(1980, 1, 1, 0, 0, 0)), content.getvalue())
+    return buffer.getvalue()
+
+
+def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
+    """Return what `pack_arrays` packed."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
+            return {info.filename.removesuffix(_ENDING): _array(info, archive) for info in archive.infolist()}
+    except _DAMAGED as error:
+        problem = f"not a valid archive of arrays ({error or type(error).__name__})"
+        raise DataError(f"Reading {path}: {problem}; write it again with the step that made it.") from error
+
+
+def _array(info: zipfile.ZipInfo, archive: zipfile.ZipFile) -> np.ndarray:
+    """Return one array, whose header states as many bytes as there are."""
+    name = info.filename
+    if not name.endswith(_ENDING) or info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
+        raise ValueError(f"{name!r} is compressed, which kros never does, or not an array")
+    content = archive.read(info)  # checks the CRC
+    file = io.BytesIO(content)
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"{name!r} has a header of another version")
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
+    start, count = file.tell(), math.prod(shape)
+    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(content) - start:
+        raise ValueError(f"{name!r} holds {len(content) - start} bytes, {dtype} of shape {shape} would not")
+    values = np.frombuffer(content, dtype, count, start).reshape(shape, order="F" if fortran else "C")
+    return np.array(values, order="K")
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -172,10 +182,8 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     content = read_json(path)
     about = (content.get("schema"), content.get("kind")) if isinstance(content, dict) else None
     if about != (SCHEMA, kind):
-        raise DataError(
-            f"Loading {kind} from {folder}: schema and kind should be {(SCHEMA, kind)}, found {about}; write it again "
-            "with this version of kros."
-        )
+        problem = f"schema and kind should be {(SCHEMA, kind)}, found {about}"
+        raise DataError(f"Loading {kind} from {folder}: {problem}; write it again with this version of kros.")
     check_checksum(content, path)
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
@@ -183,8 +191,44 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
         return content, LoadedContent({}, archive)
     packed = _read(archive, limits.MAX_ARRAYS_BYTES)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
-        raise DataError(
-            f"Reading {archive}: it is not the file that {path.name} was written with; write both again with the step "
-            "that made them."
-        )
+        problem = f"it is not the file that {path.name} was written with"
+        raise DataError(f"Reading {archive}: {problem}; write both again with the step that made them.")
     return content, LoadedContent(unpack_arrays(packed, archive), archive)
+
+
+@contextmanager
+def as_written(what: str, path: Path) -> Iterator[None]:
+    """Turn what content of the wrong kind does to the code that reads it into one error."""
+    try:
+        yield
+    except KrosError:
+        raise
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, np.linalg.LinAlgError) as error:
+        reason = f"{type(error).__name__}: {shortened(str(error))}"
+        raise DataError(f"Loading {what} from {path}: not as kros writes it ({reason}); {_AGAIN}.") from error
+
+
+def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
+    """Wrap a ``load(cls, path)`` in `as_written`; applied below ``@classmethod``."""
+
+    @wraps(load)
+    def guarded(cls: Any, path: Any) -> T:
+        with as_written(cls.__name__, Path(path)):
+            return load(cls, path)
+
+    return guarded
+
+
+def check_shapes(
+    arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], sizes: Mapping[str, int], path: Path
+) -> None:
+    """Check arrays against named axes, a letter each."""
+    known = dict(sizes)
+    for name, letters in axes.items():
+        shape, dtype = arrays[name].shape, arrays[name].dtype
+        if len(shape) == len(letters):
+            known = dict(zip(letters, shape, strict=True)) | known
+        if dtype.kind not in "biufc" or shape != tuple(known[letter] for letter in letters if letter in known):
+            expected = tuple(known.get(letter, letter) for letter in letters)
+            wanted = f"{name} should hold numbers of shape {expected}"
+            raise DataError(f"Reading {path}: {wanted}, found {dtype} of shape {shape}.")

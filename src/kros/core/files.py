@@ -1,18 +1,22 @@
-"""Files from outside: opened only when they are regular files, read up to a limit, parsed with one kind of error."""
+"""Files: opened only when they are regular, read up to a limit, parsed with one kind of error, written whole."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import stat
+import tempfile
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
+from .locks import locked
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -21,8 +25,7 @@ _KINDS = {
     stat.S_IFCHR: "a device",
     stat.S_IFBLK: "a device",
 }
-TEMPORARY = ".kros."
-"""How names begin of what is beside its place until it is whole."""
+TEMPORARY = ".kros."  # how names begin of what is beside its place until it is whole
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 
 
@@ -34,34 +37,93 @@ def is_file(path: Path) -> bool:
         return False
 
 
+def stamp_of(path: Path) -> tuple[int, int]:
+    """Return size and time of change of a file."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
 def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) -> None:
     """Refuse what is not a regular file, or a larger one than is ever read."""
     try:
         status = path.stat()
-    except FileNotFoundError as found:
-        raise error(f"Reading {path}: there is no such file; check the path.") from found
-    except (OSError, ValueError) as found:
-        raise error(f"Reading {path}: {found}; check the path and the permissions.") from found
+    except FileNotFoundError as missing:
+        raise error(f"Reading {path}: there is no such file; check the path.") from missing
+    except (OSError, ValueError) as failure:
+        raise error(f"Reading {path}: {failure}; check the path and the permissions.") from failure
     if not stat.S_ISREG(status.st_mode):
         kind = _KINDS.get(stat.S_IFMT(status.st_mode), "not a regular file")
         raise error(f"Reading {path}: a regular file is needed, found {kind}; copy its content to a file first.")
     if status.st_size > limit:
-        raise error(
-            f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; split it, or raise the "
-            "limit in kros.core.limits."
-        )
+        advice = "split it, or raise the limit in kros.core.limits"
+        raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; {advice}.")
 
 
 def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> bytes:
     """Return the content of a regular file of at most `limit` bytes."""
     require_regular(path, limit, error)
     try:
-        with path.open("rb") as file:
-            return file.read(
-                min(limit, os.fstat(file.fileno()).st_size) + 1
-            )  # Python makes room for as much as is asked for
-    except OSError as found:
-        raise error(f"Reading {path}: {found}; check the file and its permissions.") from found
+        with path.open("rb") as file:  # Python allocates as much as is asked for
+            return file.read(min(limit, os.fstat(file.fileno()).st_size) + 1)
+    except OSError as failure:
+        raise error(f"Reading {path}: {failure}; check the file and its permissions.") from failure
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees the old content or the new, never half of it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            file.write(content)
+        os.chmod(name, 0o644)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def draft_beside(folder: Path) -> Iterator[Path]:
+    """Give the path of a draft in a folder, to be moved to its place; what is not moved is removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder, ignore_cleanup_errors=True) as temporary:
+        os.chmod(temporary, 0o755)  # workers of a cluster may be other users
+        yield Path(temporary, "draft")
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """Give a folder to fill, which is moved to `out` at the end, or removed when anything fails."""
+    out = out.absolute()
+    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
+        raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
+    work = out.with_name(f"{TEMPORARY}{out.name}")
+    draft = work / "draft"
+    work.mkdir(parents=True, exist_ok=True)
+    try:
+        with locked(work):
+            shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed
+            try:
+                draft.mkdir()
+                yield draft
+                with suppress(FileNotFoundError):
+                    out.rmdir()
+                draft.replace(out)
+            finally:
+                shutil.rmtree(draft, ignore_errors=True)
+    finally:
+        with suppress(OSError):  # another process has begun
+            work.rmdir()
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Put a file in a second place: the same file where the file system can, else a copy with its times."""
+    target.unlink(missing_ok=True)
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
@@ -70,7 +132,8 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     try:
         return parse_toml(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
-        raise ConfigError(f"{what} {path}: not a TOML file that can be used ({_said(error)}); correct it.") from error
+        reason = "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
+        raise ConfigError(f"{what} {path}: not a TOML file that can be used ({reason}); correct it.") from error
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -81,19 +144,19 @@ def parse_toml(text: str) -> dict[str, Any]:
     tables = tomllib.loads(text)
     level: list[Any] = [tables]
     for _ in range(limits.MAX_TOML_DEPTH):
-        level = [
-            v
-            for item in level
-            for v in (item.values() if isinstance(item, dict) else item)
-            if isinstance(v, (dict, list))
-        ]
+        inside = (value for item in level for value in (item.values() if isinstance(item, dict) else item))
+        level = [value for value in inside if isinstance(value, (dict, list))]
     if level:
         raise ValueError(f"tables or lists are nested more than {limits.MAX_TOML_DEPTH} deep")
     return tables
 
 
-def _said(error: BaseException) -> str:
-    return "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
+def pass_on_shortage(error: BaseException, path: Path) -> None:
+    """Raise a shortage of memory as such, unless a damaged file states a size far beyond what it holds."""
+    if isinstance(error, MemoryError):
+        wanted = [int(digits) for digits in re.findall(r"\d{1,30}", str(error))]
+        if max(wanted, default=0) <= limits.RATIO_FROM_BYTES + limits.MAX_RATIO * path.stat().st_size:
+            raise MemoryError(f"{str(error) or 'no details'}, while {path} was read") from error
 
 
 def shortened(text: str, longest: int = 300) -> str:

@@ -21,10 +21,8 @@ _WIDEST = 0.5  # of Nyquist: where the grid of a recording of a few samples begi
 def nyquist_hz(sample_period_s: float) -> float:
     """Return half the sampling frequency, Hz."""
     if not sample_period_s > 0:
-        raise ConfigError(
-            f"Nyquist frequency: the sampling period should be positive, found {sample_period_s} s; only discrete "
-            "systems have one."
-        )
+        problem = f"the sampling period should be positive, found {sample_period_s} s"
+        raise ConfigError(f"Nyquist frequency: {problem}; only discrete systems have one.")
     return 0.5 / sample_period_s
 
 
@@ -33,17 +31,11 @@ def log_grid(
 ) -> Array:
     """Return logarithmically spaced frequencies up to the Nyquist frequency, shape (n_freqs,), Hz."""
     if n_freqs < 2 or not decades > 0:
-        raise ConfigError(
-            f"Frequency grid: needs at least two frequencies over a positive number of decades, found {n_freqs} over "
-            f"{decades}."
-        )
+        wanted = "at least two frequencies over a positive number of decades"
+        raise ConfigError(f"Frequency grid: needs {wanted}, found {n_freqs} over {decades}.")
     top = nyquist_hz(sample_period_s)
     low = top * 10.0**-decades
     if longest_s is not None:
-        if not longest_s > 0:
-            raise ConfigError(
-                f"Frequency grid: the longest recording should have a positive length, found {longest_s} s."
-            )
         low = min(max(low, 1 / longest_s), _WIDEST * top)
     grid = np.geomspace(low, top, n_freqs)
     grid[-1] = top
@@ -55,20 +47,14 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
     freqs = np.atleast_1d(np.asarray(freqs_hz, dtype=float))
     top = np.inf if sample_period_s is None else nyquist_hz(sample_period_s)
     if freqs.ndim != 1 or freqs.size == 0 or not np.isfinite(freqs).all():
-        raise ConfigError(
-            f"Frequency grid: needs a list of finite frequencies in Hz, found shape {freqs.shape} with "
-            f"{np.isnan(freqs).sum()} NaN."
-        )
+        problem = f"found shape {freqs.shape} with {np.isnan(freqs).sum()} NaN"
+        raise ConfigError(f"Frequency grid: needs a list of finite frequencies in Hz, {problem}.")
     if np.any(np.diff(freqs) <= 0) or freqs[0] < 0 or (sample_period_s is None and freqs[-1] == 0):
-        raise ConfigError(
-            f"Frequency grid: frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz; "
-            "sort them and drop doubles."
-        )
+        problem = f"frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz"
+        raise ConfigError(f"Frequency grid: {problem}; sort them and drop doubles.")
     if freqs[-1] > top * (1 + 1e-12):
-        raise ConfigError(
-            f"Frequency grid: {freqs[-1]} Hz is above the Nyquist frequency {top} Hz of the sampling period "
-            f"{sample_period_s} s; end the grid there."
-        )
+        limit = f"the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s"
+        raise ConfigError(f"Frequency grid: {freqs[-1]} Hz is above {limit}; end the grid there.")
     return freqs
 
 

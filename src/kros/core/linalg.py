@@ -49,8 +49,7 @@ def balancing(
 ) -> tuple[npt.NDArray[Any], npt.NDArray[Any], npt.NDArray[Any]]:
     """Balance the Gramians ``R R'`` and ``S S'``: left, right, ``left @ right = I``, and the Hankel singular values.
 
-    The balanced state is ``left x``; Gramians are never formed, so states that matter little keep their digits. Values
-    below a share of the largest are left out.
+    The balanced state is ``left x``. Values below a share of the largest are `negligible`.
     """
     U, values, Vh = np.linalg.svd(S.T @ R, full_matrices=False)
     k = int(np.sum(values > negligible * values.max(initial=0.0)))

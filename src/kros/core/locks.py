@@ -6,7 +6,6 @@ import errno
 import logging
 import os
 import socket
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -14,24 +13,16 @@ from pathlib import Path
 
 from .errors import ConfigError
 
+try:
+    import fcntl
+except ImportError:  # Windows, where a locked file cannot be read
+    fcntl = None  # type: ignore[assignment]
+
 log = logging.getLogger(__name__)
 
 NAME = ".kros.lock"
 _BUSY = {errno.EACCES, errno.EAGAIN, errno.EDEADLK}
 _READ_ONLY = {errno.EACCES, errno.EPERM, errno.EROFS}
-
-if sys.platform == "win32":
-
-    def _take(handle: int, shared: bool) -> None:
-        """On Windows a locked file cannot be read."""
-        raise OSError(errno.ENOLCK, "none on Windows")
-
-else:
-    import fcntl
-
-    def _take(handle: int, shared: bool) -> None:
-        """Lock a file for all readers together, or for one writer."""
-        fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
 
 
 @contextmanager
@@ -58,6 +49,13 @@ def locked(folder: Path, shared: bool = False) -> Iterator[None]:
         os.close(handle)
 
 
+def _take(handle: int, shared: bool) -> None:
+    """Lock a file for all readers together, or for one writer."""
+    if fcntl is None:
+        raise OSError(errno.ENOLCK, "none on Windows")
+    fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+
+
 def _open(path: Path, shared: bool) -> int:
     """Open and lock a file, again where its last holder has just removed it."""
     while True:
@@ -74,7 +72,6 @@ def _open(path: Path, shared: bool) -> int:
                 return handle
             holder = os.read(handle, 200).decode(errors="replace") or "another process"
             os.close(handle)
-            raise ConfigError(
-                f"Folder {path.parent}: {holder} is at work in it; wait until it ends, or name another folder."
-            ) from error
+            advice = "wait until it ends, or name another folder"
+            raise ConfigError(f"Folder {path.parent}: {holder} is at work in it; {advice}.") from error
         os.close(handle)

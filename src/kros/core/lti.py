@@ -25,15 +25,13 @@ Array = npt.NDArray[Any]
 def real_array(name: str, values: Any) -> Array:
     """Return a matrix of doubles, or say by name what else was found."""
     if np.iscomplexobj(values):
-        raise DimensionError(
-            f"{name} should be a matrix of real numbers, found complex ones; take the real part if that is meant."
-        )
+        advice = "take the real part if that is meant"
+        raise DimensionError(f"{name} should be a matrix of real numbers, found complex ones; {advice}.")
     try:
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
-        raise DimensionError(
-            f"{name} should be a matrix of real numbers, found {type(values).__name__}: {error}."
-        ) from error
+        problem = f"found {type(values).__name__}: {error}"
+        raise DimensionError(f"{name} should be a matrix of real numbers, {problem}.") from error
 
 
 def sampling_period(name: str, dt: Any) -> float:
@@ -43,10 +41,8 @@ def sampling_period(name: str, dt: Any) -> float:
     except (TypeError, ValueError):
         period = -1.0
     if not 0 <= period < np.inf:
-        raise DimensionError(
-            f"{name}: the sampling period should be a number of seconds, not negative, 0 for continuous time; found "
-            f"{dt!r}."
-        )
+        wanted = "should be a number of seconds, not negative, 0 for continuous time"
+        raise DimensionError(f"{name}: the sampling period {wanted}; found {dt!r}.")
     return period
 
 
@@ -89,30 +85,20 @@ class StateSpace:
         expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
         for name, shape in expected.items():
             if getattr(self, name).shape[-2:] != shape:
-                found = {key: getattr(self, key).shape for key in "ABCD"}
-                raise DimensionError(
-                    f"State space: {name} should end in shape {shape}, found {found}; transpose or pad the offending "
-                    "matrix."
-                )
+                shapes = {key: getattr(self, key).shape for key in "ABCD"}
+                problem = f"{name} should end in shape {shape}, found {shapes}"
+                raise DimensionError(f"State space: {problem}; transpose or pad the offending matrix.")
 
     @classmethod
     def of(cls, system: Any) -> StateSpace:
-        """Return any object with `A, B, C, D, dt` as a `StateSpace`; a period of None is that of a continuous system.
-
-        Raises
-        ------
-        DimensionError
-            When an attribute is missing.
-        """
+        """Return any object with `A, B, C, D, dt` as a `StateSpace`; a period of None means continuous time."""
         if isinstance(system, cls):
             return system
         try:
             return cls(system.A, system.B, system.C, system.D, 0.0 if system.dt is None else system.dt)
         except AttributeError as error:
-            raise DimensionError(
-                f"State space: needs a system with A, B, C, D and dt, found {type(system).__name__} ({error}); "
-                "convert it first."
-            ) from error
+            problem = f"needs a system with A, B, C, D and dt, found {type(system).__name__} ({error})"
+            raise DimensionError(f"State space: {problem}; convert it first.") from error
 
     @property
     def n_states(self) -> int:
@@ -136,10 +122,8 @@ class StateSpace:
 
     def __getitem__(self, index: Any) -> StateSpace:
         """Return one system, or a smaller batch, of a batch."""
-        shape = self.batch_shape
-        A, B, C, D = (
-            np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in (self.A, self.B, self.C, self.D)
-        )
+        shape, matrices = self.batch_shape, (self.A, self.B, self.C, self.D)
+        A, B, C, D = (np.broadcast_to(matrix, shape + matrix.shape[-2:])[index] for matrix in matrices)
         return StateSpace(A, B, C, D, self.dt)
 
     def poles(self) -> Array:
@@ -161,34 +145,21 @@ class StateSpace:
         return np.all(np.abs(poles) < 1 if self.dt > 0 else poles.real < 0, axis=-1)
 
     def frequency_response(self, freqs_hz: npt.ArrayLike) -> Array:
-        """Evaluate the transfer matrix on the unit circle (or imaginary axis).
-
-        Parameters
-        ----------
-        freqs_hz : array_like, shape (n_freqs,), Hz
-
-        Returns
-        -------
-        ndarray, shape (..., n_freqs, p, m), complex
-        """
+        """Return the transfer matrix on the unit circle (or imaginary axis), shape (..., n_freqs, p, m), complex."""
         s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
         # zeta = z - 1 keeps full relative precision at low frequency, where z and A are both close to one.
         zeta = np.expm1(s * self.dt) if self.dt > 0 else s
         eye = np.eye(self.n_states)
         shifted = self.A - eye if self.dt > 0 else self.A
         resolvent = zeta[:, None, None] * eye - shifted[..., None, :, :]
-        states = np.linalg.solve(
-            resolvent, np.broadcast_to(self.B[..., None, :, :] + 0j, (*resolvent.shape[:-1], self.n_inputs))
-        )
-        return self.C[..., None, :, :] @ states + self.D[..., None, :, :]
+        B = np.broadcast_to(self.B[..., None, :, :] + 0j, (*resolvent.shape[:-1], self.n_inputs))
+        return self.C[..., None, :, :] @ np.linalg.solve(resolvent, B) + self.D[..., None, :, :]
 
     def __matmul__(self, other: StateSpace) -> StateSpace:
         """Series connection `self * other`: the input passes through `other` first."""
         if self.n_inputs != other.n_outputs or self.dt != other.dt:
-            raise DimensionError(
-                f"Series connection: {self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at "
-                f"{other.dt} s; match sizes and sampling periods."
-            )
+            sizes = f"{self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at {other.dt} s"
+            raise DimensionError(f"Series connection: {sizes}; match sizes and sampling periods.")
         zero = np.zeros((other.n_states, self.n_states))
         return StateSpace(
             np.block([[self.A, self.B @ other.C], [zero, other.A]]),
@@ -244,10 +215,8 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
     from scipy.linalg import block_diag
 
     if not systems or len({s.dt for s in systems}) > 1:
-        raise DimensionError(
-            f"Block diagonal: needs systems with one sampling period, found {[s.dt for s in systems]} s; resample "
-            "first."
-        )
+        periods = [s.dt for s in systems]
+        raise DimensionError(f"Block diagonal: needs one sampling period, found {periods} s; resample first.")
 
     def stack(blocks: list[Array]) -> Array:
         rows, cols = sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)

@@ -38,29 +38,24 @@ def as_state_space(system: Any) -> StateSpace:
     """Return one system as `StateSpace`; anything with `A, B, C, D, dt` will do."""
     system = StateSpace.of(system)
     if system.batch_shape:
-        raise DimensionError(
-            f"System norm: needs one system, found a batch of shape {system.batch_shape}; index it, for example "
-            "system[0]."
-        )
+        problem = f"needs one system, found a batch of shape {system.batch_shape}"
+        raise DimensionError(f"System norm: {problem}; index it, for example system[0].")
     if not all(np.isfinite(getattr(system, name)).all() for name in "ABCD"):
-        raise KrosError(
-            "System norm: the state-space matrices contain NaN or infinity; look at the step that built them."
-        )
+        raise KrosError("System norm: the matrices contain NaN or infinity; look at the step that built them.")
     return system
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Gramian of a stable pair, ``P = A P A^T + B B^T`` by doubling; ``A P + P A^T + B B^T = 0`` for ``dt = 0``."""
-    Q = B @ B.T
+    """Gramian of a stable pair, ``P = A P A' + B B'`` by doubling; ``A P + P A' + B B' = 0`` for ``dt = 0``."""
+    power, P = A, B @ B.T
     if dt == 0:
         from scipy.linalg import solve_continuous_lyapunov
 
-        return solve_continuous_lyapunov(A, -Q)
-    power, P = A, Q
+        return np.asarray(solve_continuous_lyapunov(A, -P))
     for _ in range(_MAX_ITERATIONS):
         step = power @ P @ power.T
         P = P + step
-        if np.abs(step).max(initial=0.0) <= 1e-17 * np.abs(P).max(initial=0.0):
+        if np.abs(step).max(initial=0.0) <= _EPSILON * np.abs(P).max(initial=0.0):
             break
         power = power @ power
     return (P + P.T) / 2
@@ -69,8 +64,8 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
 def gramian_root(A: Array, B: Array, dt: float) -> Array:
     """Return R with ``R R'`` the controllability Gramian of a stable pair, shape (n, at most n) in discrete time.
 
-    Discrete time. ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor: ``R_2k`` is the triangle of ``[R_k,
-    A^k R_k]``. Poles near one cost a few more doublings and no accuracy.
+    Discrete time: ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor, ``R_2k`` is the triangle of
+    ``[R_k, A^k R_k]``. Poles near one cost a few more doublings and no accuracy.
     """
     if dt == 0:
         values, vectors = np.linalg.eigh(gramian(A, B, dt))
@@ -79,7 +74,7 @@ def gramian_root(A: Array, B: Array, dt: float) -> Array:
     for _ in range(_MAX_ITERATIONS):
         step = power @ R
         R = qr_triangle(np.hstack([R, step]).T).T
-        if np.abs(step).max(initial=0.0) <= np.finfo(float).eps * np.abs(R).max(initial=0.0):
+        if np.abs(step).max(initial=0.0) <= _EPSILON * np.abs(R).max(initial=0.0):
             break
         power = power @ power
     return R
@@ -106,13 +101,11 @@ def h2_norm(system: Any) -> float:
     >>> round(h2_norm(StateSpace([[0.6]], [[1.0]], [[0.8]], [[0.0]], 1.0)), 12)
     1.0
     """
-    system = as_state_space(system)
+    system = balanced(as_state_space(system))
     if system.dt == 0 and np.any(system.D):
         return float("inf")
-    scaled = balanced(system)
-    if _near_the_limit(scaled):
+    if _near_the_limit(system):
         return precise_h2_norm(system)
-    system = scaled if system.dt == 0 else system
     if not system.is_stable():
         return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
@@ -170,45 +163,25 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
         return float("inf")
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
-    continuous = to_continuous(system) if system.dt > 0 else system
-    at, lower = _largest(system, first_frequencies(continuous.poles()))
+    continuous = balanced(to_continuous(system) if system.dt > 0 else system)
+    known = first_frequencies(continuous.poles())
+    at, lower = _largest(system, known)
     at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    if error > tol:  # eigenvalues of the Hamiltonian are no better
-        return _norm_of_stiff(system, continuous, at, lower, error)
+    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
     for _ in range(_MAX_ITERATIONS):
-        best = _largest(system, crossings(continuous, lower * (1 + tol)))[1]
-        if best <= lower * (1 + tol):
-            return max(best, lower)
-        lower = best
-    raise KrosError(
-        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; ask for a larger "
-        f"tol than {tol}."
-    )
-
-
-def _norm_of_stiff(system: StateSpace, continuous: StateSpace, at: float, lower: float, error: float) -> float:
-    """Search the peak between the frequencies of level sets and poles; its gain is computed in multiple precision."""
-    continuous = balanced(continuous)
-    known = first_frequencies(continuous.poles())
-    for _ in range(_MAX_ITERATIONS):
-        peak, best = _peak(system, np.concatenate([known, crossings(continuous, lower * (1 + error), rounded=True)]))
-        before, (at, lower) = lower, (peak, best) if best > lower else (at, lower)
-        if best <= before * (1 + error):
-            return precise_gain(system, _in_hz(system, at))
-    raise KrosError(
-        f"H-infinity norm: no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}; scale states and "
-        "time."
-    )
+        peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
+        before, (at, lower) = lower, max((peak, best), (at, lower), key=lambda pair: pair[1])
+        if best <= before * (1 + room):
+            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
+    problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
+    raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
 
 
 def to_continuous(system: StateSpace) -> StateSpace:
-    """Map a discrete system to continuous time by ``z = (1 + s) / (1 - s)``.
-
-    Gains over all frequencies are the same.
-    """
+    """Map a discrete system to continuous time by ``z = (1 + s) / (1 - s)``, which keeps the gains."""
     eye = np.eye(system.n_states)
     solved = np.linalg.solve(system.A + eye, np.hstack([system.A - eye, system.B]))
     n = system.n_states
@@ -226,10 +199,7 @@ def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
 
 
 def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain.
-
-    Around the largest one of those given it is searched for.
-    """
+    """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
     nu = np.unique(nu)
     gains = _gains(system, nu)
     best = int(np.argmax(gains))
@@ -238,7 +208,7 @@ def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
         inside = np.linspace(low, high, 12)
         gains = _gains(system, inside)
         best = int(np.argmax(gains))
-        at, most = (inside[best], gains[best]) if gains[best] > most else (at, most)
+        at, most = max((inside[best], gains[best]), (at, most), key=lambda pair: pair[1])
         low, high = inside[max(best - 1, 0)], inside[min(best + 1, 11)]
     return float(at), float(most)
 
@@ -255,27 +225,18 @@ def _gains(system: StateSpace, nu: Array) -> Array:
 
 
 def _rounding(system: StateSpace, nu: float) -> float:
-    """Bound of what rounding changes in the gain at one frequency, to first order.
-
-    ``eps || |C R| (|z| I + |A|) |R B| ||``, R the resolvent.
-    """
+    """Bound of what rounding changes in the gain at one frequency: ``eps || |C R| (|z| I + |A|) |R B| ||``."""
     if np.isinf(nu) and system.dt == 0:
         return 0.0
     z = np.exp(2j * np.pi * _in_hz(system, nu) * system.dt) if system.dt > 0 else 1j * nu
-    resolvent = np.linalg.inv(z * np.eye(system.n_states) - system.A)
-    inside = (
-        np.abs(system.C @ resolvent)
-        @ (np.abs(z) * np.eye(system.n_states) + np.abs(system.A))
-        @ np.abs(resolvent @ system.B)
-    )
+    eye = np.eye(system.n_states)
+    R = np.linalg.inv(z * eye - system.A)
+    inside = np.abs(system.C @ R) @ (np.abs(z) * eye + np.abs(system.A)) @ np.abs(R @ system.B)
     return float(_EPSILON * np.linalg.norm(inside, 2))
 
 
 def first_frequencies(poles: Array) -> Array:
-    """Frequencies for the first lower bound, rad/s.
-
-    DC, all poles of a continuous system, a logarithmic grid around them.
-    """
+    """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a grid around them."""
     sizes = np.abs(poles)
     low, high = max(sizes.min(), 1e-300), max(sizes.max(), 1e-300)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
@@ -284,7 +245,7 @@ def first_frequencies(poles: Array) -> Array:
     return np.unique(np.concatenate([[0.0], sizes, np.abs(poles.imag), peaks, grid]))
 
 
-def crossings(system: StateSpace, gamma: float, rounded: bool = False) -> Array:
+def crossings(system: StateSpace, gamma: float) -> Array:
     """Frequencies at which a singular value may equal `gamma`, with the points between them."""
     A, B, C, D = system.A, system.B, system.C, system.D
     R = gamma**2 * np.eye(system.n_inputs) - D.T @ D
@@ -295,10 +256,8 @@ def crossings(system: StateSpace, gamma: float, rounded: bool = False) -> Array:
     Q = C.T @ C + C.T @ D @ F[:, :n]
     H = np.block([[closed, gamma * (B @ F[:, n:])], [-Q / gamma, -closed.T]])
     eigenvalues = np.linalg.eigvals(H)
-    rounding = 100 * _EPSILON * np.linalg.norm(H) if rounded else 0.0
-    near = eigenvalues[
-        (np.abs(eigenvalues.real) <= np.maximum(1e-3 * np.abs(eigenvalues), rounding)) & (eigenvalues.imag >= 0)
-    ]
+    axis = np.maximum(1e-3 * np.abs(eigenvalues), 100 * _EPSILON * np.linalg.norm(H))
+    near = eigenvalues[(np.abs(eigenvalues.real) <= axis) & (eigenvalues.imag >= 0)]
     points = np.unique(np.concatenate([[0.0], near.imag]))
     between = np.concatenate([(points[1:] + points[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])
     return np.concatenate([points, between])

@@ -13,18 +13,12 @@ DIGITS, MOST_DIGITS, MOST_STATES = 40, 160, 60
 
 
 def precise_h2_norm(system: StateSpace) -> float:
-    """H2 norm by eigenvectors of A.
-
-    Infinity where a pole is not stable. Digits are doubled until two results agree to 1e-9.
-    """
+    """H2 norm by eigenvectors of A, infinite where a pole is not stable; digits double until two results agree."""
     import mpmath
 
     if system.n_states > MOST_STATES:
-        raise SynthesisError(
-            f"H2 norm: double precision cannot tell it, and more than {MOST_STATES} states, {system.n_states}, take "
-            "too long in multiple precision; "
-            "reduce the system, or scale its states alike."
-        )
+        problem = f"double precision does not suffice, and multiple precision takes at most {MOST_STATES} states"
+        raise SynthesisError(f"H2 norm: {problem}, found {system.n_states}; reduce the system, or scale its states.")
     before, digits = None, DIGITS
     while digits <= MOST_DIGITS:
         with mpmath.workdps(digits):
@@ -32,9 +26,8 @@ def precise_h2_norm(system: StateSpace) -> float:
         if before is not None and (norm == before or abs(norm - before) <= 1e-9 * abs(norm)):
             return norm
         before, digits = norm, 2 * digits
-    raise SynthesisError(
-        f"H2 norm: no two results agree with up to {MOST_DIGITS} digits; the system has poles on the stability limit."
-    )
+    problem = f"no two results agree with up to {MOST_DIGITS} digits"
+    raise SynthesisError(f"H2 norm: {problem}; the system has poles on the stability limit.")
 
 
 def _h2_norm(mp: Any, system: StateSpace) -> float:
@@ -63,9 +56,7 @@ def precise_gain(system: StateSpace, freq_hz: float) -> float:
     with mpmath.workdps(DIGITS):
         s = mpmath.mpc(0, 2 * mpmath.pi * mpmath.mpf(freq_hz))
         point = mpmath.exp(s * mpmath.mpf(system.dt)) if system.dt > 0 else s
-        states = mpmath.inverse(point * mpmath.eye(system.n_states) - mpmath.matrix(system.A.tolist())) * mpmath.matrix(
-            system.B.tolist()
-        )
-        response = mpmath.matrix(system.C.tolist()) * states + mpmath.matrix(system.D.tolist())
+        A, B, C, D = (mpmath.matrix(matrix.tolist()) for matrix in (system.A, system.B, system.C, system.D))
+        response = C * mpmath.inverse(point * mpmath.eye(system.n_states) - A) * B + D
         values = np.array([[complex(response[i, j]) for j in range(response.cols)] for i in range(response.rows)])
     return float(np.linalg.norm(values, 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import Any, Self, TypeVar, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -11,6 +12,7 @@ from .files import did_you_mean, shortened
 from .removed import instead_of
 
 T = TypeVar("T")
+E = TypeVar("E", bound=Enum)
 _OF_FAMILIES = (TypeError, LookupError, AttributeError, ArithmeticError, MemoryError, RecursionError)  # their arguments
 
 
@@ -57,3 +59,12 @@ def require_kind(value: object, kind: type[T], asked: str, instead: str) -> T:
     if not isinstance(value, kind):
         raise ConfigError(f"{asked}: needs {kind.__name__}, found {type(value).__name__}; {instead}.")
     return value
+
+
+def member(kind: type[E], value: E | str, what: str) -> E:
+    """Return the member of an enumeration by its name, or raise a `ConfigError` that lists the names."""
+    try:
+        return kind(value)
+    except ValueError as error:
+        names = ", ".join(str(m.value) for m in kind)
+        raise ConfigError(f"{what} {value!r} is unknown; choose one of {names}.") from error

@@ -1,7 +1,7 @@
 """Products and largest singular values of many small matrices, on long vectors.
 
-NumPy multiplies stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every
-entry is a long vector over units and frequencies: a product of small matrices is a few dozen vector operations.
+LAPACK takes stacks of 2 x 2 matrices one by one. Here the matrix axes come first, `(row, column, ...)`, and every entry
+is a long vector over units and frequencies.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
-_UNROLL = 6  # beyond this inner size BLAS wins
 _RANK = 1e-12  # columns closer to parallel than this are left to the SVD, which decides about the rank
 
 
@@ -29,19 +28,7 @@ def entries_last(matrices: Array) -> Array:
 
 def multiply(left: Array, right: Array) -> Array:
     """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
-    p, r, m = left.shape[0], left.shape[1], right.shape[1]
-    rest = np.broadcast_shapes(left.shape[2:], right.shape[2:])
-    out = np.empty((p, m, *rest), np.result_type(left, right))
-    if r > _UNROLL:
-        out[...] = entries_first(entries_last(left) @ entries_last(right))
-        return out
-    scratch = np.empty(rest, out.dtype)
-    for i in range(p):
-        for j in range(m):
-            np.multiply(left[i, 0], right[0, j], out=out[i, j, ...])
-            for k in range(1, r):
-                out[i, j] += np.multiply(left[i, k], right[k, j], out=scratch)
-    return out
+    return np.asarray(np.einsum("ik...,kj...->ij...", left, right))
 
 
 def adjoint(matrices: Array) -> Array:
@@ -81,9 +68,7 @@ def sigma_max_squared(matrices: Array) -> Array:
     if columns.shape[1] == 1:
         return first
     second = squared(columns[:, 1]).sum(axis=0)
-    cross = np.conj(columns[0, 0]) * columns[0, 1]
-    for i in range(1, columns.shape[0]):
-        cross += np.conj(columns[i, 0]) * columns[i, 1]
+    cross = np.einsum("i...,i...->...", np.conj(columns[:, 0]), columns[:, 1])
     half = (first - second) / 2
     return (first + second) / 2 + np.sqrt(half**2 + squared(cross))
 
@@ -124,17 +109,5 @@ def pseudo_inverse_first(matrices: Array) -> Array:
 
 def lower_factor(pseudo_inverse: Array) -> Array:
     """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s."""
-    if pseudo_inverse.shape[0] > 2:
-        R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
-        return entries_first(np.conj(np.swapaxes(R, -1, -2)))
-    size = np.sqrt(squared(pseudo_inverse[0]).sum(axis=0))
-    if pseudo_inverse.shape[0] == 1:
-        return size[None, None] + 0j
-    q = pseudo_inverse[0] / np.where(size > 0, size, 1.0)
-    along = (np.conj(q) * pseudo_inverse[1]).sum(axis=0)
-    rest = pseudo_inverse[1] - q * along
-    again = (np.conj(q) * rest).sum(axis=0)
-    rest -= q * again
-    out = np.zeros((2, 2, *size.shape), complex)
-    out[0, 0], out[1, 0], out[1, 1] = size, along + again, np.sqrt(squared(rest).sum(axis=0))
-    return out
+    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
+    return entries_first(np.conj(np.swapaxes(R, -1, -2)))

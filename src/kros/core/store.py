@@ -1,7 +1,7 @@
 """Artefacts: folders named by the digest of all that they follow from, written beside their place and renamed into it.
 
     <run>/store/<digest>/       what a stage wrote, and `artefact.json`, which lists it
-    <run>/store/<digest>.npz    the result of one task of a map; see `results`
+    <run>/store/<digest>.npz    the result of one task of a map; see `work`
     <run>/manifest.json         the artefacts of a run; their files are at their places in the run folder too
 
 A digest is of settings, inputs and source. So what is there need not be computed, and what is computed twice is the
@@ -12,11 +12,9 @@ out of its folder.
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
-import tempfile
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
@@ -24,7 +22,7 @@ from pydantic import Field, NonNegativeFloat
 
 from .artifacts import CHECKSUM, check_checksum, read_json, with_checksum, write_json
 from .errors import ConfigError, DataError
-from .files import TEMPORARY, is_file
+from .files import TEMPORARY, draft_beside, is_file, link_or_copy, stamp_of
 from .settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
@@ -48,7 +46,7 @@ class Artefact(Settings):
     def matches(self, folder: Path, name: str) -> bool:
         """Return whether a file is in a folder as it was written; one with its size and time is not read."""
         path, (content, *stamp) = place(folder, name), self.files[name]
-        return is_file(path) and (_stamp(path) == tuple(stamp) or file_digest(path) == content)
+        return is_file(path) and (stamp_of(path) == tuple(stamp) or file_digest(path) == content)
 
 
 def digest_of(*content: object) -> str:
@@ -64,12 +62,7 @@ def file_digest(path: Path) -> str:
 
 def describe(path: Path) -> Described:
     """Return digest, size and time of a file."""
-    return file_digest(path), *_stamp(path)
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns
+    return file_digest(path), *stamp_of(path)
 
 
 def place(folder: Path, name: str) -> Path:
@@ -80,9 +73,8 @@ def place(folder: Path, name: str) -> Path:
     for depth in range(1, len(parts)):
         path = folder.joinpath(*parts[:depth])
         if path.is_symlink():
-            raise DataError(
-                f"Run folder {folder}: {path} is a link, and results stay inside the folder; put a folder in its place."
-            )
+            problem = f"{path} is a link, and results stay inside the folder"
+            raise DataError(f"Run folder {folder}: {problem}; put a folder in its place.")
     return folder / name
 
 
@@ -94,9 +86,8 @@ def read_manifest(folder: Path) -> dict[str, Artefact]:
     try:
         return {stage: Artefact.of(content, stage) for stage, content in _checked(path).items()}
     except (ConfigError, DataError, AttributeError, TypeError) as error:
-        raise DataError(
-            f"Manifest {path}: is damaged, or of another version of kros ({error}); run the study again."
-        ) from error
+        problem = f"is damaged, or of another version of kros ({error})"
+        raise DataError(f"Manifest {path}: {problem}; run the study again.") from error
 
 
 def _checked(path: Path) -> Mapping[str, object]:
@@ -113,12 +104,8 @@ def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
 def recorded_files(folder: Path) -> frozenset[str]:
     """Return the names of all files that belong to a run."""
     artefacts = read_manifest(folder).values()
-    inside = (
-        f"{run}/{name}"
-        for artefact in artefacts
-        for run in artefact.runs
-        for name in recorded_files(place(folder, run))
-    )
+    runs = [run for artefact in artefacts for run in artefact.runs]
+    inside = (f"{run}/{name}" for run in runs for name in recorded_files(place(folder, run)))
     return frozenset(inside).union(*(artefact.files for artefact in artefacts))
 
 
@@ -140,13 +127,9 @@ class ArtefactStore:
             return None
         return artefact if whole else None
 
-    @contextmanager
-    def draft(self) -> Iterator[Path]:
+    def draft(self) -> AbstractContextManager[Path]:
         """Give the path of a draft beside the artefacts; it goes where it was not put into its place."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=self.folder, ignore_cleanup_errors=True) as folder:
-            Path(folder).chmod(0o755)  # workers of a cluster may be other users
-            yield Path(folder, "draft")
+        return draft_beside(self.folder)
 
     def put(self, draft: Path, artefact: Artefact) -> None:
         """Move a draft into its place; what is there, and not whole, goes."""
@@ -166,9 +149,8 @@ class ArtefactStore:
             link_or_copy(self.folder / artefact.digest / name, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            raise ConfigError(
-                f"Run folder {folder}: {error.filename2 or error.filename} is in the place of a result; move it away."
-            ) from error
+            obstacle = error.filename2 or error.filename
+            raise ConfigError(f"Run folder {folder}: {obstacle} is in the place of a result; move it away.") from error
 
     def sweep(self, named: Collection[str]) -> None:
         """Remove what is not named: artefacts, results, drafts of processes that were killed."""
@@ -176,15 +158,6 @@ class ArtefactStore:
             ours = len(path.stem) == hashlib.sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
             if ours and path.stem not in named:
                 remove(path)
-
-
-def link_or_copy(source: Path, target: Path) -> None:
-    """Put a file in a second place, with its times."""
-    target.unlink(missing_ok=True)
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 def remove(path: Path) -> None:

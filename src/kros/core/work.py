@@ -1,36 +1,46 @@
-"""Independent pieces of work, in order: where they run, which results are there, and who listens to their progress."""
+"""Independent pieces of work, in order: where they run, which results are there, and who listens to their progress.
+
+Results of maps are in a store, by the digest of all that they follow from: what is new is computed, the rest is read.
+The process that computes a result writes it, on a cluster too. Numbers come back bit by bit, so results do not depend
+on how they were obtained; what cannot be read back whole is computed again.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import dataclasses
+import json
 import logging
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import Any, Protocol, TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
-from .results import Results, Storing
+import numpy as np
+
+from .artifacts import pack_arrays, unpack_arrays
+from .errors import DataError
+from .files import read_bytes, write_bytes
+from .limits import MAX_ARRAYS_BYTES
+from .store import digest_of
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
+_TRIM, _MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of glibc
+_RETAINED, _OF_HEAP = 1 << 28, 1 << 25  # bytes; glibc takes no more than the second
 
 
-class Executor(Protocol):
-    """Maps a function over tasks, in order."""
-
-    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
-        """Yield results in the order of the tasks."""
-        ...
-
-
-class SerialExecutor:
-    """Runs every task in this process."""
+class Executor:
+    """Maps a function over tasks: here, one behind the other; others derive from it."""
 
     def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Yield results in the order of the tasks."""
         return map(function, tasks)
 
 
-class Progress(Protocol):
-    """Told which part of a computation runs and how far it is."""
+class Progress:
+    """Listens to which part of a computation runs and how far it is; this one ignores everything."""
 
     def start(self, stage: str, total: int | None) -> None:
         """A stage (or a part of one) begins."""
@@ -42,32 +52,112 @@ class Progress(Protocol):
         """A stage is done, or was skipped."""
 
 
-class Silent:
-    """A progress listener that ignores everything."""
+@dataclass(frozen=True)
+class Results:
+    """Results in a folder, computed with the `source` of kros; `used` are those of the maps so far."""
 
-    def start(self, stage: str, total: int | None) -> None:
-        """Ignore."""
+    folder: Path
+    source: str
+    used: set[str] = field(default_factory=set)
 
-    def advance(self) -> None:
-        """Ignore."""
+    def digests(self, function: Callable[[Any], Any], of_tasks: Iterable[str | None]) -> list[str | None]:
+        """Return the digests of results from those of what the tasks hold; None where a task has none."""
+        name = f"{function.__module__}.{function.__qualname__}"
+        digests = [None if digest is None else digest_of(self.source, name, digest) for digest in of_tasks]
+        self.used.update(digest for digest in digests if digest is not None)
+        return digests
 
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """Ignore."""
+    def read(self, digest: str | None, kinds: Iterable[type]) -> Any:
+        """Return a result, or None."""
+        path = self.folder / f"{digest}.npz"
+        if digest is None or not path.exists():
+            return None
+        try:
+            return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, {kind.__name__: kind for kind in kinds})
+        except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
+            log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
+            return None
+
+
+@dataclass(frozen=True)
+class Storing:
+    """A function of a digest and a task, whose result is written where it has a digest."""
+
+    function: Callable[[Any], Any]
+    folder: Path
+
+    def __call__(self, task: tuple[str | None, Any]) -> Any:
+        """Compute."""
+        result = self.function(task[1])
+        if task[0] is not None:
+            write_bytes(self.folder / f"{task[0]}.npz", packed(result))
+        return result
+
+
+def packed(value: Any) -> bytes:
+    """Return a result as an archive of its arrays, beside JSON of all else."""
+    arrays: list[np.ndarray] = []
+    text = json.dumps(_plain(value, arrays)).encode()
+    return pack_arrays({"content": np.frombuffer(text, np.uint8), **{str(i): a for i, a in enumerate(arrays)}})
+
+
+def unpacked(content: bytes, path: Path, kinds: Mapping[str, type]) -> Any:
+    """Return what `packed` packed; dataclasses are of some kinds."""
+    arrays = unpack_arrays(content, path)
+    return _restored(json.loads(arrays["content"].tobytes()), arrays, kinds)
+
+
+def _plain(value: Any, arrays: list[np.ndarray]) -> Any:
+    """Turn a value into what JSON can hold: what is not JSON's own becomes ``[kind, ...]``."""
+    if value is None or type(value) in (str, int, bool, float):
+        return value
+    if isinstance(value, np.ndarray | np.generic):
+        arrays.append(np.asarray(value))
+        return ["array" if isinstance(value, np.ndarray) else "number", len(arrays) - 1, np.shape(value)]
+    if dataclasses.is_dataclass(value):
+        return [
+            type(value).__name__,
+            {f.name: _plain(getattr(value, f.name), arrays) for f in dataclasses.fields(value)},
+        ]
+    if isinstance(value, list | tuple):
+        return [type(value).__name__, [_plain(v, arrays) for v in value]]
+    if isinstance(value, dict):
+        return ["dict", {k: _plain(v, arrays) for k, v in value.items()}]
+    raise TypeError(f"Storing a result: {type(value).__name__} is of no kind that can be stored.")
+
+
+def _restored(value: Any, arrays: Mapping[str, np.ndarray], kinds: Mapping[str, type]) -> Any:
+    """Return what `_plain` turned into JSON."""
+    if not isinstance(value, list):
+        return value
+    kind, content, *shape = value
+    if shape:
+        array = arrays[str(content)].reshape(shape[0])
+        return array if kind == "array" else array[()]
+    if isinstance(content, list):
+        items = [_restored(v, arrays, kinds) for v in content]
+        return tuple(items) if kind == "tuple" else items
+    fields = {name: _restored(v, arrays, kinds) for name, v in content.items()}
+    return fields if kind == "dict" else kinds[kind](**fields)
 
 
 @dataclass(frozen=True)
 class Work:
     """An executor, a progress listener and earlier results; by default work runs here, in silence, without results."""
 
-    executor: Executor = field(default_factory=SerialExecutor)
-    progress: Progress = field(default_factory=Silent)
+    executor: Executor = field(default_factory=Executor)
+    progress: Progress = field(default_factory=Progress)
     results: Results | None = None
 
     def map(self, title: str, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
         """Map a function over tasks, in order."""
         tasks = list(tasks)
-        self.progress.start(title, len(tasks))
-        for result in self.executor.map(function, tasks):
+        return self._followed(title, len(tasks), self.executor.map(function, tasks))
+
+    def _followed(self, title: str, total: int, results: Iterator[T]) -> Iterator[T]:
+        """Yield results, and report progress."""
+        self.progress.start(title, total)
+        for result in results:
             self.progress.advance()
             yield result
 
@@ -85,11 +175,10 @@ class Work:
             yield from self.map(title, function, tasks)
             return
         tasks, kinds, digests = list(tasks), tuple(kinds), self.results.digests(function, marks)
-        earlier = [self.results.read(digest, kinds) for digest in digests]
-        earlier = [
-            None if result is None or not usable(task, result) else result
-            for task, result in zip(tasks, earlier, strict=True)
-        ]
+        earlier: list[Any] = []
+        for task, digest in zip(tasks, digests, strict=True):
+            result = self.results.read(digest, kinds)
+            earlier.append(result if result is not None and usable(task, result) else None)
         new = [row for row, result in zip(zip(digests, tasks, strict=True), earlier, strict=True) if result is None]
         if new:
             log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
@@ -106,17 +195,16 @@ class Work:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         pieces = list(work)
         running = self.executor.map(_call, pieces)
-
-        def results() -> list[T]:
-            self.progress.start(title, len(pieces))
-            computed = []
-            for result in running:
-                self.progress.advance()
-                computed.append(result)
-            return computed
-
-        return results
+        return lambda: list(self._followed(title, len(pieces), running))
 
 
 def _call(work: Callable[[], T]) -> T:
     return work()
+
+
+def keep_freed_memory() -> None:
+    """Let glibc keep what is freed for the next array, up to 256 MB; nothing changes elsewhere."""
+    with suppress(AttributeError, TypeError, OSError):
+        mallopt = ctypes.CDLL(None).mallopt
+        mallopt(_TRIM, _RETAINED)
+        mallopt(_MMAP, _OF_HEAP)

@@ -21,8 +21,7 @@ from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame, from_pykoop, to_pykoop
 from .readers.motor_drive_raw import write_raw
 from .readers.opening import read
-from .readers.parquet import read_parquet
-from .writers.parquet import write_parquet
+from .readers.parquet import read_parquet, write_parquet
 
 __all__ = [
     "Channel",

@@ -30,8 +30,8 @@ class AlertRule:
 
     near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
     compact: float = 3.0  # by which sizes may differ on either side of it
-    apart: float = 0.6  # of the gap between both sides that sizes of one side may span
     correlated: float = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
+    decades: float = 0.05  # by which the factor between both may differ from a thousand or a million
 
 
 _RULE = AlertRule()
@@ -39,13 +39,9 @@ _RULE = AlertRule()
 
 def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
     """Return what speaks against a sampling period."""
-    alerts = []
-    if not SHORTEST_S < period_s < LONGEST_S:
-        alerts.append(
-            f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s, "
-            "on which every frequency depends."
-        )
-    return (*alerts, *_derivatives(values, channels, period_s), *_sampling(values, channels, period_s))
+    unusual = f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s"
+    alerts = [] if SHORTEST_S < period_s < LONGEST_S else [f"{unusual}, on which every frequency depends."]
+    return (*alerts, *_derivatives(values, channels, period_s))
 
 
 def size_of(values: Array) -> Array:
@@ -76,7 +72,7 @@ def _two_scales(sizes: Mapping[str, float]) -> str:
     cut = int(np.diff(logs).argmax()) + 1
     gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
     kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_RULE.near)]
-    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > min(np.log(_RULE.compact), _RULE.apart * gap):
+    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > np.log(_RULE.compact):
         return ""
     smaller = cut <= len(names) - cut
     fewer = some(names[:cut] if smaller else names[cut:])
@@ -92,18 +88,7 @@ def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) ->
         sizes = np.linalg.norm(slope), np.linalg.norm(speed)
         if min(sizes) > 0 and slope @ speed > _RULE.correlated * sizes[0] * sizes[1]:
             decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
-            if abs(abs(decades) - 3) < 0.05 or abs(abs(decades) - 6) < 0.05:
+            if min(abs(abs(decades) - 3), abs(abs(decades) - 6)) < _RULE.decades:
                 slope_of = f"{channels[other].name!r} is the slope of {channels[one].name!r}"
                 factor = f"times {10.0 ** round(decades):g} at the sampling period of {period_s:g} s"
                 yield f"{slope_of} {factor}: {UNUSUAL}, or the units of these channels."
-
-
-def _sampling(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:
-    """Signals that change by as much as their own size from sample to sample: sampled too slowly, or noise."""
-    states = values[:, [i for i, c in enumerate(channels) if c.role is Role.STATE]]
-    step, size = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=0)), states.std(axis=0)
-    if np.all(step > size) and np.all(size > 0):
-        yield (
-            f"At the sampling period of {period_s:g} s every state changes by more than its own standard deviation "
-            "from sample to sample: they hold noise alone, or samples are too far apart for a model of one step."
-        )

@@ -13,7 +13,6 @@ from ..core.errors import DataError
 from .population import EpisodeKey, Population
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 512  # samples of all episodes that are put side by side at once: they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +65,7 @@ class EpisodeBatch:
         parameters: Mapping[str, Mapping[str, float]] | None = None,
         truths: bool = False,
     ) -> EpisodeBatch:
-        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have.
-
-        With `truths` also what states really were, for evaluation.
-        """
+        """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have."""
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
         pairs = [population.read_with_truths(key) for key in keys]
@@ -88,16 +84,13 @@ class EpisodeBatch:
         return tuple(k.unit for k in self.keys)
 
     def measurements(self, measured: Sequence[int], arrived: bool = True) -> Array:
-        """Return what the sensor shows of some states, shape (n_samples, batch, q).
-
-        NaN where a sample does not arrive; what would have arrived there where `arrived` is false.
-        """
+        """Return what the sensor shows of some states, (n_samples, batch, q), NaN where a sample has not `arrived`."""
         at = list(measured)
         y = np.ascontiguousarray((self.states if self.shown is None else self.shown)[..., at])
         return np.where(self.lost[..., at], np.nan, y) if arrived and self.lost is not None else y
 
     def head(self, n_samples: int) -> EpisodeBatch:
-        """Return the same episodes, cut to so many samples."""
+        """Return the same episodes, cut to a number of samples."""
         return replace(self, lengths=np.minimum(self.lengths, n_samples), **self._signals(np.s_[:n_samples]))
 
     def take(self, rows: Sequence[int]) -> EpisodeBatch:
@@ -115,25 +108,13 @@ class EpisodeBatch:
         return parts | {"inputs": np.ascontiguousarray(parts["inputs"])}
 
     def first_states(self, history: int = 0) -> Array:
-        """Return what a simulation starts from: the first states of every episode, with `history` more for delays.
-
-        Returns
-        -------
-        ndarray, shape (batch, n), or (batch, history + 1, n) for a lifting with delays
-
-        Raises
-        ------
-        DataError
-            When an episode is shorter than the history.
-        """
+        """Return the first states of every episode, (batch, n), or (batch, history + 1, n) with delays."""
         if not history:
             return self.states[0]
         for key, length in zip(self.keys, self.lengths, strict=True):
             if length < history + 1:
-                raise DataError(
-                    f"Simulation of {key}: needs {history + 1} samples for delays of up to {history}, found {length}; "
-                    "leave the episode out."
-                )
+                needs = f"needs {history + 1} samples for delays of up to {history}, found {length}"
+                raise DataError(f"Simulation of {key}: {needs}; leave the episode out.")
         return np.swapaxes(self.states[: history + 1], 0, 1)
 
 
@@ -150,9 +131,7 @@ def hold_missing(y: Array) -> Array:
 def _side_by_side(episodes: Sequence[Array], lengths: npt.NDArray[np.int64]) -> Array:
     """Return episodes as one array, shape (n_samples, batch, n_columns), shorter ones held at their last sample."""
     values = np.empty((lengths.max(), len(episodes), episodes[0].shape[1]))
-    for start in range(0, len(values), _AT_ONCE):
-        for i, episode in enumerate(episodes):
-            part = episode[start : start + _AT_ONCE]
-            values[start : start + len(part), i] = part
-            values[start + len(part) : start + _AT_ONCE, i] = episode[-1]
+    for i, episode in enumerate(episodes):
+        values[: len(episode), i] = episode
+        values[len(episode) :, i] = episode[-1]
     return values

@@ -7,7 +7,6 @@ import math
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from hashlib import sha256
 from numbers import Real
 from typing import Any
@@ -81,23 +80,6 @@ def _kind(value: float) -> str:
     return "infinity" if np.isinf(value) else f"above {limits.MAX_VALUE:g}"
 
 
-@dataclass(frozen=True, eq=False)
-class _Suspects:
-    """Samples of a channel that are far from the others of their episode."""
-
-    key: EpisodeKey
-    channel: int
-    samples: npt.NDArray[np.int64]
-    values: Array
-    quantiles: tuple[float, float, float]  # 1 %, 50 % and 99 % of the episode
-
-    def beyond(self, range_elsewhere: float) -> npt.NDArray[np.int64]:
-        """Return which are wild: |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0."""
-        low, middle, high = self.quantiles
-        size = max(high - low, abs(low), abs(high), range_elsewhere)
-        return np.flatnonzero((np.abs(self.values - middle) > WILD * size) & (size > 0))
-
-
 class GroupWatch:
     """What only the episodes of one unit and condition tell together: channels that never move, and wild samples.
 
@@ -109,34 +91,33 @@ class GroupWatch:
         self._channels = channels
         self._resting: list[dict[int, float]] = []
         self._ranges: dict[EpisodeKey, Array] = {}
-        self._suspects: list[_Suspects] = []
+        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # samples, values and quantiles of a channel
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
-        roles = [(i, c.role) for i, c in enumerate(self._channels)]
-        signals = [i for i, role in roles if role is not Role.TRUTH and is_constant(values[:, i])]
-        self._resting.append({i: float(values[0, i]) for i in signals})
+        signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
+        self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
         self._ranges[key] = np.ptp(values, axis=0)
         for i, column in enumerate(values.T):
             few = np.sort(column[:: max(1, len(column) // 64)])
             if self._ranges[key][i] <= WILD * (few[-2] - few[1]):
                 continue  # a few samples show already that the channel moves as much
             outside = max(1, len(column) // 100)  # at each end; one at least, for short episodes
-            low, middle, high = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
-            far = np.flatnonzero(np.abs(column - middle) > WILD * (high - low))
+            quantiles = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
+            far = np.flatnonzero(np.abs(column - quantiles[1]) > WILD * (quantiles[2] - quantiles[0]))
             if far.size:
-                self._suspects.append(_Suspects(key, i, far, column[far], (low, middle, high)))
+                self._suspects.append((key, i, np.stack([far, column[far]]), quantiles))
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
-        """Yield the episodes with wild samples, and where these are."""
-        for s in self._suspects:
-            others = sorted(r[s.channel] for key, r in self._ranges.items() if key != s.key)
-            wild = s.beyond(others[(len(others) - 1) // 2] if others else 0.0)
+        """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0, and the place."""
+        for suspect, i, (samples, values), (low, middle, high) in self._suspects:
+            others = sorted(ranges[i] for key, ranges in self._ranges.items() if key != suspect)
+            size = max(high - low, abs(low), abs(high), others[(len(others) - 1) // 2] if others else 0.0)
+            wild = np.flatnonzero((np.abs(values - middle) > WILD * size) & (size > 0))
             if wild.size:
-                actual = f"{s.values[wild[0]]:g} at sample {s.samples[wild[0]]}"
-                most = f"98 % of its samples are from {s.quantiles[0]:g} to {s.quantiles[2]:g}"
-                name = self._channels[s.channel].name
-                yield s.key, f"channel {name!r} is {actual}, and {most} ({wild.size} such samples)"
+                actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
+                most = f"98 % of its samples are from {low:g} to {high:g}"
+                yield suspect, f"channel {self._channels[i].name!r} is {actual}, and {most} ({wild.size} such samples)"
 
     def check(self) -> None:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
@@ -161,8 +142,7 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
         if not isinstance(name, str) or not name.strip():
             raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
         if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
-            wanted = "should hold printable characters in UTF-8 only"
-            raise DataError(f"The name of a {kind} {wanted}, found {name!r}; rename it.")
+            raise DataError(f"The name of a {kind} should hold printable characters only, found {name!r}; rename it.")
 
 
 def check_period(period_s: Any, what: str) -> float:
@@ -208,26 +188,24 @@ def check_population(population: Population, allow_single: bool = False) -> None
     """Check what needs no reading: not empty, no duplicates, a state, a measured state, more than one unit."""
     check_structure(population.columns, population.episodes)
     if not population.measured:
-        raise DataError(
-            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with; "
-            "declare measured = true for at least one."
+        problem = (
+            f"No state of {list(population.states)} is measured, so an observer would have nothing to correct with"
         )
+        raise DataError(f"{problem}; declare measured = true for at least one.")
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
     if len(units) < 2 and not allow_single:
-        raise DataError(
-            f"A population needs at least two units outside the group {OUTLIERS!r}, found {len(units)} "
-            f"({', '.join(units) or 'none'}): uncertainty is the difference between units; add recordings of more "
-            'units, or stop after identification ("--until identify").'
-        )
+        actual = f"found {len(units)} ({', '.join(units) or 'none'}): uncertainty is the difference between units"
+        advice = 'add recordings of more units, or stop after identification ("--until identify")'
+        raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
 
 
 def scan_digests(
     population: Population, on_nan: str = "error", look: Look | None = None
 ) -> list[tuple[EpisodeKey, str]]:
     """Read and check every episode; return the usable ones with their digests. `look` is called with every episode."""
-    groups = (keys for _, _, keys in population.groups())
-    digests = [(key, digest) for keys in groups for key, _, digest in usable_episodes(population, keys, on_nan, look)]
+    groups = (usable_episodes(population, keys, on_nan, look) for _, _, keys in population.groups())
+    digests = [(key, digest) for group in groups for key, _, digest in group]
     refuse_copies(digests)
     return digests
 

@@ -3,9 +3,7 @@
 A flat top is a run of samples at a signal's extreme value, within its noise. It may be a smooth peak, a commanded
 plateau, the top level of a coarse signal, or a limit. It counts as a limit where
 
-- the signal has many levels,
 - the signal is constant there and changes sharply before or after (a smooth peak falls with the square of the time),
-- it does not bend: the middle of the run is no higher than its ends,
 - it is there several times, in more than one episode, at the same value, and nothing was recorded beyond,
 - every input took different values there: what an input holds at one value may be that input's doing.
 
@@ -22,7 +20,6 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
-_OF_RUNS = ("values", "lengths", "steep", "bend", "inputs")
 
 
 @dataclass(frozen=True)
@@ -32,10 +29,8 @@ class LimitRule:
     shortest: int = 8  # samples of a run: as many as a filter of a sensor may smear
     runs: int = 5  # fewest runs
     episodes: int = 2  # in so many of which they are
-    levels: int = 64  # of a signal; fewer make a coarse one, whose top level is no limit
     noise: float = 5.0  # standard deviations that noise is wide
     far: float = 5.0  # widths of the noise by which the signal falls beside a run
-    bent: float = 0.25  # width of the noise that the middle of a run may be above its ends
     varied: float = 0.02  # of an input's range that it covers in the runs
 
 
@@ -50,11 +45,11 @@ class FlatTops:
     episode: str  # the episode's name holds its condition
     top: float  # largest value of the signal, noise apart
     width: float  # of the noise
-    values: Array  # mean of every run
-    lengths: Rows  # samples of every run
-    steep: npt.NDArray[np.bool_]  # whether the signal is far away shortly before or after a run
-    bend: Array  # by how much the middle of a run is above its ends
-    inputs: Array  # mean inputs of every run, shape (runs, m)
+    # Of every run, shape (runs, 3 + m): mean, samples, whether the signal is far away shortly before or after, inputs.
+    runs: Array
+
+
+Ends = tuple[FlatTops, FlatTops]  # at the lower end with the sign changed, and at the upper end
 
 
 @dataclass(frozen=True)
@@ -71,31 +66,23 @@ class FoundLimit:
         return f"{' and '.join(ends)}, where {len(self.units)} units were for {self.samples} samples"
 
 
-@dataclass(frozen=True, eq=False)
-class Ends:
-    """Flat tops of one state in one episode, at its lower end with the sign changed and at its upper end."""
-
-    lower: FlatTops
-    upper: FlatTops
-
-
 def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
     """Return the flat tops of a signal, shape (n_samples,), with inputs of shape (n_samples, m), at both ends."""
     signal, width = np.ascontiguousarray(signal), _width(signal)
-    return Ends(*(flat_tops(unit, episode, side, inputs, width) for side in (-signal, signal)))
+    lower, upper = (_flat_tops(unit, episode, side, inputs, width) for side in (-signal, signal))
+    return lower, upper
 
 
 def found_limit(ends: Sequence[Ends], ranges: Array) -> FoundLimit | None:
     """Return the limits that all episodes of a population speak for; None where they speak for none."""
-    below, above = [end.lower for end in ends], [end.upper for end in ends]
-    lower, upper = limit_of(below, ranges), limit_of(above, ranges)
-    lower, upper = lower or _mirrored(upper, below), upper or _mirrored(lower, above)
-    if lower is None and upper is None:
+    below, above = zip(*ends, strict=True)
+    lower, upper = _level(below, ranges), _level(above, ranges)
+    levels = [level for level in (lower, upper) if level is not None]
+    if not levels:
         return None
-    levels = [part for part in (lower, upper) if part is not None]
-    units = tuple(dict.fromkeys(unit for part in levels for unit in part.units))
-    value = None if upper is None else upper.value
-    return FoundLimit(None if lower is None else -lower.value, value, units, sum(part.samples for part in levels))
+    units = tuple(dict.fromkeys(unit for level in levels for unit in level.units))
+    low, high = None if lower is None else -lower.value, None if upper is None else upper.value
+    return FoundLimit(low, high, units, sum(level.samples for level in levels))
 
 
 @dataclass(frozen=True)
@@ -107,48 +94,31 @@ class _Level:
     samples: int = 0
 
 
-def _mirrored(other: _Level | None, tops: Sequence[FlatTops]) -> _Level | None:
-    """Return the limit of the other end where the signal goes as far at this one."""
-    furthest = max(tops, key=lambda f: f.top)
-    return None if other is None or abs(furthest.top - other.value) > furthest.width else _Level(other.value)
-
-
-def flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
+def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
     """Return the flat tops of a signal at its upper end, with noise of a width, and how far the signal goes."""
-    top = (
-        float(np.partition(signal, -_RULE.shortest)[-_RULE.shortest])
-        if len(signal) > 2 * _RULE.shortest
-        else float(signal.max())
-    )
-    for _ in range(2):
-        top = float(signal[signal >= top - width].mean())
+    place = _RULE.shortest if len(signal) > 2 * _RULE.shortest else 1
+    top = float(np.partition(signal, -place)[-place])
     edges = np.flatnonzero(np.diff(np.concatenate([[False], signal >= top - width, [False]])))
-    starts, stops = edges[::2], edges[1::2]
-    coarse = len(np.unique(signal[:: _RULE.levels])) < _RULE.levels and len(np.unique(signal)) < _RULE.levels
-    long = (stops - starts >= _RULE.shortest) & (not coarse)
-    starts, stops = starts[long], stops[long]
-    third = (stops - starts) // 3
-    values, middle = _means(signal, starts, stops), _means(signal, starts + third, stops - third)
-    mean_inputs = np.reshape([_means(u, starts, stops) for u in inputs.T], (inputs.shape[1], len(starts))).T
+    long = edges[1::2] - edges[::2] >= _RULE.shortest
+    starts, stops = edges[::2][long], edges[1::2][long]
     steep = _steep(signal, starts, stops, top - _RULE.far * width)
-    return FlatTops(unit, episode, top, width, values, stops - starts, steep, 1.5 * (middle - values), mean_inputs)
+    columns = [_means(signal, starts, stops), stops - starts, steep, *(_means(u, starts, stops) for u in inputs.T)]
+    return FlatTops(unit, episode, top, width, np.column_stack(columns).astype(float))
 
 
-def limit_of(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
+def _level(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
     """Return the upper limit that flat tops of a population speak for; None where they do not."""
-    level = max((f.values[f.steep].max() for f in tops if f.steep.any()), default=-np.inf)
-    at = [(f, np.abs(f.values - level) <= f.width) for f in tops]
-    at = [(f, rows) for f, rows in at if rows.any()]
-    if not at or any(f.top > level + 2 * f.width for f in tops):
+    level = max((f.runs[f.runs[:, 2] > 0, 0].max() for f in tops if f.runs[:, 2].any()), default=-np.inf)
+    near = [(f, f.runs[np.abs(f.runs[:, 0] - level) <= f.width]) for f in tops]
+    near = [(f, runs) for f, runs in near if len(runs)]
+    if not near or any(f.top > level + 2 * f.width for f in tops):
         return None
-    runs = (np.concatenate([getattr(f, name)[rows] for f, rows in at]) for name in _OF_RUNS)
-    values, lengths, steep, bend, inputs = runs
-    often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in at}) >= _RULE.episodes
-    straight = abs(np.average(bend, weights=lengths)) <= _RULE.bent * max(f.width for f, _ in at)
-    varied = np.all(np.ptp(inputs, axis=0) > _RULE.varied * ranges)
-    if not (often and straight and varied and np.average(steep, weights=lengths) >= 0.5):
+    values, lengths, steep, *inputs = np.concatenate([runs for _, runs in near]).T
+    often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in near}) >= _RULE.episodes
+    varied = all(np.ptp(u) > _RULE.varied * size for u, size in zip(inputs, ranges, strict=True))
+    if not (often and varied):
         return None
-    units = tuple(dict.fromkeys(f.unit for f, _ in at))
+    units = tuple(dict.fromkeys(f.unit for f, _ in near))
     return _Level(float(np.average(values, weights=lengths * steep)), units, int(lengths.sum()))
 
 
@@ -156,10 +126,15 @@ def _width(signal: Array) -> float:
     """Width of the noise: five standard deviations by second differences, at least one step of quantisation."""
     steps = np.diff(signal)
     noise = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / np.sqrt(6) if len(steps) > 1 else 0.0
-    floor = 1e-9 * float(np.abs(signal).max())
-    np.abs(steps, out=steps)
+    smallest = smallest_step(signal)
+    return max(_RULE.noise * noise, 1.01 * smallest)
+
+
+def smallest_step(signal: Array) -> float:
+    """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
+    steps, floor = np.abs(np.diff(signal)), 1e-9 * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
-    return max(_RULE.noise * noise, 1.01 * smallest if np.isfinite(smallest) else floor)
+    return smallest if np.isfinite(smallest) else floor
 
 
 def _means(signal: Array, starts: Rows, stops: Rows) -> Array:

@@ -17,9 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..core.choices import member
 from ..core.errors import DataError
-from .scaling import Scaling
+from ..core.settings import member
 
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
@@ -115,8 +114,27 @@ def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
 
 
+@dataclass(frozen=True)
+class Scaling:
+    """From a column as recorded to a channel: ``channel[k] = factor * column[k + lag_samples]``, plus `offset`."""
+
+    column: str | int | None  # name in the header, or number from 1; none where it differs between units
+    factor: float = 1.0
+    lag_samples: int = 0  # samples by which the column lagged behind the others
+    offset: str = ""  # what was added in every episode, in words; empty where nothing was
+    converted: float = 1.0  # the part of the factor that is in the files already, since recordings were converted
+
+
+Scalings = Mapping[str, Scaling]
+
+
+def scaling_of(scalings: Scalings, name: str) -> Scaling:
+    """Return the scaling of a channel; one that is not declared is the column of its name, as it is."""
+    return scalings.get(name, Scaling(name))
+
+
 def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
-    """Return a source that knows fewer episodes where it can say so (`restricted`), else the source itself."""
+    """Return a source of fewer episodes, cheaper to send to another process, where it has a method `restricted`."""
     restricted = getattr(source, "restricted", None)
     return source if restricted is None else restricted(keys)
 
@@ -128,9 +146,10 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
 
 def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
-    columns = tuple(columns)
-    truths = tuple(c for c in columns if c.role is Role.TRUTH)
-    return {"channels": tuple(c for c in columns if c not in truths), "truths": truths}
+    parts: dict[bool, list[Channel]] = {False: [], True: []}
+    for column in columns:
+        parts[column.role is Role.TRUTH].append(column)
+    return {"channels": tuple(parts[False]), "truths": tuple(parts[True])}
 
 
 @dataclass(frozen=True)
@@ -228,9 +247,9 @@ class Population:
 
     def unit(self, unit_id: str) -> Unit:
         """Return one unit's facts."""
-        if unit_id in self._unit_positions:
-            return self.units[self._unit_positions[unit_id]]
-        known = f"{', '.join(self.unit_ids[:10])}{' ...' if len(self.units) > 10 else ''}"
+        if unit_id in self._units:
+            return self._units[unit_id]
+        known = ", ".join(self.unit_ids[:10]) + (" ..." if len(self.units) > 10 else "")
         raise DataError(f"Asked for unit {unit_id!r}; the population has {known}.")
 
     def keys(self, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
@@ -278,8 +297,8 @@ class Population:
         return positions
 
     @cached_property
-    def _unit_positions(self) -> dict[str, int]:
-        return {unit.id: i for i, unit in enumerate(self.units)}
+    def _units(self) -> dict[str, Unit]:
+        return {unit.id: unit for unit in self.units}
 
 
 def split_episodes(population: Population, test: Iterable[str] | None = None) -> dict[tuple[str, str], Split]:
@@ -307,16 +326,13 @@ def split_episodes(population: Population, test: Iterable[str] | None = None) ->
         where = f"Splitting the episodes of unit {unit} ({condition})"
         ordered = sorted(keys, key=lambda k: natural_key(k.episode))
         if len(ordered) < 2:
-            raise DataError(
-                f"{where} into training and test needs at least two, found {len(ordered)}; "
-                "record more, or leave the unit out."
-            )
+            needs = f"needs at least two, found {len(ordered)}"
+            raise DataError(f"{where} into training and test {needs}; record more, or leave the unit out.")
         names = {k.episode for k in ordered[-max(1, len(ordered) // 10) :]} if named is None else named
         train, tested = (tuple(k for k in ordered if (k.episode in names) is part) for part in (False, True))
         if not train or not tested:
-            raise DataError(
-                f"{where}: split.test = {sorted(names, key=natural_key)} leaves {len(train)} for training and "
-                f"{len(tested)} for testing of {[k.episode for k in ordered]}; name some of them, not all."
-            )
+            left = f"leaves {len(train)} for training and {len(tested)} for testing of {[k.episode for k in ordered]}"
+            advice = "name some of them, not all"
+            raise DataError(f"{where}: split.test = {sorted(names, key=natural_key)} {left}; {advice}.")
         splits[unit, condition] = Split(train, tested)
     return splits

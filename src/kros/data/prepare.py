@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.files import stamp_of
+from ..core.store import digest_of
 from .checks import check_episode, check_period, check_structure
 from .population import (
     Channel,
     EpisodeKey,
     EpisodeSource,
     Population,
+    Scalings,
     Unit,
     columns_in_order,
     natural_key,
@@ -26,30 +27,14 @@ from .population import (
     restrict,
 )
 from .recording import Recording, Recordings, check_even, estimate_period
-from .scaling import Scalings
-from .steps import Step
-
-
-@dataclass(frozen=True, eq=False)
-class EvenRecordings:
-    """Recordings of a population that is even already."""
-
-    source: EpisodeSource
-
-    def __call__(self, key: EpisodeKey) -> Recording:
-        """Return one episode."""
-        return Recording(key, self.source(key))
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> EvenRecordings:
-        """Return the same for fewer episodes."""
-        return EvenRecordings(restrict(self.source, keys))
+from .steps import Signals, Step
 
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
-    recordings: Recordings | EvenRecordings  # returns a `Recording` for an `EpisodeKey`
+    recordings: Recordings | EpisodeSource  # of a reader, or samples that are even already
     channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
@@ -58,25 +43,25 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        recording = self.recordings(key)
+        recording = self.recorded(key)
         if not any(step.makes_even for step in self.steps):
             where = self.recordings.where(key) if isinstance(self.recordings, Recordings) else ""
             check_even(recording, self.period_s, self.reference, where)
-        channels, period = self.channels, self.period_s
+        signals = Signals(self.channels, self.period_s)
         for step in self.steps:
-            recording = step.apply(recording, channels, period)
-            channels, period = step.channels_after(channels), step.period_after(period)
-        check_episode(recording.values, key, channels, gaps=self.gaps)
+            recording = step.apply(recording, signals.channels, signals.period_s)
+            signals = step.describe(signals)
+        check_episode(recording.values, key, signals.channels, gaps=self.gaps)
         return recording.values
 
+    def recorded(self, key: EpisodeKey) -> Recording:
+        """Return one episode as recorded."""
+        recording = self.recordings(key)
+        return recording if isinstance(recording, Recording) else Recording(key, recording)
+
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
-        """Return the same for fewer episodes, cheaper to send to another process."""
+        """Return the same for fewer episodes."""
         return replace(self, recordings=restrict(self.recordings, keys))
-
-
-def episode_order(key: EpisodeKey) -> tuple[Any, ...]:
-    """Sort key of episodes: natural order of unit, condition and episode, and no ties."""
-    return tuple((natural_key(name), name) for name in (key.unit, key.condition, key.episode))
 
 
 def assemble(
@@ -94,16 +79,15 @@ def assemble(
     if channels != columns_in_order(channels):
         roles = [(c.name, c.role.value) for c in channels]
         raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
-    episodes = tuple(sorted(recordings.places, key=episode_order))
+    order = [(tuple((natural_key(name), name) for name in astuple(key)), key) for key in recordings.places]
+    episodes = tuple(key for _, key in sorted(order, key=lambda pair: pair[0]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
     period = estimate_period(recordings(episodes[0])) if sample_period_s is None else sample_period_s
     period = check_period(period, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
-    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {})}
-    population = Population(
-        sample_period_s=period, units=known, episodes=episodes, source=source, **about, **part_columns(channels)
-    )
+    about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
+    population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
     return prepare(population, steps)
 
 
@@ -139,20 +123,18 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     >>> prepare(raw, [steps.Trim(start=1), steps.Scale(("x",), 2.0)]).read(raw.episodes[0]).ravel().tolist()
     [2.0, 8.0, 18.0]
     """
-    added = tuple(steps)
+    added, source = tuple(steps), population.source
     if not added:
         return population
-    channels, period, scaling = population.columns, population.sample_period_s, population.scaling
-    for step in added:
-        channels, period = step.channels_after(channels), step.period_after(period)
-        scaling = step.scaling_after(scaling)
-    check_structure(channels, population.episodes)
-    source = population.source
+    signals = Signals(population.columns, population.sample_period_s, population.scaling)
     if not isinstance(source, PreparedSource):
-        first, declared = population.episodes[0], (population.columns, population.sample_period_s)
-        source = PreparedSource(EvenRecordings(source), *declared, first)
+        source = PreparedSource(source, signals.channels, signals.period_s, population.episodes[0])
+    for step in added:
+        signals = step.describe(signals)
+    check_structure(signals.channels, population.episodes)
+    about: dict[str, Any] = {"scaling": signals.scaling, **part_columns(signals.channels)}
     source = replace(source, steps=source.steps + added)
-    return replace(population, sample_period_s=period, source=source, scaling=scaling, **part_columns(channels))
+    return replace(population, sample_period_s=signals.period_s, source=source, **about)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,37 +161,23 @@ def scale_population(population: Population, sizes: Mapping[str, float]) -> Popu
     return replace(population, source=Scaled(population.source, factors), **part_columns(columns))
 
 
-def mark_of(*content: Any) -> str:
-    """Return a digest of plain content, dataclasses among it by their `repr`."""
-    return hashlib.sha256(repr(content).encode()).hexdigest()
-
-
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
-    """Return what the samples of every group follow from, without reading; None where the recordings are in no file.
+    """Return digests of all that the samples of every group follow from; None where the recordings are in no file.
 
     These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
     """
     about: list[Any] = []
-    while isinstance(source, PreparedSource | EvenRecordings):
-        if isinstance(source, PreparedSource):
-            about.append((source.channels, source.period_s, source.steps, source.gaps))
-        source = source.recordings if isinstance(source, PreparedSource) else source.source
+    while isinstance(source, PreparedSource):
+        about.append((source.channels, source.period_s, source.steps, source.gaps))
+        source = source.recordings
     if not isinstance(source, Recordings):
         return [None for _ in groups]
     settings = [(f.name, getattr(source, f.name)) for f in fields(source) if f.name != "places"]
-    stamp, how = lru_cache(maxsize=64)(_stamp), mark_of(about, type(source).__name__, settings, declared)
+    stamp, how = lru_cache(maxsize=64)(stamp_of), digest_of(about, type(source).__name__, settings, declared)
 
     def mark(keys: Sequence[EpisodeKey]) -> str | None:
         files = [source.file(source.places[key]) for key in keys]
-        rows = [
-            (key, source.places[key], stamp(file)) for key, file in zip(keys, files, strict=True) if file is not None
-        ]
-        return mark_of(how, rows) if len(rows) == len(keys) else None
+        rows = [(key, source.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
+        return digest_of(how, rows) if len(rows) == len(keys) else None
 
     return [mark(keys) for keys in groups]
-
-
-def _stamp(file: Path) -> tuple[int, int]:
-    """Return size and time of change of a file."""
-    status = file.stat()
-    return status.st_size, status.st_mtime_ns

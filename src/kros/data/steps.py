@@ -1,21 +1,31 @@
 """Preparation as declared steps: small frozen objects, applied to each episode in the order given.
 
-Each step says what it does to the channels and the sampling period, so that a population can be described before
+A step describes what it does to the signals of all episodes (`describe`), so that a population can be described before
 anything is read, and does it to one recording at a time (`apply`). No step changes its argument. In TOML a step is a
 table with its name under `step`: ``[[data.prepare]] step = "trim" start = 1000``.
 
 Examples
 --------
+The column `late` lags by a sample, and the angle, in degrees, has an offset that the target shows in the first samples:
+
 >>> import kros
->>> kros.data.steps.parse_steps([{"step": "shift", "channels": ["torque"], "lag": 1}])
-(Shift(channels=('torque',), lag=1),)
+>>> from kros.data import steps
+>>> names = {"states": ["angle", "late"], "inputs": ["target"], "measured": ["angle"], "sample_period_s": 0.01}
+>>> rows = [[5.0, 9.0, 0.0], [5.0, 1.0, 0.0], [95.0, 2.0, 90.0], [185.0, 3.0, 180.0], [185.0, 4.0, 180.0]]
+>>> data = kros.from_arrays({"a": [rows]}, **names)
+>>> declared = [steps.Shift(("late",), lag=1), steps.Offset("angle", "target", 0, 2), steps.Trim(start=1)]
+>>> prepared = kros.data.prepare(data, [*declared, steps.Scale(("angle",), 0.0174533, "rad")])
+>>> prepared.read(prepared.keys()[0]).round(2).tolist(), prepared.channels[0].unit
+([[0.0, 2.0, 0.0], [1.57, 3.0, 90.0], [3.14, 4.0, 180.0]], 'rad')
+>>> steps.parse_steps([{"step": "resample", "period_s": 0.005}])
+(Resample(period_s=0.005, max_gap_s=None, passband=0.8),)
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,15 +37,29 @@ from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean, shortened
 from ..core.removed import refusing
 from .checks import check_finite
-from .population import Channel, Role
+from .population import Channel, Role, Scalings, scaling_of
 from .recording import Recording, check_increasing, estimate_period, title
-from .scaling import Scalings, scaling_of
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
 __getattr__ = refusing(__name__)
 
 Float = npt.NDArray[np.float64]
 Channels = tuple[Channel, ...]
+_ROUNDING = 1e-6  # of a sample: how far rounding may move the end of an even grid
+
+
+@dataclass(frozen=True)
+class Signals:
+    """The signals of all episodes before or after a step."""
+
+    channels: Channels
+    period_s: float
+    scaling: Scalings = field(default_factory=dict)  # where channels come from
+
+    def scaled(self, names: Iterable[str], **changes: Any) -> Signals:
+        """Return the signals with changes to where some channels come from."""
+        changed = {name: replace(scaling_of(self.scaling, name), **changes) for name in names}
+        return replace(self, scaling={**self.scaling, **changed})
 
 
 @dataclass(frozen=True)
@@ -64,22 +88,10 @@ class Step:
         names = getattr(self, "channels", None) or (getattr(self, "channel", None), getattr(self, "reference", None))
         return tuple(name for name in names if name is not None)
 
-    def check(self, period_s: float) -> None:
-        """Refuse settings that cannot be."""
-
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels as this step leaves them; refuse channels that it does not fit."""
-        self.columns(self.named, channels)
-        return channels
-
-    def period_after(self, period_s: float) -> float:
-        """Return the sampling period as this step leaves it, s."""
-        self.check(period_s)
-        return period_s
-
-    def scaling_after(self, scaling: Scalings) -> Scalings:
-        """Return where channels come from, with what this step does to them."""
-        return scaling
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals as this step leaves them; refuse settings that cannot be, and channels it does not fit."""
+        self.columns(self.named, signals.channels)
+        return signals
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the prepared recording; `channels` and `period_s` describe the one given."""
@@ -108,36 +120,21 @@ class Step:
 
 @dataclass(frozen=True)
 class Scale(Step):
-    """Multiply channels by a factor; `unit` names the new unit of measure.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[180.0], [90.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> turned = kros.data.prepare(data, [kros.data.steps.Scale(("x",), 3.14159 / 180, unit="rad")])
-    >>> turned.channels[0].unit
-    'rad'
-    """
+    """Multiply channels by a factor; `unit` names the new unit of measure."""
 
     channels: tuple[str, ...]
     factor: float
     unit: str | None = None
     step: ClassVar[str] = "scale"
 
-    def check(self, period_s: float) -> None:
-        """Refuse a factor that leaves nothing."""
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals with channels multiplied and their new unit of measure."""
         self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
-
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels with their new unit of measure."""
-        self.columns(self.channels, channels)
-        scaled = self.channels if self.unit is not None else ()
-        return tuple(replace(c, unit=self.unit or "") if c.name in scaled else c for c in channels)
-
-    def scaling_after(self, scaling: Scalings) -> Scalings:
-        """Return where channels come from, multiplied."""
-        before = {name: scaling_of(scaling, name) for name in self.channels}
-        return {**scaling, **{name: replace(s, factor=s.factor * self.factor) for name, s in before.items()}}
+        channels = list(super().describe(signals).channels)
+        for i, name in zip(self.columns(self.channels, signals.channels), self.channels, strict=True):
+            channels[i] = channels[i] if self.unit is None else replace(channels[i], unit=self.unit)
+            signals = signals.scaled([name], factor=scaling_of(signals.scaling, name).factor * self.factor)
+        return replace(signals, channels=tuple(channels))
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with some columns multiplied."""
@@ -152,32 +149,26 @@ class Shift(Step):
     """Move channels that lag the others by `lag` samples back into place; a negative `lag` is a lead.
 
     The value recorded at sample ``k + lag`` is moved to sample ``k``; the ends that have no partner are cut.
-
-    Examples
-    --------
-    >>> import kros
-    >>> names = {"states": ["x", "late"], "measured": ["x"], "sample_period_s": 0.01}
-    >>> data = kros.from_arrays({"a": [[[0.0, 9.0], [1.0, 0.0], [2.0, 1.0], [3.0, 2.0]]]}, **names)
-    >>> kros.data.prepare(data, [kros.data.steps.Shift(("late",), lag=1)]).read(data.keys()[0]).tolist()
-    [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]]
     """
 
     channels: tuple[str, ...]
     lag: int
     step: ClassVar[str] = "shift"
 
-    def scaling_after(self, scaling: Scalings) -> Scalings:
-        """Return where channels come from, moved."""
-        before = {name: scaling_of(scaling, name) for name in self.channels}
-        return {**scaling, **{name: replace(s, lag_samples=s.lag_samples + self.lag) for name, s in before.items()}}
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals with channels moved."""
+        signals = super().describe(signals)
+        for name in self.channels:
+            lag = scaling_of(signals.scaling, name).lag_samples + self.lag
+            signals = signals.scaled([name], lag_samples=lag)
+        return signals
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the aligned recording, `abs(lag)` samples shorter."""
         n, length = len(recording.values), len(recording.values) - abs(self.lag)
         if length <= 0:
-            raise DataError(
-                f"{title(recording.key)}: shifting by {self.lag} samples leaves nothing of {n}; leave it out."
-            )
+            left = f"shifting by {self.lag} samples leaves nothing of {n}"
+            raise DataError(f"{title(recording.key)}: {left}; leave it out.")
         fixed, moved = max(0, -self.lag), max(0, self.lag)
         columns, rest = self.columns(self.channels, channels), recording.cut(fixed, fixed + length)
         values = rest.values.copy()
@@ -187,17 +178,7 @@ class Shift(Step):
 
 @dataclass(frozen=True)
 class Offset(Step):
-    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)``.
-
-    Examples
-    --------
-    >>> import kros
-    >>> names = {"states": ["x"], "inputs": ["target"], "measured": ["x"], "sample_period_s": 0.01}
-    >>> data = kros.from_arrays({"a": [[[0.5, 0.0], [1.5, 1.0], [2.5, 2.0]]]}, **names)
-    >>> shifted = kros.data.prepare(data, [kros.data.steps.Offset("x", "target", 0, 2)])
-    >>> shifted.read(shifted.keys()[0])[:, 0].tolist()
-    [0.0, 1.0, 2.0]
-    """
+    """Remove a channel's constant offset: ``channel += mean(reference - channel)`` over samples ``[start, stop)``."""
 
     channel: str
     reference: str
@@ -205,15 +186,12 @@ class Offset(Step):
     stop: int
     step: ClassVar[str] = "offset"
 
-    def check(self, period_s: float) -> None:
-        """Refuse an empty window."""
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals with the offset in words."""
         self._require(0 <= self.start < self.stop, f"0 <= start < stop, found start = {self.start}, stop = {self.stop}")
-
-    def scaling_after(self, scaling: Scalings) -> Scalings:
-        """Return where channels come from, with the offset in words."""
         window = f"samples {self.start} to {self.stop - 1} of every episode"
         offset = f"mean of {self.reference} - {self.channel} over {window}"
-        return {**scaling, self.channel: replace(scaling_of(scaling, self.channel), offset=offset)}
+        return super().describe(signals).scaled([self.channel], offset=offset)
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
@@ -231,25 +209,18 @@ class Offset(Step):
 
 @dataclass(frozen=True)
 class Trim(Step):
-    """Keep samples ``[start, stop)``, without the last `tail`.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> kros.data.prepare(data, [kros.data.steps.Trim(start=1, tail=1)]).source.steps
-    (Trim(start=1, stop=None, tail=1),)
-    """
+    """Retain samples ``[start, stop)``, without the last `tail`."""
 
     start: int = 0
     stop: int | None = None
     tail: int = 0
     step: ClassVar[str] = "trim"
 
-    def check(self, period_s: float) -> None:
+    def describe(self, signals: Signals) -> Signals:
         """Refuse bounds in the wrong order."""
         ordered = self.stop is None or self.start < self.stop
         self._require(self.start >= 0 and self.tail >= 0 and ordered, f"0 <= start < stop and tail >= 0, found {self}")
+        return signals
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the shorter recording."""
@@ -277,14 +248,6 @@ class Resample(Step):
         Longest gap in time that a straight line bridges, a longer one is an error; default: ten median steps.
     passband : float
         Cut-off of the filter as a share of the new Nyquist frequency.
-
-    Examples
-    --------
-    >>> import kros
-    >>> data = kros.from_arrays({"a": [[[0.0], [1.0], [2.0]]]}, states=["x"], measured=["x"], sample_period_s=0.01)
-    >>> finer = kros.data.prepare(data, [kros.data.steps.Resample(0.005)])
-    >>> finer.read(finer.keys()[0]).ravel().tolist()
-    [0.0, 0.5, 1.0, 1.5, 2.0]
     """
 
     period_s: float
@@ -293,12 +256,12 @@ class Resample(Step):
     step: ClassVar[str] = "resample"
     makes_even: ClassVar[bool] = True
 
-    def period_after(self, period_s: float) -> float:
-        """Return the new sampling period, s."""
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals at the new sampling period."""
         self._require(0 < self.period_s < math.inf, f"period_s > 0, found {self.period_s}")
         self._require(self.max_gap_s is None or self.max_gap_s > 0, f"max_gap_s > 0, found {self.max_gap_s}")
         self._require(0 < self.passband < 1, f"0 < passband < 1, found {self.passband}")
-        return self.period_s
+        return replace(signals, period_s=self.period_s)
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording on the new grid, which starts at its first sample."""
@@ -315,13 +278,13 @@ class Resample(Step):
         if count > limits.MAX_SAMPLES:
             make = f"would make {count:g} samples of {len(time)}"
             raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
-        return replace(recording, values=self.resampled(time, recording.values, median), time_s=None)
+        return replace(recording, values=self.on_grid(time, recording.values, median), time_s=None)
 
-    def resampled(self, time_s: Float, values: Float, median_s: float) -> Float:
+    def on_grid(self, time_s: Float, values: Float, median_s: float) -> Float:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
         finer = math.ceil(self.period_s / median_s - 1e-3)
         step = self.period_s / finer
-        grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + 1e-6) + 1)
+        grid = time_s[0] + step * np.arange(math.floor((time_s[-1] - time_s[0]) / step + _ROUNDING) + 1)
         fine = np.column_stack([np.interp(grid, time_s, column) for column in values.T])
         return fine if finer == 1 else np.ascontiguousarray(lowpass(fine, self.passband * 0.5 / finer)[::finer])
 
@@ -332,15 +295,6 @@ class Differentiate(Step):
 
     The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a
     running observer could have measured.
-
-    Examples
-    --------
-    >>> import kros
-    >>> parabola = {"a": [[[(0.01 * k) ** 2] for k in range(200)]]}
-    >>> data = kros.from_arrays(parabola, states=["angle"], measured=["angle"], sample_period_s=0.01)
-    >>> with_rate = kros.data.prepare(data, [kros.data.steps.Differentiate("angle", "rate", cutoff_hz=5.0)])
-    >>> with_rate.states, float(with_rate.read(with_rate.keys()[0])[100, 1].round(6))
-    (('angle', 'rate'), 2.0)
     """
 
     channel: str
@@ -349,22 +303,17 @@ class Differentiate(Step):
     unit: str = ""
     step: ClassVar[str] = "differentiate"
 
-    def check(self, period_s: float) -> None:
-        """Refuse a cut-off that is not below the Nyquist frequency."""
-        bound = f"a cutoff_hz above zero and below the Nyquist frequency of {0.5 / period_s:g} Hz"
-        self._require(0 < self.cutoff_hz < 0.5 / period_s, f"{bound}, found {self.cutoff_hz}")
-
-    def channels_after(self, channels: Channels) -> Channels:
-        """Return the channels with the new state after the other states."""
-        self.columns(self.named, channels)
+    def describe(self, signals: Signals) -> Signals:
+        """Return the signals with the new state after the others: it has the factor of its channel, and no column."""
+        bound, channels = 0.5 / signals.period_s, super().describe(signals).channels
+        needs = f"a cutoff_hz above zero and below the Nyquist frequency of {bound:g} Hz, found {self.cutoff_hz}"
+        self._require(0 < self.cutoff_hz < bound, needs)
         if self.name in [c.name for c in channels]:
             raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
         at = _n_states(channels)
-        return (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
-
-    def scaling_after(self, scaling: Scalings) -> Scalings:
-        """Return where channels come from: the derivative has the factor of its channel, and no column."""
-        return {**scaling, self.name: replace(scaling_of(scaling, self.channel), column=None, offset="")}
+        added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
+        channels = (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
+        return replace(signals, channels=channels, scaling={**signals.scaling, self.name: added})
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with one more column."""

@@ -9,30 +9,29 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact
+from ..core.artifacts import load_artifact, loader
 from ..core.errors import DataError
-from ..core.files import is_file
-from ..core.loading import loader
+from ..core.files import is_file, link_or_copy
+from ..core.store import file_digest
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
 from .checks import check_population, refuse_copies, scan_digests
-from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit
+from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit, smallest_step
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .prepare import recording_marks
+from .readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from .recording import some, title
-from .writers.folders import same_file
-from .writers.parquet import GroupRecord, write_group, write_index
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 UNLOADED = "noload"
+_PARTS = ("train", "test")
 _TEXTS = ("dropped", "alerts", "reserve")
 
 
@@ -58,38 +57,39 @@ class RecordingFacts:
 
     def keys(self, part: str, unit: str | None = None, condition: str | None = None) -> tuple[EpisodeKey, ...]:
         """Return the episodes of a part, ``train`` or ``test``, of a unit, a condition or both."""
-        keys: Sequence[EpisodeKey] = getattr(self, part) if unit is None else self._by_unit[part].get(unit, ())
+        keys: Sequence[EpisodeKey] = getattr(self, part) if unit is None else self._by_unit.get((part, unit), ())
         return tuple(k for k in keys if condition in (None, k.condition))
 
     @cached_property
-    def _by_unit(self) -> dict[str, dict[str, list[EpisodeKey]]]:
-        """Episodes of every part and unit."""
-        parts: dict[str, dict[str, list[EpisodeKey]]] = {"train": {}, "test": {}}
-        for part, units in parts.items():
+    def _by_unit(self) -> dict[tuple[str, str], list[EpisodeKey]]:
+        """Episodes by part and unit."""
+        episodes: dict[tuple[str, str], list[EpisodeKey]] = {}
+        for part in _PARTS:
             for key in getattr(self, part):
-                units.setdefault(key.unit, []).append(key)
-        return parts
+                episodes.setdefault((part, key.unit), []).append(key)
+        return episodes
 
     def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...] | None:
-        """Return what some episodes are known again by; None where it is not known of one of them."""
+        """Return the digests of some episodes; None where that of one of them is not known."""
         digests = tuple(self.digests.get(key, "") for key in keys)
         return digests if all(digests) else None
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
-        parts = {part: getattr(self, part) for part in ("train", "test")}
-        rows = {part: [[k.unit, k.condition, k.episode] for k in keys] for part, keys in parts.items()}
         facts = {name: getattr(self, name) for name in ("identify_on", "groups", "resolution", *_TEXTS)}
-        limits = {name: asdict(limit) for name, limit in self.limits.items()}
-        digests = {part: [self.digests.get(k) for k in keys] for part, keys in parts.items()}
-        return facts | rows | {"limits": limits} | ({"digests": digests} if self.digests else {})
+        for part in _PARTS:
+            facts[part] = [[k.unit, k.condition, k.episode] for k in getattr(self, part)]
+        facts["limits"] = {name: asdict(limit) for name, limit in self.limits.items()}
+        if self.digests:
+            facts["digests"] = {part: [self.digests.get(k) for k in getattr(self, part)] for part in _PARTS}
+        return facts
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
-        parts: dict[str, Any] = {part: tuple(EpisodeKey(*row) for row in content[part]) for part in ("train", "test")}
+        parts: dict[str, Any] = {part: tuple(EpisodeKey(*row) for row in content[part]) for part in _PARTS}
         known = content.get("digests", {})
         pairs = [pair for part, keys in parts.items() for pair in zip(keys, known.get(part, ()), strict=False)]
         limits = content.get("limits", {})
@@ -109,14 +109,12 @@ class _Group:
     """One unit in one condition, for a worker; `folder` is None where the recordings stay where they are."""
 
     population: Population
-    unit: str
-    condition: str
     folder: Path | None
     on_nan: str
 
 
 @dataclass(frozen=True)
-class _Found:
+class _GroupFacts:
     """What a worker read in one unit and condition; `written` is the digest of the file that it wrote."""
 
     record: GroupRecord | None
@@ -125,11 +123,11 @@ class _Found:
     scanned: list[tuple[EpisodeKey, str]]
     alerts: tuple[str, ...]
     ends: dict[str, list[Ends]]
-    inputs: Array
+    inputs: list[Array]  # lowest and highest inputs of every episode, shape (2, m)
     sizes: list[Array]  # of the channels of every episode, with its number of samples behind them
 
 
-_KINDS = (_Found, GroupRecord, EpisodeKey, Ends, FlatTops)
+_KINDS = (_GroupFacts, GroupRecord, EpisodeKey, FlatTops)
 
 
 @dataclass(frozen=True)
@@ -150,6 +148,14 @@ class Copy:
     folder: Path
     earlier: Path
 
+    def reuse(self, group: _GroupFacts) -> bool:
+        """Take the file of the earlier copy where it is as it was written; tell whether it was."""
+        path = self.earlier / ("" if group.record is None else group.record.file)
+        if not is_file(path) or file_digest(path) != group.written:
+            return False
+        link_or_copy(path, self.folder / path.name)
+        return True
+
 
 def survey(
     population: Population, work: Work | None = None, copy: Copy | None = None, **options: Any
@@ -159,16 +165,16 @@ def survey(
     folder = None if copy is None else copy.folder
     if folder is not None:
         folder.mkdir(parents=True)
-    tasks = [_Group(population.select([u], [c]), u, c, folder, chosen.on_nan) for u, c, _ in population.groups()]
+    tasks = [_Group(population.select([u], [c]), folder, chosen.on_nan) for u, c, _ in population.groups()]
     keys = (keys for _, _, keys in population.groups())
     marks = recording_marks(population.source, keys, chosen.on_nan, folder is None)
 
-    def usable(task: _Group, known: _Found) -> bool:
-        return copy is None or _taken(known, copy)
+    def usable(task: _Group, known: _GroupFacts) -> bool:
+        return copy is None or copy.reuse(known)
 
-    found = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
-    retained = _retained(population, found, folder)
-    part = [f for task, f in zip(tasks, found, strict=True) if task.unit not in set(chosen.reserve)]
+    groups = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
+    retained = _retained(population, groups, folder)
+    part = [group for group in groups if group.scanned[0][0].unit not in set(chosen.reserve)]
     facts = _facts(population, retained, part, chosen)
     for name, limit in facts.limits.items():
         log.info("%s is limited at %s.", name, limit)
@@ -178,29 +184,29 @@ def survey(
 
 
 def _facts(
-    population: Population, retained: Population, found: Sequence[_Found], options: SurveyOptions
+    population: Population, retained: Population, groups: Sequence[_GroupFacts], options: SurveyOptions
 ) -> RecordingFacts:
-    """Return what all groups that take part tell together."""
+    """Return the facts of all groups that take part."""
     left, part = set(retained.episodes), [u for u in retained.unit_ids if u not in set(options.reserve)]
     splits = split_episodes(retained.select(part), options.test)
-    sizes = {key: size for f in found for (key, _), size in zip(f.scanned, f.sizes, strict=True)}
+    sizes = {key: size for g in groups for (key, _), size in zip(g.scanned, g.sizes, strict=True)}
     short = [f"{title(key)} has {int(size[-1])}" for key, size in sizes.items() if size[-1] < options.fewest]
     if short:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
-    alerts = [alert for f in found for alert in f.alerts] + list(scale_alerts(sizes, population.columns))
+    alerts = [alert for g in groups for alert in g.alerts] + list(scale_alerts(sizes, population.columns))
     outliers = {u for u in part if retained.unit(u).group == OUTLIERS}
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
         groups={unit: retained.unit(unit).group for unit in part},
         train=tuple(k for s in splits.values() for k in s.train),
         test=tuple(k for s in splits.values() for k in s.test),
-        resolution={m: min(f.resolution[m] for f in found) for m in retained.measured},
+        resolution={m: min(g.resolution[m] for g in groups) for m in retained.measured},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
         alerts=tuple(dict.fromkeys(alerts)),
         reserve=tuple(options.reserve),
-        limits=_limits([f for f in found if f.scanned[0][0].unit not in outliers]),
-        digests=dict(pair for f in found for pair in f.scanned),
+        limits=_limits([g for g in groups if g.scanned[0][0].unit not in outliers]),
+        digests=dict(pair for g in groups for pair in g.scanned),
     )
 
 
@@ -224,81 +230,54 @@ def condition_of(population: Population, wanted: str | None) -> str:
     return wanted
 
 
-def _read_group(task: _Group) -> _Found:
+def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
-    population, record = task.population, None
-    names, inputs = [c.name for c in population.channels], slice(len(population.states), len(population.channels))
+    population, record, written = task.population, None, None
+    ((unit, condition, _),) = population.groups()
+    names, n = [c.name for c in population.channels], len(population.states)
     ends: dict[str, list[Ends]] = {name: [] for name in population.states if name not in population.measured}
-    reach = np.array([[np.inf], [-np.inf]]) * np.ones(len(population.inputs))
     first: list[Array] = []
     sizes: list[Array] = []
+    reach: list[Array] = []
 
     def look(key: EpisodeKey, values: Array) -> None:
-        if not first:
-            first.append(values)
+        first.extend([values] if not first else [])
         sizes.append(np.append(size_of(values), len(values)))
-        columns = np.ascontiguousarray(values.T)
+        inputs = values[:, n : len(names)]
+        reach.append(np.stack([inputs.min(axis=0), inputs.max(axis=0)]))
         for name, of in ends.items():
-            signal = columns[names.index(name)]
-            of.append(ends_of(key.unit, f"{key.condition}/{key.episode}", signal, columns[inputs].T))
-        reach[0] = np.minimum(reach[0], columns[inputs].min(axis=1))
-        reach[1] = np.maximum(reach[1], columns[inputs].max(axis=1))
+            of.append(ends_of(unit, f"{condition}/{key.episode}", values[:, names.index(name)], inputs))
 
     if task.folder is None:
         digests = scan_digests(population, on_nan=task.on_nan, look=look)
     else:
-        record = write_group(population, task.unit, task.condition, task.folder, task.on_nan, look)
-        digests, record = record.recognised, replace(record, digests=())
+        record = write_group(population, unit, condition, task.folder, task.on_nan, look)
+        digests = record.recognised
     if not digests:
-        what = f"Unit {task.unit} ({task.condition}): every episode was dropped"
-        raise DataError(f"{what}; fix the source or leave the unit out.")
-    steps = {name: resolution(first[0][:, names.index(name)]) for name in population.measured}
+        raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
+    if record is not None and task.folder is not None:
+        written = file_digest(task.folder / record.file)
+    resolution = {name: smallest_step(first[0][:, names.index(name)]) for name in population.measured}
     alerts = period_alerts(first[0][:, : len(names)], population.channels, population.sample_period_s)
-    written = None if record is None or task.folder is None else _digest(task.folder / record.file)
-    return _Found(record, written, steps, digests, alerts, ends, reach, sizes)
+    return _GroupFacts(record, written, resolution, digests, alerts, ends, reach, sizes)
 
 
-def _digest(path: Path) -> str:
-    return sha256(path.read_bytes()).hexdigest()
-
-
-def _taken(known: _Found, copy: Copy) -> bool:
-    """Take the file of an earlier copy where it is as it was written; tell whether it was."""
-    if known.record is None:
-        return False
-    path = copy.earlier / known.record.file
-    if not is_file(path) or _digest(path) != known.written:
-        return False
-    same_file(path, copy.folder / known.record.file)
-    return True
-
-
-def _limits(found: Sequence[_Found]) -> dict[str, FoundLimit]:
+def _limits(groups: Sequence[_GroupFacts]) -> dict[str, FoundLimit]:
     """Return the limits that the states of all units were seen at."""
-    if not found:
+    if not groups:
         return {}
-    ranges = np.max([f.inputs[1] for f in found], axis=0) - np.min([f.inputs[0] for f in found], axis=0)
-    limits = {name: found_limit([end for f in found for end in f.ends[name]], ranges) for name in found[0].ends}
+    reach = np.concatenate([inputs for group in groups for inputs in group.inputs])
+    ranges, names = np.ptp(reach, axis=0), groups[0].ends
+    limits = {name: found_limit([e for g in groups for e in g.ends[name]], ranges) for name in names}
     return {name: limit for name, limit in limits.items() if limit is not None}
 
 
-def _retained(population: Population, found: Sequence[_Found], folder: Path | None) -> Population:
+def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:
     """Return the population of usable episodes, that of the copy where there is one."""
     if folder is not None:
-        from .readers.parquet import read_parquet
-
-        written = [(f.record, tuple(digest for _, digest in f.scanned)) for f in found]
-        records = [replace(record, digests=digests) for record, digests in written if record is not None]
-        write_index(population, records, folder, converted=False)
+        write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
         return read_parquet(folder)
-    scanned = [pair for f in found for pair in f.scanned]
+    scanned = [pair for group in groups for pair in group.scanned]
     refuse_copies(scanned)
     present = {key for key, _ in scanned}
     return replace(population, episodes=tuple(k for k in population.episodes if k in present))
-
-
-def resolution(signal: Array) -> float:
-    """Return the smallest step between samples, the quantisation of a digital sensor."""
-    steps = np.abs(np.diff(signal))
-    floor = 1e-9 * np.max(np.abs(signal))
-    return float(np.min(steps[steps > floor], initial=np.inf)) if np.any(steps > floor) else float(floor)

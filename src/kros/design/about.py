@@ -8,7 +8,7 @@ from importlib.metadata import version
 from typing import Any
 
 from ..core.artifacts import plain
-from ..data.scaling import scaling_of
+from ..data.population import scaling_of
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, ReliftCertificate, Sensor
 from .task import DesignTask

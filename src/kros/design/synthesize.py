@@ -16,9 +16,8 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import ConfigError, SynthesisError
-from ..core.loading import loader
 from ..core.settings import require_kind
 from ..core.work import Work
 from ..identify import ModelSet

@@ -14,8 +14,8 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
-from ..core.choices import member
 from ..core.errors import ConfigError, DimensionError
+from ..core.settings import member
 from ..data.batch import hold_missing as hold_missing  # beside what makes them miss
 
 Array = npt.NDArray[np.float64]

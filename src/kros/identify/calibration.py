@@ -26,12 +26,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import IdentificationError
-from ..core.loading import loader
+from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
-from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts
 
 log = logging.getLogger(__name__)
@@ -258,7 +257,7 @@ def _mark(facts: RecordingFacts, task: Task) -> str | None:
     """Return what the segments of a task follow from."""
     population, keys, spec = task
     samples = facts.marks(keys)
-    return None if samples is None else mark_of(population.columns, population.sample_period_s, spec, keys, samples)
+    return None if samples is None else digest_of(population.columns, population.sample_period_s, spec, keys, samples)
 
 
 def segments_of(task: Task) -> list[Segment]:

@@ -12,9 +12,8 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import DataError
-from ..core.loading import loader
 from ..data.population import Population
 from ..data.survey import RecordingFacts
 from ..lifting import Lifting

@@ -19,9 +19,9 @@ import numpy.typing as npt
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
+from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
-from ..data.prepare import mark_of
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
@@ -160,7 +160,7 @@ def _mark(facts: RecordingFacts, task: Task) -> str | None:
     """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
     population, keys, lifting = task
     samples = facts.marks(keys)
-    return None if samples is None else mark_of(samples, keys, population.channels, repr(lifting))
+    return None if samples is None else digest_of(samples, keys, population.channels, repr(lifting))
 
 
 def reduce_episodes(task: Task) -> Factor:

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import ConfigError
 from ..core.frequency import log_grid
-from ..core.loading import check_shapes, loader
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting

@@ -21,10 +21,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.choices import member
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
+from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .filter_bank import FilterBank

@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import CHECKSUM, check_checksum, plain, read_json, with_checksum, write_json
+from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
 from ..core.files import shortened
-from ..core.loading import as_written
 from ..core.lti import StateSpace
 from ..lifting import Lifting
 from ..synthesis.result import Injection

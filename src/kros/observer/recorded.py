@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from ..core.files import shortened
-from ..data.discovery.measures import unit_of_factor
+from ..data.discovery.roles import unit_of_factor
 from .data import ObserverData
 
 

@@ -44,7 +44,11 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     """Return what lifted states and inputs are multiplied by where other sizes take the place of an observer's own."""
     old, new = observer.lifting, observer.lifting.in_sizes(sizes)
     inputs = (*observer.inputs, *old.input_functions)
-    return old.sizes_of(old.names) / new.sizes_of(old.names), old.sizes_of(inputs) / new.sizes_of(inputs)
+    x, u = (old.sizes_of(names) / new.sizes_of(names) for names in (old.names, inputs))
+    if observer.bank is not None:  # what is estimated from inputs alone has the units of the recorded states
+        n, recorded = old.n_states, len(observer.recorded)
+        x[n - recorded : n] = x[:recorded]
+    return x, u
 
 
 def _runtime(runtime: Runtime, x: Array, y: Array, into: Array, u: Array) -> Runtime:

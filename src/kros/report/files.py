@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
-from ..core.artifacts import write_bytes
 from ..core.errors import ConfigError
-from ..core.work import Progress, Silent
+from ..core.files import write_bytes
+from ..core.work import Progress
 from .canvas import settle
 from .figures import FIGURES, draw_all
 from .run_folder import RunFolder
@@ -67,7 +67,7 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")
-    names, progress, began = [], progress or Silent(), time.perf_counter()
+    names, progress, began = [], progress or Progress(), time.perf_counter()
     progress.start("figures", len(FIGURES))
     for drawn in draw_all(RunFolder(Path(run))):
         progress.advance()

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import write_bytes
+from ..core.files import write_bytes
 from .facts import Facts
 from .figures import draw
 from .files import to_svg

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..core.choices import member
 from ..core.errors import ConfigError
-from ..core.work import Executor, Progress, Silent, Work
+from ..core.settings import member
+from ..core.work import Executor, Progress, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader
 from ..design.task import is_robust
@@ -168,7 +168,7 @@ def run_in(
     given: Population | None = None,
 ) -> RunResult:
     """Run a study in its run folder, which is open."""
-    context = Context(config, store, Work(executor, progress or Silent()), given)
+    context = Context(config, store, Work(executor, progress or Progress()), given)
     run_steps(context, STEPS, until)
     metrics = collect_metrics(context, until)
     store.keep("metrics.json", metrics)

@@ -8,11 +8,10 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from ..core.artifacts import load_artifact, save_artifact
-from ..core.choices import member
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
-from ..core.loading import loader
 from ..core.lti import StateSpace
+from ..core.settings import member
 
 log = logging.getLogger(__name__)
 

@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.choices import member
 from ..core.errors import DimensionError
+from ..core.settings import member
 from ..core.small_matrices import (
     condition_number,
     entries_first,

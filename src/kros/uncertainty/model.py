@@ -15,8 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
-from ..core.loading import check_shapes, loader
+from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.certificate import Method

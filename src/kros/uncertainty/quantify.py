@@ -16,9 +16,8 @@ from typing import Any, overload
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, read_json, save_artifact, write_json
+from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.errors import IdentificationError
-from ..core.loading import loader
 from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from ..core.work import Work

@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
-from ..core.loading import check_shapes, loader
 from .forms import Form, residual
 from .weights.cover import Cover, cover_ratio
 from .weights.magnitude import fit_magnitude

@@ -24,10 +24,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, save_artifact
+from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import ConfigError, DataError
 from ..core.frequency import check_grid
-from ..core.loading import check_shapes, loader
 from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, as_form, residual

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.errors import DataError
-from ..readers.csvfile import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
-from .measures import is_unit_row
+from ..readers.tables import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
+from .roles import is_unit_row
 
 HEAD_BYTES = 1 << 18
 ROWS = 60  # first rows of numbers that are looked at closely
@@ -53,7 +53,10 @@ class TableHead:
 
 def look_at(path: Path) -> TableHead:
     """Return how a text file is written: the reading with most rows of numbers of equal width."""
-    content = _head(path)
+    with opened(path) as file:
+        content = b""
+        while len(content) < HEAD_BYTES and (more := file.read(HEAD_BYTES - len(content))):
+            content += more
     encoding = encoding_of(content)
     lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
     lines = lines[:-1] if len(content) >= HEAD_BYTES else lines
@@ -78,14 +81,6 @@ def encoding_of(content: bytes) -> str:
         except UnicodeDecodeError:
             continue
     return "latin-1"
-
-
-def _head(path: Path) -> bytes:
-    with opened(path) as file:
-        content = b""
-        while len(content) < HEAD_BYTES and (more := file.read(HEAD_BYTES - len(content))):
-            content += more
-    return content
 
 
 def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:

@@ -19,14 +19,13 @@ from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
-from ..readers.csv_folder import csv_files, file_fields, parquet_columns, parquet_head, read_csv_folder
-from ..readers.csvfile import Dialect, read_columns
+from ..readers.csv_folder import csv_files, read_csv_folder
+from ..readers.tables import PARQUET, Dialect, file_fields, parquet_head, read_columns
 from ..recording import some, usable
 from .dialect import ROWS, TableHead, look_at
 from .examine import RULE, Examined, examine
 from .filenames import infer_names, quoted
-from .measures import SECONDS
-from .roles import UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
+from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
 Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
@@ -57,11 +56,11 @@ class Discovery:
 
 
 def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of text tables or of anybody's Parquet files."""
+    """Describe a folder of text tables or of Parquet files of any layout."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     mapping, notes = _names(list(alike), wanted.files)
-    mapping |= _dialect_keys(head.dialect)
+    mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, why = _columns(source, head, list(alike.values()), wanted.period_s)
     mapping, notes = mapping | keys, notes | why
     columns = _decided(columns, wanted, ask)
@@ -138,13 +137,6 @@ def _head_of(path: Path) -> TableHead | None:
     return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(rows))
 
 
-def _dialect_keys(dialect: Dialect) -> dict[str, Any]:
-    """Return what is not as usual."""
-    names = ("delimiter", "decimal", "encoding", "header", "skip_rows", "unit_rows")
-    values = {name: getattr(dialect, name) for name in names}
-    return {name: value for name, value in values.items() if value != getattr(Dialect(), name)}
-
-
 def _columns(
     source: Path, head: TableHead, paths: Sequence[Path], period_s: float | None
 ) -> tuple[list[TableColumn], dict[str, Any], dict[str, str]]:
@@ -157,19 +149,18 @@ def _columns(
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
         problem = "the files looked at have fewer than three rows of numbers"
         raise DataError(f"Looking at {source}: {problem}; check the folder.")
-    time, keys, notes = (
-        (None, {"sample_period_s": period_s}, {}) if period_s else _time(head, described, numeric, samples)
-    )
-    if time is None and not period_s:
-        raise DataError(f"Looking at {source}: {_no_time(described)}; give the sampling period, --period SECONDS.")
-    if time is not None:
+    time: int | None = None
+    keys: dict[str, Any] = {"sample_period_s": period_s}
+    notes: dict[str, str] = {}
+    if not period_s:
+        time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)
     for i, column in zip(numeric, propose([described[i] for i in numeric], samples), strict=True):
         described[i] = column
     for i, column in enumerate(described):
         if i not in numeric and i != time:
             described[i] = replace(column, why="no numbers")
-    return [c for c, field_ in zip(described, head.fields, strict=True) if field_], keys, notes
+    return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
 
 
 def _described(head: TableHead) -> list[TableColumn]:
@@ -184,8 +175,8 @@ def _described(head: TableHead) -> list[TableColumn]:
 
 
 def _time(
-    head: TableHead, columns: Sequence[TableColumn], numeric: Sequence[int], samples: Sequence[Array]
-) -> tuple[int | None, dict[str, Any], dict[str, str]]:
+    source: Path, head: TableHead, columns: Sequence[TableColumn], numeric: Sequence[int], samples: Sequence[Array]
+) -> tuple[int, dict[str, Any], dict[str, str]]:
     """Return the column of time, the keys of a mapping that describe it, and what they rest on."""
     candidates = time_columns([columns[i] for i in numeric], samples)
     texts = [i for i in range(len(columns)) if head.timestamp(i) is not None]
@@ -197,16 +188,12 @@ def _time(
         return (at, keys, {}) if scale == 1 else (at, keys | {"time_scale": scale}, {"time_scale": why})
     if texts:
         return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
-    return None, {}, {}
-
-
-def _no_time(columns: Sequence[TableColumn]) -> str:
-    """Return why no column is time."""
     called = next((c.header for c in columns if c.kind == "time"), None)
-    actual = f"found the columns {', '.join(repr(c.header) for c in columns)}"
-    if called is None:
-        return f"no column increases like time, {actual}"
-    return f"{called!r} stands still or runs back in places, as rounded times do, {actual}"
+    problem = f"{called!r} stands still or runs back in places, as rounded times do"
+    problem = "no column increases like time" if called is None else problem
+    found = ", ".join(repr(c.header) for c in columns)
+    advice = "give the sampling period, --period SECONDS"
+    raise DataError(f"Looking at {source}: {problem}, found the columns {found}; {advice}.")
 
 
 def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
@@ -219,22 +206,24 @@ def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
-    if path.suffix == ".parquet":
-        return parquet_columns(path, [head.fields[i] for i in columns])
-    names = [f"{field or 'column'} #{i + 1}" for i, field in enumerate(head.fields)]
+    """Read the numeric columns of a file, shape (n_columns, n_rows)."""
+    if path.suffix == PARQUET:
+        return read_columns(path, file_fields(path), [head.fields[i] for i in columns])
+    names = [f"{name or 'column'} #{i + 1}" for i, name in enumerate(head.fields)]
     return read_columns(path, names, [names[i] for i in columns], head.dialect)
 
 
 def _channel(column: TableColumn) -> dict[str, Any]:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     reference = column.reference if column.reference != column.name else None
-    optional = {
+    table = {
+        "name": column.name,
+        "column": reference,
+        "role": "input" if column.part is ColumnPart.INPUT else "state",
         "measured": column.part is ColumnPart.MEASURED or None,
         "unit": column.unit or None,
         "scale": column.scale if column.scale != 1 else None,
     }
-    role = "input" if column.part is ColumnPart.INPUT else "state"
-    table = {"name": column.name, "column": reference, "role": role, **optional}
     return {key: value for key, value in table.items() if value is not None}
 
 
@@ -287,8 +276,7 @@ def _examined(
     wrong = dict(examined.wrong)
     if not examined.counts:
         key, why = next(iter(wrong.items()), (next(iter(examined.nan), ""), "no number in some samples"))
-        problem = f"none of {len(population.episodes)} episodes can be used; {key}: {why}"
-        raise DataError(f"Looking at {source}: {problem}.")
+        raise DataError(f"Looking at {source}: none of {len(population.episodes)} episodes can be used; {key}: {why}.")
     few = [group for group, n in examined.counts.items() if n < 2]
     if few and 2 * len(few) > len(examined.counts) and examined.shortest >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}
@@ -304,26 +292,29 @@ def _examined(
         findings.append(f"{len(examined.nan)} episodes hold NaN or infinity and are dropped, {first}")
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
-    prepare, text = _resampling(population, source, examined)
-    findings += _too_few(retained) + text
+    prepare: tuple[dict[str, Any], ...] = ()
+    if examined.resample_s is not None:
+        prepare = (_resampling(examined),)
+        findings.append(_unevenness(population, source, examined))
+    findings = [*findings, *_too_few(retained)]
     reading, nan = _reading(retained, source), bool(examined.nan)
     return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), nan, reading)
 
 
-def _resampling(
-    population: Population, source: Path, examined: Examined
-) -> tuple[tuple[dict[str, Any], ...], list[str]]:
-    """Return the step that brings uneven time to one period, and what is said of it; nothing where time is even."""
-    if examined.resample_s is None:
-        return (), []
-    bridged = {"max_gap_s": examined.max_gap_s} if examined.max_gap_s is not None else {}
-    where = ""
-    if examined.uneven is not None:
-        key, sample = examined.uneven
-        where = f", the worst step in {_relative(population, source, key)} at sample {sample}"
+def _resampling(examined: Examined) -> dict[str, Any]:
+    """Return the step that brings uneven time to one period."""
+    step = {"step": "resample", "period_s": examined.resample_s, "max_gap_s": examined.max_gap_s}
+    return {key: value for key, value in step.items() if value is not None}
+
+
+def _unevenness(population: Population, source: Path, examined: Examined) -> str:
+    """Return a sentence on uneven time."""
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"time is uneven: everything is brought to a period of {examined.resample_s:g} s {recorded}{where}"
-    return ({"step": "resample", "period_s": examined.resample_s, **bridged},), [text]
+    text = f"time is uneven: everything is brought to a period of {examined.resample_s:g} s {recorded}"
+    if examined.uneven is None:
+        return text
+    key, sample = examined.uneven
+    return f"{text}, the worst step in {_relative(population, source, key)} at sample {sample}"
 
 
 def _reading(population: Population, source: Path) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -13,9 +12,8 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...core.work import Work
 from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
-from ..population import Channel, EpisodeKey, Population, Role
-from ..prepare import PreparedSource
-from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, Recording, check_increasing, title
+from ..population import EpisodeKey, Population
+from ..recording import PERIOD_TOLERANCE, TIME_TOLERANCE, check_increasing
 
 Array = npt.NDArray[np.float64]
 
@@ -31,7 +29,6 @@ class DiscoveryRule:
     gap: float = 10.0  # median steps that a step may take before it is a gap, as in the step `resample`
     bridged: float = 50.0  # median steps of the longest gap that is bridged
     often: float = 0.2  # share of episodes with gaps, from which on gaps are bridged
-    long_rest: float = 0.2  # of an episode, from which on a signal that stands still while others move is reported
     slower: float = 1.5  # times the median period, from which on an episode was sampled too slowly
 
 
@@ -44,12 +41,11 @@ class EpisodeLook:
 
     key: EpisodeKey
     wrong: str = ""  # why it cannot be used, or nothing
-    doubts: tuple[str, ...] = ()  # what is odd about it
     n_samples: int = 0
     period_s: float = np.nan  # median step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
     gap: tuple[float, int] = (0.0, 0)  # longest step of time, s, where it is a gap, and the sample before it
-    nan: bool = False
+    nan: str = ""  # where it holds NaN or infinity, or nothing
     digest: str = ""
 
 
@@ -71,25 +67,22 @@ def examine(population: Population, work: Work | None = None) -> Examined:
     """Read every episode once, as it was recorded."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
-    usable_looks = [s for s in looks if not s.wrong]
-    median = float(np.median([s.period_s for s in usable_looks])) if usable_looks else np.nan
-    gaps = [s.gap[0] for s in usable_looks if s.gap[0] and s.period_s <= RULE.slower * median]
-    many = len(gaps) > RULE.often * len(usable_looks)
+    readable = [s for s in looks if not s.wrong]
+    median = float(np.median([s.period_s for s in readable])) if readable else np.nan
+    gaps = [s.gap[0] for s in readable if s.gap[0] and s.period_s <= RULE.slower * median]
+    many = len(gaps) > RULE.often * len(readable)
     bridged = max((g for g in gaps if many and g <= RULE.bridged * median), default=0.0)
     wrong = {s.key: problem for s in looks if (problem := _problem(s, median, bridged))}
     for key, other in copies_among((s.key, s.digest) for s in looks if s.digest and s.key not in wrong):
         wrong[key] = f"a copy of {other}"
     good = [s for s in looks if s.key not in wrong]
     n_bridged = sum(s.gap[0] > 0 for s in good)
-    doubts = [d for s in good for d in s.doubts]
-    if n_bridged:
-        how = f"of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"
-        doubts.insert(0, f"{n_bridged} episodes have gaps, {how}")
+    how = f"of up to {bridged:.3g} s: they are bridged by straight lines (max_gap_s)"
     worst = max((s for s in good if s.uneven[0]), key=lambda s: s.uneven, default=None)
     different = any(abs(s.period_s - median) > PERIOD_TOLERANCE * median for s in good)
     return Examined(
         wrong,
-        tuple(doubts),
+        (*([f"{n_bridged} episodes have gaps, {how}"] if n_bridged else []), *(s.nan for s in good if s.nan)),
         resample_s=float(f"{median:.3g}") if worst is not None or different else None,
         nan=tuple(s.key for s in good if s.nan),
         counts=Counter((s.key.unit, s.key.condition) for s in good if not s.nan),
@@ -101,12 +94,10 @@ def examine(population: Population, work: Work | None = None) -> Examined:
 
 def _problem(look: EpisodeLook, median: float, bridged: float) -> str:
     """Return why an episode cannot be used beside the others, or nothing."""
-    if look.wrong:
-        return look.wrong
-    if look.period_s > RULE.slower * median:
+    if not look.wrong and look.period_s > RULE.slower * median:
         return f"sampled every {look.period_s:.3g} s, the others every {median:.3g} s"
     gap, sample = look.gap
-    return f"a gap of {gap:.3g} s after sample {sample}" if gap > bridged else ""
+    return look.wrong or (f"a gap of {gap:.3g} s after sample {sample}" if gap > bridged else "")
 
 
 def _look(population: Population) -> list[EpisodeLook]:
@@ -116,23 +107,21 @@ def _look(population: Population) -> list[EpisodeLook]:
     for key in population.episodes:
         looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
-            recording = source.recordings(key) if isinstance(source, PreparedSource) else Recording(key, source(key))
-            values = recording.values
+            recording = source.recorded(key)
             check_increasing(recording)
-            looks[key] = look = _timed(replace(looks[key], n_samples=len(values)), recording.time_s)
-            check_episode(values, key, population.columns)
-            doubts = tuple(_rests(key, values, population.columns))
-            looks[key] = replace(look, doubts=doubts, digest=digest_of(values))
-            watch.add(key, values)
+            looks[key] = _timed(replace(looks[key], n_samples=len(recording.values)), recording.time_s)
+            check_episode(recording.values, key, population.columns)
+            looks[key] = replace(looks[key], digest=digest_of(recording.values))
+            watch.add(key, recording.values)
         except NonFiniteError as error:
-            looks[key] = replace(looks[key], nan=True, doubts=(str(error),))
+            looks[key] = replace(looks[key], nan=str(error))
         except DataError as error:
             looks[key] = replace(looks[key], wrong=str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())
 
 
 def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
-    """Return a look with what the steps of time say."""
+    """Return a look with its period, and its most uneven step and its longest gap."""
     if time is None or len(time) < 2:
         return look
     steps = np.diff(time)
@@ -142,20 +131,3 @@ def _timed(look: EpisodeLook, time: Array | None) -> EpisodeLook:
     uneven = (float(deviation[worst]), worst) if deviation[worst] > TIME_TOLERANCE else look.uneven
     gap = (float(steps[longest]), longest) if steps[longest] > RULE.gap * period else look.gap
     return replace(look, period_s=period, uneven=uneven, gap=gap)
-
-
-def _rests(key: EpisodeKey, values: Array, channels: Sequence[Channel]) -> list[str]:
-    """Report where a state stands still for long while other states move a good part of their range."""
-    states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
-    ranges, texts = np.ptp(values, axis=0), []
-    for i in states:
-        ends = np.concatenate([[-1], np.flatnonzero(np.diff(values[:, i]) != 0), [len(values) - 1]])
-        longest = int(np.diff(ends).argmax())
-        start, stop = int(ends[longest]) + 1, int(ends[longest + 1]) + 1
-        if stop - start < max(50, RULE.long_rest * len(values)):
-            continue
-        moving = [channels[j].name for j in states if j != i and np.ptp(values[start:stop, j]) > 0.2 * ranges[j] > 0]
-        if moving:
-            rest = f"{channels[i].name!r} stays at {values[start, i]:g} from sample {start} to {stop - 1}"
-            texts.append(f"{title(key)}: {rest} while {', '.join(moving)} move")
-    return texts

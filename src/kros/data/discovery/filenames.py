@@ -46,22 +46,12 @@ class FileNames:
     other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
 
 
-@dataclass(frozen=True)
 class _Cut:
     """Paths cut into words: `rows` with a word for every place, `marks` with what is between places, path by path."""
 
-    rows: list[list[str]]
-    marks: list[list[str]]
-
-    @classmethod
-    def of(cls, parts: Sequence[Sequence[str]]) -> _Cut:
-        """Return the cut of words that alternate with marks."""
-        return cls([list(p[::2]) for p in parts], [list(p[1::2]) for p in parts])
-
-    @property
-    def columns(self) -> list[tuple[str, ...]]:
-        """The words at every place."""
-        return list(zip(*self.rows, strict=True))
+    def __init__(self, parts: Sequence[Sequence[str]]) -> None:
+        self.rows, self.marks = [p[::2] for p in parts], [p[1::2] for p in parts]
+        self.columns = list(zip(*self.rows, strict=True))
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
@@ -70,7 +60,7 @@ def infer_names(paths: Sequence[str]) -> FileNames:
     endings = sorted({re.escape(ending) for _, ending in parts if ending})
     ending = endings[0] if len(endings) == 1 else f"(?:{'|'.join(endings)})"
     stems = [stem for stem, _ in parts]
-    for cut in (_words(stems), _aligned(stems), _whole(stems)):
+    for cut in (_words(stems), _aligned(stems)):
         if cut is None:
             continue
         roles, sure = _roles(cut.columns)
@@ -96,7 +86,7 @@ def _words(stems: Sequence[str]) -> _Cut | None:
     for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)"):
         parts = [re.split(marks, s) for s in stems]
         if len(set(map(len, parts))) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
-            return _Cut.of(parts)
+            return _Cut(parts)
     return None
 
 
@@ -108,18 +98,7 @@ def _aligned(stems: Sequence[str]) -> _Cut | None:
         head += 2
     tail = fewest - head - 1
     cut = [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts]
-    return _Cut.of(cut) if tail > 0 else None
-
-
-def _whole(stems: Sequence[str]) -> _Cut | None:
-    """Cut into folders and the first word of the name, where that is all that paths have in common."""
-    parts = [re.split(r"(/)", s) for s in stems]
-    if len(set(map(len, parts))) != 1:
-        return None
-    last = [match.groups() for p in parts if (match := re.match(r"([^_\- ]+)([_\- ]+)(.+)$", p[-1]))]
-    return _Cut.of(
-        [[*p[:-1], *words] for p, words in zip(parts, last, strict=True)] if len(last) == len(parts) else parts
-    )
+    return _Cut(cut) if tail > 0 else None
 
 
 def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
@@ -185,9 +164,7 @@ def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequ
         elif roles[i] is None:
             few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i]) and i != varying[-1]
             labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
-            free: str = (
-                UNIT if labels and not before else EPISODE
-            )  # KDN_1bar, O-ring257_3bar: these words count nothing
+            free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
             roles[i] = CONDITION if (before or few) and CONDITION not in roles else free
 
 
@@ -209,7 +186,7 @@ def _contiguous(roles: Roles) -> Roles:
 
 
 def quoted(text: str) -> str:
-    """Return a text as an expression, without escapes that nobody needs."""
+    """Return a text as an expression, without escapes that are not needed."""
     return re.sub(r"\\([^\w\s.^$*+?{}\[\]|()\\])|\\ ", lambda m: m[1] or " ", re.escape(text))
 
 

@@ -1,8 +1,13 @@
-"""What the columns of a table are likely to be: time, measured states, hidden states, inputs, or not needed."""
+"""Columns of a table: units of measure, kinds of quantities, names of channels, and what they are likely to be.
+
+A column is time, a measured state, a hidden state, an input, or not needed.
+"""
 
 from __future__ import annotations
 
+import math
 import re
+import unicodedata
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
@@ -11,21 +16,33 @@ import numpy as np
 import numpy.typing as npt
 
 from ..alerts import LONGEST_S, SHORTEST_S
-from .measures import SECONDS, clean_unit, identifier, kind_of_unit, split_header, to_radians
 
 Array = npt.NDArray[np.float64]
-
-
-class ColumnPart(str, Enum):
-    """What a column is taken for."""
-
-    TIME = "time"
-    MEASURED = "measured"
-    STATE = "state"
-    INPUT = "input"
-    LEFT_OUT = "left out"
-
-
+_TIMES = {1.0: "s sec seconds sek", 1e-3: "ms msec", 1e-6: "us µs μs", 1e-9: "ns", 60.0: "min", 3600.0: "h"}
+SECONDS = {unit: factor for factor, units in _TIMES.items() for unit in units.split()}
+_KINDS = {
+    "angle": "rad mrad deg ° grad rev turn turns u umdr",
+    "position": "m mm cm um µm μm km in inc counts cnt",
+    "velocity": "rad/s deg/s °/s m/s mm/s cm/s rpm 1/min u/min min-1 min^-1 rev/s upm hz",
+    "acceleration": "m/s2 m/s^2 m/s² rad/s2 rad/s^2 rad/s² deg/s² °/s²",
+    "current": "a ma",
+    "voltage": "v mv",
+    "torque": "nm n·m n*m mnm knm ncm",
+    "force": "n kn mn",
+    "pressure": "pa kpa mpa hpa bar mbar psi",
+    "temperature": "°c degc k °f c",
+    "other": "w kw kg g % - 1 l/min l/s pct percent none bool hex dez",
+    "time": " ".join(SECONDS),
+}
+KIND_OF = {unit: kind for kind, units in _KINDS.items() for unit in units.split()}
+_ANGLES = {"deg ° grad": math.pi / 180, "mrad": 1e-3, "rev turn turns umdr": 2 * math.pi}
+_SPEEDS = {"deg/s °/s": math.pi / 180, "rpm 1/min u/min min-1 min^-1 upm": math.pi / 30, "rev/s": 2 * math.pi}
+_TO_RADIANS = {
+    unit: (factor, base)
+    for base, factors in (("rad", _ANGLES), ("rad/s", _SPEEDS))
+    for units, factor in factors.items()
+    for unit in units.split()
+}
 WORDS = {
     "input": "target desired des cmd command commanded setpoint soll sollwert sollposition solldrehzahl ref reference "
     "sollgeschwindigkeit consigne con ctrl control input inputs pwm duty stell stellgroesse stellwert feedforward "
@@ -49,6 +66,20 @@ _OF_WORD = {word: kind for kind, words in WORDS.items() for word in words.split(
 UNKNOWN = "not recognised"
 _STATES = ("angle", "position", "velocity", "current", "torque", "force", "pressure", "acceleration")
 _FIRST_MEASURED = (("angle", "position"), ("velocity",), ("pressure",), ("current",), ("force",), ("torque",))
+_BRACKETED = re.compile(r"^(.*?)[\s_]*[\[({<]\s*([^\[\](){}<>]*?)\s*[\])}>]\s*$")
+_AFTER = re.compile(r"^(.+?)(?:\s+in\s+|\s*/\s*|\s*,\s*|\s+)(\S+)$")
+_LETTERS = "ae oe ue ss Ae Oe Ue d omega phi theta alpha tau"
+_SPELLED = dict(zip("äöüßÄÖÜΔωφθατ", _LETTERS.split(), strict=True))
+
+
+class ColumnPart(str, Enum):
+    """What a column is taken for."""
+
+    TIME = "time"
+    MEASURED = "measured"
+    STATE = "state"
+    INPUT = "input"
+    LEFT_OUT = "left out"
 
 
 @dataclass(frozen=True)
@@ -70,14 +101,66 @@ class TableColumn:
         return self.header if self.number is None else self.number
 
 
+def _bare(text: str) -> str:
+    return text.strip().strip("[](){}").strip()
+
+
+def _plain(unit: str) -> str:
+    return _bare(unicodedata.normalize("NFC", unit)).lower().replace(" ", "").replace("º", "°")
+
+
+def split_header(text: str) -> tuple[str, str]:
+    """Return the name and the unit in a header such as ``pos [mm]``, ``Weg in mm``, ``i/A`` or ``time_ms``."""
+    text = text.strip()
+    bracketed, after = _BRACKETED.match(text), _AFTER.match(text)
+    if bracketed and bracketed[1]:
+        return bracketed[1].strip(), bracketed[2]
+    if after and _plain(after[2]) in KIND_OF and (len(after[2]) > 1 or "/" in text or " in " in text):
+        return after[1].strip(), after[2]
+    stem, _, last = text.rpartition("_")
+    unit = _plain(last) in KIND_OF and (len(last) > 1 or last == "s") and last not in ("in", "no", "none", "min")
+    return (stem, last) if stem and unit else (text, "")
+
+
+def is_unit_row(cells: Sequence[str]) -> bool:
+    """Tell whether a row holds units of measure."""
+    written = [c.strip() for c in cells if c.strip()]
+    units = sum(_plain(c) in KIND_OF or (c.startswith("[") and c.endswith("]")) for c in written)
+    return bool(written) and 2 * units > len(written)
+
+
+def clean_unit(text: str) -> str:
+    """Return a unit without brackets; nothing for a dash."""
+    bare = _bare(text)
+    return {"-": "", "1": "", "none": "", "°": "deg", "°/s": "deg/s"}.get(bare, bare)
+
+
+def unit_of_factor(factor: float, unit: str) -> str:
+    """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
+    sizes = ((name, size) for name, (size, base) in _TO_RADIANS.items() if base == unit)
+    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=1e-6)), "")
+
+
+def identifier(text: str, taken: Collection[str] = ()) -> str:
+    """Return a name for a channel that may stand in formulas and in C source, as close to the header as can be."""
+    if text.isidentifier() and text.isascii() and text not in taken:
+        return text
+    spelled = "".join(_SPELLED.get(letter, letter) for letter in text)
+    ascii_text = unicodedata.normalize("NFKD", spelled).encode("ascii", "ignore").decode().lower()
+    name = re.sub(r"\W+", "_", ascii_text).strip("_") or "channel"
+    name = name if name[0].isalpha() else f"c{name}"
+    numbered = (f"{name}_{n}" for n in range(2, len(taken) + 3))
+    return next(n for n in (name, *numbered) if n not in taken)
+
+
 def describe(header: str, unit: str, taken: Collection[str]) -> TableColumn:
     """Return a column by its header and the unit in a row of units, without a part."""
-    split = split_header(header)
-    unit = clean_unit(unit) or clean_unit(split.unit)
-    name = split.name if split.unit or not header.isidentifier() else header
-    name = identifier(f"column_{name}" if name.isdigit() else name, list(taken))
-    kind = kind_of(split.name, unit)
-    radians = to_radians(unit) if kind in ("angle", "velocity", "position") else None
+    stem, written = split_header(header)
+    unit = clean_unit(unit) or clean_unit(written)
+    name = header if header.isidentifier() and not written else stem
+    name = identifier(f"column_{name}" if name.isdigit() else name, taken)
+    kind = kind_of(stem, unit)
+    radians = _TO_RADIANS.get(_plain(unit)) if kind in ("angle", "velocity", "position") else None
     scale, unit = radians or (1.0, unit)
     return TableColumn(header, name, unit, scale, kind)
 
@@ -91,8 +174,9 @@ def _kinds_of(name: str) -> list[str]:
 
 def kind_of(name: str, unit: str = "") -> str:
     """Return the kind of quantity that a channel is, by its unit of measure or its name, or nothing."""
+    of_unit = KIND_OF.get(_plain(unit), "other")
     quantities = (kind for kind in _kinds_of(name) if kind not in ("", "input", "spare"))
-    return kind_of_unit(unit) or next(quantities, "")
+    return next(quantities, "") if of_unit == "other" else of_unit
 
 
 def is_commanded(name: str) -> bool:
@@ -136,8 +220,11 @@ def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[Ta
     """Return the columns with the part that each is likely to have; time is known already."""
     proposed: list[TableColumn] = []
     for i, column in enumerate(columns):
-        spare = _spare(i, column, proposed, samples) if column.part is not ColumnPart.TIME else ""
-        proposed.append(replace(column, part=ColumnPart.LEFT_OUT, why=spare) if spare else _by_name(column))
+        part, why = column.part, column.why
+        if part is not ColumnPart.TIME:
+            spare = _spare(i, column, proposed, samples)
+            part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
+        proposed.append(replace(column, part=part, why=why))
     free = [c.kind for c in proposed if c.part is ColumnPart.STATE]
     first = next((kinds for kinds in _FIRST_MEASURED if set(kinds) & set(free)), ())
     measured = [c for c in proposed if c.part is ColumnPart.STATE and c.kind in first]
@@ -156,19 +243,15 @@ def _spare(i: int, column: TableColumn, before: Sequence[TableColumn], samples: 
         return "counts the samples"
     if "spare" in _kinds_of(column.name):
         return "by its name"
-    for j, other in enumerate(before):
-        if other.part is not ColumnPart.LEFT_OUT and all(np.array_equal(s[i], s[j]) for s in samples):
-            return f"the same as {other.header!r}"
-    return ""
+    copies = (j for j, c in enumerate(before) if c.part is not ColumnPart.LEFT_OUT)
+    same = next((j for j in copies if all(np.array_equal(s[i], s[j]) for s in samples)), None)
+    return "" if same is None else f"the same as {before[same].header!r}"
 
 
-def _by_name(column: TableColumn) -> TableColumn:
-    """Return a column with the part that its name and unit of measure speak for."""
-    if column.part is ColumnPart.TIME:
-        return column
-    if is_commanded(split_header(column.header).name) or column.kind == "voltage":
-        return replace(column, part=ColumnPart.INPUT, why="a command or a voltage, by name and unit")
+def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
+    """Return the part that the name and the unit of measure of a column speak for, and why."""
+    if is_commanded(split_header(column.header)[0]) or column.kind == "voltage":
+        return ColumnPart.INPUT, "a command or a voltage, by name and unit"
     if column.kind in _STATES:
-        return replace(column, part=ColumnPart.STATE, why=f"{column.kind}, by name or unit")
-    why = "a second column of time" if column.kind == "time" else UNKNOWN
-    return replace(column, part=ColumnPart.LEFT_OUT, why=why)
+        return ColumnPart.STATE, f"{column.kind}, by name or unit"
+    return ColumnPart.LEFT_OUT, "a second column of time" if column.kind == "time" else UNKNOWN

@@ -120,15 +120,14 @@ def as_numbers(values: Any) -> Array:
     """Return an array of doubles; text, complex numbers and dates are refused rather than converted."""
     array = np.asarray(values)
     kind = array.dtype.kind
-    if kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist()):
-        raise TypeError("text or complex numbers cannot be used as real numbers")
-    if kind not in "biufO":
-        raise TypeError(f"{array.dtype} cannot be used as real numbers")
+    mixed = kind == "O" and any(isinstance(v, (str, bytes, complex)) for v in array.ravel().tolist())
+    if mixed or kind not in "biufO":
+        raise TypeError(f"{'text or complex' if mixed else array.dtype} cannot be used as real numbers")
     return np.asarray(array, dtype=float)
 
 
 def _named(items: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield what a mapping or a list holds, with its key or number."""
+    """Yield the items of a mapping or a list, with their keys or numbers."""
     if isinstance(items, Mapping):
         yield from items.items()
     elif isinstance(items, Iterable) and not isinstance(items, str | bytes) and getattr(items, "shape", True):
@@ -164,8 +163,8 @@ def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> Arra
             raise DataError(f"{title(key)}: {actual}; add it, or correct the names.")
         episode = tuple(episode[name] for name in names)
     try:
-        parts = [as_numbers(part) for part in episode] if isinstance(episode, tuple) else []
-        values = np.column_stack(parts) if parts else as_numbers(episode)
+        whole = not isinstance(episode, tuple)
+        values = as_numbers(episode) if whole else np.column_stack([as_numbers(part) for part in episode])
     except (ValueError, TypeError, OverflowError, RecursionError) as error:
         needs = f"needs numbers of shape (n_samples, {len(channels)})"
         raise DataError(f"{title(key)}: {needs}, found something else ({error}); correct the array.") from error
@@ -223,18 +222,17 @@ def from_frame(
     Population(2 units, 1 condition, 2 episodes every 0.01 s; states x (measured); inputs u)
     """
     if type(frame).__module__.partition(".")[0] != "pandas" or not hasattr(frame, "columns"):
-        raise DataError(
-            f"from_frame needs a pandas DataFrame, found {type(frame).__name__}; use from_arrays for arrays."
-        )
+        actual = f"found {type(frame).__name__}"
+        raise DataError(f"from_frame needs a pandas DataFrame, {actual}; use from_arrays for arrays.")
     if (time is None) == (sample_period_s is None):
         actual = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
         raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
     ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
     _check_columns(frame, [unit, *([time] if time else []), *(c.name for c in ordered)], [condition, episode])
-    defaults = ((unit, ""), (condition, DEFAULT_CONDITION), (episode, "0"))
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
-    rows = _rows_of(map(EpisodeKey, *(_ids(frame, *named) for named in defaults)))
+    ids = _ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
+    rows = _rows_of(map(EpisodeKey, *ids))
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
     return assemble(ArrayRecordings(places), ordered, units, sample_period_s, metadata)
 
@@ -242,15 +240,11 @@ def from_frame(
 def _check_columns(frame: Any, required: Sequence[str], optional: Sequence[str | None]) -> None:
     """Refuse a frame in which a column is missing or occurs twice."""
     columns = list(frame.columns)
-    counts = {name: columns.count(name) for name in (*required, *optional) if name is not None}
-    for name, count in counts.items():
-        if count == 0 and name in required:
-            advice = "rename a column or correct the channels"
-            raise DataError(f"from_frame: column {name!r} is missing, found {columns}; {advice}.")
-        if count > 1:
-            raise DataError(
-                f"from_frame: column {name!r} occurs {count} times in {columns}; rename or drop the others."
-            )
+    for name in (name for name in (*required, *optional) if name is not None):
+        count = columns.count(name)
+        if count > 1 or (count == 0 and name in required):
+            problem = f"occurs {count} times in" if count else "is missing, found"
+            raise DataError(f"from_frame: column {name!r} {problem} {columns}; rename a column or correct the names.")
 
 
 def _ids(frame: Any, column: str | None, default: str) -> list[str]:
@@ -332,33 +326,31 @@ def from_pykoop(
     if not arrays:
         raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
     shapes = [x.shape for x in arrays.values()]
-    whole = isinstance(n_inputs, (int, np.integer)) and not isinstance(n_inputs, bool)
-    width = shapes[0][-1] if all(len(s) == 2 and s[-1] == shapes[0][-1] for s in shapes) else 0
-    if not whole or not 0 <= n_inputs < width - 1:
+    n_states = shapes[0][-1] - 1 - n_inputs if {(len(s), s[-1:]) for s in shapes} == {(2, shapes[0][-1:])} else 0
+    if not isinstance(n_inputs, (int, np.integer)) or n_inputs < 0 or n_states < 1:
         needs = f"needs arrays (n_samples, 1 + states + {n_inputs}) of one width"
         raise DataError(f"from_pykoop: {needs}, found {shapes[:5]}; check n_inputs.")
-    states, inputs = [f"x{i}" for i in range(width - 1 - n_inputs)], [f"u{i}" for i in range(n_inputs)]
-    named = channels if channels is not None else declare_channels(None, states, inputs, states, "from_pykoop")
+    if channels is None:
+        states = [Channel(f"x{i}", Role.STATE, measured=True) for i in range(n_states)]
+        channels = [*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs))]
     episodes: dict[EpisodeKey, Any] = {}
     for unit, x in arrays.items():
-        rows = _rows_of(EpisodeKey(unit, DEFAULT_CONDITION, name) for name in _numbered_episodes(unit, x[:, 0]))
+        rows = _rows_of(
+            EpisodeKey(unit, DEFAULT_CONDITION, _episode(v, row, unit)) for row, v in enumerate(x[:, 0].tolist())
+        )
         episodes |= {key: x[at, 1:] for key, at in rows.items()}
-    return from_arrays(episodes, named, sample_period_s)
+    return from_arrays(episodes, channels, sample_period_s)
 
 
-def _numbered_episodes(unit: str, column: npt.NDArray[Any]) -> list[str]:
-    """Return the names of the episodes, row by row; whole numbers are written without a point."""
-    kind = column.dtype.kind
-    if kind == "f":
-        good = np.isfinite(column) & (column == np.round(column)) & (np.abs(column) < _EXACT)
-    else:
-        good = np.array([_is_name(v) for v in column], dtype=bool)
-    if not good.all():
-        row = int(np.argmin(good))
+def _episode(value: Any, row: int, unit: str) -> str:
+    """Return the name of a row's episode; whole numbers are written without a point."""
+    if isinstance(value, float) and value.is_integer() and abs(value) < _EXACT:
+        return str(int(value))
+    if not _is_name(value):
         wanted = "the first column should number the episodes (as floating-point numbers below 2**53)"
-        actual = f"found {column.tolist()[row]!r} in row {row} of unit {unit}"
+        actual = f"found {value!r} in row {row} of unit {unit}"
         raise DataError(f"from_pykoop: {wanted}, {actual}; use an integer or object array.")
-    return [str(int(v) if kind == "f" else v) for v in column]
+    return str(value)
 
 
 def to_pykoop(population: Population) -> Array:

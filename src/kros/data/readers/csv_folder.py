@@ -6,7 +6,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -15,17 +15,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core import limits
 from ...core.errors import DataError
-from ...core.files import did_you_mean, require_regular, shortened
-from ...core.memory import pass_on_shortage
-from ..arrow import fill
+from ...core.files import did_you_mean, require_regular, stamp_of
 from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings, some, usable
 from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
-from .csvfile import Dialect, first_fields, read_columns
+from .tables import Dialect, file_fields, read_columns
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -60,7 +57,8 @@ class CsvRecordings(Recordings):
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
         i, n = place.piece
-        columns = _whole_file(self.dialect, self.timestamp, replace(place, piece=(0, n)), _version(Path(place.path)))
+        require_regular(Path(place.path), sys.maxsize)
+        columns = _whole_file(self, replace(place, piece=(0, n)), stamp_of(Path(place.path)))
         columns = columns[:, i * columns.shape[1] // n : (i + 1) * columns.shape[1] // n]
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(columns.T))
@@ -70,25 +68,16 @@ class CsvRecordings(Recordings):
         return Recording(key, np.ascontiguousarray(columns[1:].T), since * scale)
 
 
-def _version(path: Path) -> tuple[int, int]:
-    require_regular(path, sys.maxsize)
-    status = path.stat()
-    return status.st_mtime_ns, status.st_size
-
-
 @lru_cache(maxsize=1)  # pieces of a file are read one behind the other
-def _whole_file(dialect: Dialect, timestamp: str | None, place: FilePlace, version: tuple[int, int]) -> Array:
+def _whole_file(recordings: CsvRecordings, place: FilePlace, version: tuple[int, int]) -> Array:
     """Return the wanted columns of a file, shape (len(wanted), n_rows)."""
-    path = Path(place.path)
-    if path.suffix == ".parquet":
-        return parquet_columns(path, place.wanted, timestamp is not None)
-    return read_columns(path, place.names, place.wanted, dialect, timestamp)
+    return read_columns(Path(place.path), place.names, place.wanted, recordings.dialect, recordings.timestamp)
 
 
 def read_csv_folder(
     source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()
 ) -> Population:
-    """Read a folder of CSV files (also gzip-compressed), or of anybody's Parquet files."""
+    """Read a folder of CSV files (also gzip-compressed), or of Parquet files of any layout."""
     chosen, source = load_mapping(mapping), Path(source)
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
@@ -109,7 +98,9 @@ def read_csv_folder(
                 both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
                 raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
-        actual = f"no file matches files = {chosen.files!r}{_sample(source)}"
+        files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
+        sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
+        actual = f"no file matches files = {chosen.files!r}{sample or f'; there is no file that ends in {endings}'}"
         raise DataError(f"Reading {source} as csv: {actual}; correct the expression.")
     time_scale = None if chosen.time is None else chosen.time_scale
     recordings = CsvRecordings(places, chosen.dialect, time_scale, chosen.timestamp)
@@ -120,9 +111,9 @@ def read_csv_folder(
 
 def _keys(match: re.Match[str], mapping: CsvMapping, unit: UnitMapping) -> list[EpisodeKey]:
     """Return the episodes of one unit in a file."""
-    groups = match.groupdict()
-    name = f"{groups.get('unit') or DEFAULT_UNIT}{unit.suffix}"
-    condition, episode = groups.get("condition") or DEFAULT_CONDITION, groups.get("episode") or DEFAULT_EPISODE
+    groups = {name: text for name, text in match.groupdict().items() if text}
+    name = f"{groups.get('unit', DEFAULT_UNIT)}{unit.suffix}"
+    condition, episode = groups.get("condition", DEFAULT_CONDITION), groups.get("episode", DEFAULT_EPISODE)
     endings = [f".{i + 1}" for i in range(mapping.pieces)] if mapping.pieces > 1 else [""]
     return [EpisodeKey(name, condition, f"{episode}{ending}") for ending in endings]
 
@@ -162,21 +153,13 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _sample(source: Path) -> str:
-    files = [relative for _, relative in csv_files(source)]
-    if files:
-        return f" of {len(files)} files such as {files[0]!r}"
-    return f"; there is no file that ends in {', '.join(ENDINGS[:4])} (or with .gz)"
-
-
 def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
     """Return where the channels of a unit are in a file."""
     wanted = [] if mapping.time is None else [mapping.time]
     wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
-    names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that nobody wants
-    if mapping.header and all(
-        isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False)
-    ):
+    names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that are not needed
+    numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False))
+    if mapping.header and numbered:
         problem = f"one header line is needed, found numbers in the first line: {fields}"
         raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
     positions = [_position(path, fields, column) for column in wanted]
@@ -198,59 +181,3 @@ def _position(path: Path, fields: list[str], column: Column) -> int:
     else:
         problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"
     raise DataError(f"Reading {path}: {problem}; correct the mapping or the file.")
-
-
-def file_fields(path: Path, dialect: Dialect) -> list[str]:
-    """Return the names of a file's columns."""
-    if path.suffix != ".parquet":
-        return first_fields(path, dialect)
-    from pyarrow import parquet
-
-    require_regular(path, sys.maxsize)
-    try:
-        return list(parquet.read_schema(path).names)
-    except (OSError, ValueError) as error:
-        problem = f"no Parquet file that can be read ({shortened(str(error))})"
-        raise DataError(f"Reading {path}: {problem}; check the file.") from error
-
-
-def parquet_columns(path: Path, wanted: Sequence[str], timestamp: bool = False) -> Array:
-    """Read columns of anybody's Parquet file, the first as seconds with `timestamp`, shape (len(wanted), n_rows)."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    require_regular(path, sys.maxsize)
-    try:
-        if parquet.read_metadata(path).num_rows > limits.MAX_SAMPLES:
-            advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
-            raise DataError(f"Reading {path}: has more than {limits.MAX_SAMPLES} rows; {advice}.")
-        table = parquet.ParquetFile(path).read(columns=list(wanted), use_threads=False)
-        values = np.empty((len(wanted), table.num_rows))
-        for i, name in enumerate(wanted):
-            column = table.column(name)
-            fill(values[i], _seconds(column) if timestamp and i == 0 else column.cast(pa.float64()))
-        return values
-    except DataError:
-        raise
-    except (OSError, ValueError, LookupError, MemoryError, NotImplementedError) as error:  # and Arrow's own
-        pass_on_shortage(error, path)
-        raise DataError(f"Reading {path}: {shortened(str(error))}; correct the file, or the mapping.") from error
-
-
-def _seconds(column: Any) -> Any:
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    since = column.cast(pa.timestamp("ns")).cast(pa.int64())
-    whole = pc.subtract(since, pc.min(since))
-    return pc.multiply(whole.cast(pa.float64()), 1e-9)
-
-
-def parquet_head(path: Path, rows: int) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Return the names of a file's columns, and its first rows as text."""
-    from pyarrow import parquet
-
-    fields = file_fields(path, Dialect())
-    batch = next(parquet.ParquetFile(path).iter_batches(batch_size=rows), None)
-    columns = () if batch is None else [["" if v is None else str(v) for v in c.to_pylist()] for c in batch.columns]
-    return fields, list(zip(*columns, strict=True))

@@ -6,18 +6,17 @@ import codecs
 import re
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core.files import read_toml
 from ...core.settings import Settings
-from ..population import Channel, Role, columns_in_order
-from ..scaling import Scaling
+from ..population import Channel, Role, Scaling, columns_in_order
 from ..steps import Scale, Step, parse_steps
-from .csvfile import Dialect
+from .tables import Dialect
 
-Column = str | int  # a name in the header, or a number counted from 1
+Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
 
 
@@ -31,13 +30,6 @@ class ChannelMapping(Settings):
     unit: str = Field("", description="unit of measure after scaling")
     scale: float = Field(1.0, description="factor from the column to the channel")
     truth_of: str = Field("", alias="of", description="for the role `truth`: the state that it is the truth of")
-
-    @field_validator("scale")
-    @classmethod
-    def _not_zero(cls, value: float) -> float:
-        if value == 0:
-            raise ValueError("should be finite and not zero")
-        return value
 
     @property
     def declared(self) -> Channel:
@@ -120,18 +112,13 @@ class CsvMapping(Settings):
         if not names:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")
         for unit in self.units:
-            unknown = sorted(set(unit.columns) - set(names))
-            if unknown:
-                raise ValueError(
-                    f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}; the channels are {names}"
-                )
-        for column in (self.time, *(self.column(c, u) for u in self.units for c in self.channel)):
-            if isinstance(column, int) and column < 1:
-                raise ValueError(f"columns are numbered from 1, found {column}")
-            if isinstance(column, str) and not self.header:
-                raise ValueError(
-                    f"header = false leaves columns without names, found {column!r}; give its number from 1"
-                )
+            if unknown := sorted(set(unit.columns) - set(names)):
+                gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
+                raise ValueError(f"{gives}; the channels are {names}")
+        columns = (self.time, *(self.column(c, u) for u in self.units for c in self.channel))
+        named = next((column for column in columns if isinstance(column, str)), None)
+        if named is not None and not self.header:
+            raise ValueError(f"header = false leaves columns without names, found {named!r}; give its number from 1")
         return self
 
     @property
@@ -172,18 +159,14 @@ class CsvMapping(Settings):
 
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
-        units = [UnitMapping(suffix=u.suffix, columns=_without(u.columns, names)) for u in self.unit]
+        columns = [{name: c for name, c in u.columns.items() if name not in names} for u in self.unit]
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
         retained = {
             "channel": tuple(c for c in self.channel if c.name not in names),
-            "unit": tuple(units),
+            "unit": tuple(u.model_copy(update={"columns": c}) for u, c in zip(self.unit, columns, strict=True)),
             "prepare": tuple(step for step in steps if step is not None),
         }
         return self.model_copy(update=retained)
-
-
-def _without(columns: Mapping[str, Column], names: Collection[str]) -> dict[str, Column]:
-    return {name: column for name, column in columns.items() if name not in names}
 
 
 def _is_mark(text: str) -> bool:

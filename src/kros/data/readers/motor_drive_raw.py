@@ -14,19 +14,20 @@ import logging
 import math
 import re
 from datetime import datetime, timedelta
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
+from ...core.files import whole_folder
 from ..arrow import from_numpy
-from ..population import OUTLIERS, Channel, EpisodeKey, Population, Role
+from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
-from ..writers.folders import in_threads, whole_folder
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import ChannelMapping, CsvMapping
+from .parquet import in_threads
 
 logger = logging.getLogger(__name__)
 
@@ -72,10 +73,8 @@ FIRST_STAMP = datetime(2023, 1, 1)
 
 def find_root(source: Path) -> Path | None:
     """Return the folder with ``population`` or ``outliers``: `source`, or its ``batch_b`` (also below ``raw``)."""
-    for candidate in (source, source / "batch_b", source / "raw" / "batch_b"):
-        if any((candidate / group).is_dir() for group in GROUPS):
-            return candidate
-    return None
+    candidates = (source, source / "batch_b", source / "raw" / "batch_b")
+    return next((c for c in candidates if any((c / group).is_dir() for group in GROUPS)), None)
 
 
 def is_raw_layout(source: Path) -> bool:
@@ -102,9 +101,9 @@ def read_motor_drive_raw(source: Path | str) -> Population:
     if scale is None:
         text = "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples."
         logger.warning(text, period, population.episodes[0])
-    return (
-        population if scale in (None, 1.0) else read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
-    )
+    if scale in (None, 1.0):
+        return population
+    return read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
 
 
 def write_raw(population: Population, out: Path | str) -> None:
@@ -141,24 +140,18 @@ def write_raw(population: Population, out: Path | str) -> None:
     if names != expected:
         needs = f"needs the channels {expected}, found {names}"
         raise DataError(f"Writing the raw layout of motor drives {needs}; write Parquet instead.")
-    groups = list(population.groups())
     for key in population.episodes:
-        _check_names(key)
+        named = re.fullmatch("[0-9]{6}", key.unit) and re.fullmatch("[0-9]{1,3}", key.episode)
+        if not named or key.condition not in ("load", "noload"):
+            needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
+            raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
     with whole_folder(Path(out)) as folder:
-        in_threads([partial(_write_folder, population, keys, folder, i) for i, (_, _, keys) in enumerate(groups)])
+        in_threads(lambda group: _write_folder(population, folder, *group), enumerate(population.groups()))
 
 
-def _check_names(key: EpisodeKey) -> None:
-    """Refuse names that the layout cannot hold."""
-    named = re.fullmatch("[0-9]{6}", key.unit) and re.fullmatch("[0-9]{1,3}", key.episode)
-    if not named or key.condition not in ("load", "noload"):
-        needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
-        raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
-
-
-def _write_folder(population: Population, keys: tuple[EpisodeKey, ...], folder: Path, index: int) -> None:
+def _write_folder(population: Population, folder: Path, index: int, keys_of: tuple[str, str, Any]) -> None:
     """Write the episodes of one unit and condition."""
-    unit, condition = keys[0].unit, keys[0].condition
+    unit, condition, keys = keys_of
     group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
     stamp = (FIRST_STAMP + timedelta(minutes=10 * index)).strftime("%Y%m%dT%H%M%S")
     name = f"{stamp}_{unit}_{condition}"

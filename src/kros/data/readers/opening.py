@@ -15,12 +15,12 @@ from .csv_mapping import CsvMapping
 from .motor_drive_raw import is_raw_layout, read_motor_drive_raw
 from .parquet import INDEX, read_parquet
 
-READERS = ("motor-drive-raw", "parquet", "csv")
 LOOKS = {
     "motor-drive-raw": "holds a folder 'population' or 'outliers'",
     "parquet": "holds population.json",
     "csv": "holds CSV files",
 }
+READERS = tuple(LOOKS)
 
 
 def detect_reader(source: Path | str) -> str | None:

@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ...core.artifacts import json_bytes, with_checksum, write_bytes
+from ...core.artifacts import json_bytes, with_checksum
 from ...core.errors import ConfigError
-from ...data.writers.folders import whole_folder
+from ...core.files import whole_folder, write_bytes
 from ...loops.compiler import find_compiler
 from ...observer import Observer
 from ...observer.file import observer_content

@@ -15,8 +15,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import write_bytes
 from ...core.errors import ConfigError
+from ...core.files import write_bytes
 from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer
 from ...observer.recorded import recorded_channel

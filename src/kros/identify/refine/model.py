@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ...core.errors import DimensionError
-from ...core.loading import check_shapes, loader
 from ...data.population import Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting

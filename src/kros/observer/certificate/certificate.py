@@ -25,8 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
-from ...core.loading import loader
+from ...core.artifacts import load_artifact, loader, save_artifact
 from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes

@@ -8,8 +8,8 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ...core.choices import member
 from ...core.errors import ConfigError
+from ...core.settings import member
 from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ...data.steps import Offset, Trim

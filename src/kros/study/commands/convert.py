@@ -5,14 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from ...core.files import read_toml
+from ...core.files import read_toml, whole_folder
 from ...core.work import Progress
 from ...data import Population, read
 from ...data.checks import check_population
 from ...data.readers.opening import detect_reader
-from ...data.readers.parquet import read_parquet
-from ...data.writers.folders import whole_folder
-from ...data.writers.parquet import GroupRecord, write_group, write_index
+from ...data.readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from ..engine.executors import open_executor
 
 Task = tuple[Population, str, str, Path]

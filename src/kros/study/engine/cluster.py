@@ -19,6 +19,7 @@ from threading import Lock
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from ...core.work import Executor
 from .store import code_key
 
 T = TypeVar("T")
@@ -33,7 +34,7 @@ _GIVEN_UP = (
 )
 
 
-class DaskExecutor:
+class DaskExecutor(Executor):
     """Runs tasks on a Dask cluster, in batches where they are many."""
 
     def __init__(self, client: Any, address: str) -> None:

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
-from ...core.memory import keep_freed_memory
-from ...core.work import Executor, SerialExecutor
+from ...core.work import Executor, keep_freed_memory
 from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")
@@ -22,7 +21,7 @@ _CHUNKS = 128  # of a map of many tasks, which are small: handing each out costs
 
 
 @dataclass(frozen=True)
-class ProcessExecutor:
+class ProcessExecutor(Executor):
     """Runs tasks in worker processes, each with a single BLAS thread."""
 
     pool: Any
@@ -54,7 +53,7 @@ def open_executor(workers: int = 1, scheduler: str | None = None) -> Iterator[Ex
         with open_dask(scheduler) as executor:
             yield executor
     elif workers == 1:
-        yield SerialExecutor()
+        yield Executor()
     else:
         with single_threaded(), _pool(workers) as pool:
             yield ProcessExecutor(pool)

@@ -9,10 +9,10 @@ from contextlib import closing, contextmanager, suppress
 from threading import Event, Lock, Thread
 from typing import Any
 
-from ...core.work import Progress, Silent
+from ...core.work import Progress
 
 
-class Lines:
+class Lines(Progress):
     """One line a finished stage, and one every ten seconds where there is no other."""
 
     def __init__(self, every_s: float = 10.0) -> None:
@@ -62,7 +62,7 @@ class Lines:
             sys.stderr.flush()
 
 
-class Bars:
+class Bars(Progress):
     """A bar for what is running, a line for what is done."""
 
     def __init__(self, display: Any) -> None:
@@ -93,7 +93,7 @@ class Bars:
 def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     """Return the progress listener that fits where standard error goes; bars would hide questions."""
     if quiet or asks:
-        yield Silent()
+        yield Progress()
     elif not sys.stderr.isatty():
         with closing(Lines()) as lines:
             yield lines

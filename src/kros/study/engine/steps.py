@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.results import Results
 from ...core.store import digest_of
+from ...core.work import Results
 from ...data.checks import NonFiniteError
 from ...data.population import EpisodeKey, Population
 from ..config import Stage, StudyConfig

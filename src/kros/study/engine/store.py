@@ -20,9 +20,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import json_bytes, write_bytes
+from ...core.artifacts import json_bytes
 from ...core.errors import DataError
-from ...core.files import TEMPORARY, is_file
+from ...core.files import TEMPORARY, is_file, write_bytes
 from ...core.locks import NAME as LOCK
 from ...core.store import (
     MANIFEST,

@@ -275,7 +275,7 @@ def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict
 
 
 @dataclass(frozen=True)
-class Fold:
+class Fold(Progress):
     """Tells a progress listener about the stages of a fold."""
 
     listener: Progress

@@ -28,10 +28,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.choices import member
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
+from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ...uncertainty.weights.cover import Structure
 from ..assumptions import require_detectable

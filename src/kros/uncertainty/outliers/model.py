@@ -31,9 +31,8 @@ from typing import Any, cast
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, save_artifact
+from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
-from ...core.loading import check_shapes, loader
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
 from .distances import Distances, balance, distances, joined, scaled_levels

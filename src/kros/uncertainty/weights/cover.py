@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.choices import member
+from ...core.settings import member
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]

@@ -1,4 +1,4 @@
-"""Numbers from one delimited text file, fast, in bounded memory, with errors that name the file and the column."""
+"""Numbers from one table, text or Parquet, fast, in bounded memory, with errors that name the file and the column."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import codecs
 import csv
 import gzip
 import re
+import sys
 import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,13 +19,14 @@ import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened
-from ...core.memory import pass_on_shortage
+from ...core.files import pass_on_shortage, require_regular, shortened
 from ..arrow import fill
 
+Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
 ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
 BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
+PARQUET = ".parquet"
 CLOCK = r"(?P<hour>\d{1,2}):(?P<minute>\d{2}):(?P<second>\d{2})(?:[.,:](?P<fraction>\d{1,9}))?(?:Z|[+-]\d{2}:?\d{2})?"
 _DATE_PARTS = {"y": r"(?P<year>\d{4})", "m": r"(?P<month>\d{1,2})", "d": r"(?P<day>\d{1,2})"}
 DATES = {order: "[-./]".join(_DATE_PARTS[letter] for letter in order) for order in ("ymd", "dmy", "mdy")}
@@ -32,7 +34,7 @@ DATES = {order: "[-./]".join(_DATE_PARTS[letter] for letter in order) for order 
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a file is written: delimiter, whether a line names the columns, lines before it, decimal point, ..."""
+    """How a text file is written: delimiter, whether a line names the columns, lines before it, decimal point, ..."""
 
     delimiter: str = ","
     header: bool = True
@@ -43,6 +45,105 @@ class Dialect:
 
 
 COMMA = Dialect()
+
+
+def file_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
+    """Return the names of a table's columns, or the first numbers where it has no header."""
+    if path.suffix != PARQUET:
+        return _text_fields(path, dialect)
+    from pyarrow import parquet
+
+    require_regular(path, sys.maxsize)
+    try:
+        return list(parquet.read_schema(path).names)
+    except (OSError, ValueError) as error:
+        problem = f"no Parquet file that can be read ({shortened(str(error))})"
+        raise DataError(f"Reading {path}: {problem}; check the file.") from error
+
+
+def read_columns(
+    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA, timestamp: str | None = None
+) -> Array:
+    """Read some columns of a table by names that are given to all of them, shape (len(wanted), n_rows).
+
+    With the order of a date in `timestamp` the first one holds timestamps, which become seconds.
+    """
+    import pyarrow as pa
+
+    try:
+        table = (_parquet_table if path.suffix == PARQUET else _text_table)(path, names, wanted, dialect, timestamp)
+    except DataError:
+        raise
+    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+        pass_on_shortage(error, path)
+        raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file, or the mapping.") from error
+    values = np.empty((len(wanted), 0 if table is None else table.num_rows))
+    for i, name in enumerate(wanted if table is not None else ()):
+        column = table.column(name)
+        if i > 0 or timestamp is None:
+            fill(values[i], column)
+        else:
+            values[i] = seconds_of(column, timestamp) if path.suffix != PARQUET else _since_first(column)
+    return values
+
+
+def _text_table(
+    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, timestamp: str | None
+) -> Any:
+    """Read columns of a text file; None where it has no rows."""
+    import pyarrow as pa
+    from pyarrow import csv as arrow
+
+    kinds = {name: pa.float64() for name in wanted} | ({} if timestamp is None else {wanted[0]: pa.string()})
+    options = (
+        arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK),
+        arrow.ParseOptions(delimiter=dialect.delimiter),
+        arrow.ConvertOptions(
+            column_types=kinds,
+            include_columns=list(kinds),
+            decimal_point=dialect.decimal,
+            null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
+        ),
+    )
+    with opened(path, dialect.encoding) as file:
+        lines = dialect.skip_rows + dialect.header + (dialect.unit_rows if dialect.header else 0)
+        _skip(file, lines, path)  # here, so that both readings count lines alike
+        try:
+            return arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
+        except pa.ArrowInvalid as error:
+            if "Empty CSV" in str(error):
+                return None
+            raise
+
+
+def _parquet_table(
+    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, timestamp: str | None
+) -> Any:
+    """Read columns of a Parquet file as numbers, but for the first one with `timestamp`."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    require_regular(path, sys.maxsize)
+    file = parquet.ParquetFile(path)
+    if file.metadata.num_rows > limits.MAX_SAMPLES:
+        advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
+        raise DataError(f"Reading {path}: has more than {limits.MAX_SAMPLES} rows; {advice}.")
+    fields = {name: file.schema_arrow.names[list(names).index(name)] for name in wanted}
+    table = file.read(columns=list(fields.values()), use_threads=False).select(list(fields.values()))
+    kinds = dict.fromkeys(fields, pa.float64()) | ({} if timestamp is None else {wanted[0]: pa.timestamp("ns")})
+    return table.rename_columns(list(fields)).cast(pa.schema(kinds))
+
+
+def parquet_head(path: Path, rows: int) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Return the names of a Parquet file's columns, and its first rows as text."""
+    from pyarrow import parquet
+
+    fields = file_fields(path)
+    batch = next(parquet.ParquetFile(path).iter_batches(batch_size=rows), None)
+    if batch is None:
+        return fields, []
+    columns = [["" if value is None else str(value) for value in c.to_pylist()] for c in batch.columns]
+    return fields, list(zip(*columns, strict=True))
 
 
 class LimitedFile:
@@ -82,10 +183,8 @@ class LimitedFile:
             advice = "split it, or raise MAX_TEXT_BYTES in kros.core.limits"
             raise DataError(f"{more} {limits.MAX_TEXT_BYTES} bytes; {advice}.")
         if self._given > max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size):
-            advice = "unpack it yourself if it is one, or raise MAX_RATIO in kros.core.limits"
-            raise DataError(
-                f"{more} {limits.MAX_RATIO} times its {self._size} bytes, which recordings never do; {advice}."
-            )
+            advice = "which recordings never do; unpack it, or raise MAX_RATIO in kros.core.limits"
+            raise DataError(f"{more} {limits.MAX_RATIO} times its {self._size} bytes, {advice}.")
         return content
 
 
@@ -106,7 +205,7 @@ def _has_ascii(encoding: str) -> bool:
     return "0;".encode(encoding) == b"0;"
 
 
-def first_fields(path: Path, dialect: Dialect = COMMA) -> list[str]:
+def _text_fields(path: Path, dialect: Dialect) -> list[str]:
     """Return the fields of the header, or of the first line of numbers, without surrounding space and quotes."""
     with opened(path, dialect.encoding) as file:
         _skip(file, dialect.skip_rows, path)
@@ -130,45 +229,6 @@ def _fields(line: str, path: Path, dialect: Dialect) -> list[str]:
     except csv.Error as error:
         raise DataError(f"Reading {path}: its first line is no list of columns ({error}); correct the file.") from error
     return [part.strip() for part in row]
-
-
-def read_columns(
-    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect = COMMA, timestamp: str | None = None
-) -> npt.NDArray[np.float64]:
-    """Read some columns of a file, the first as timestamps where their order is given, shape (len(wanted), n_rows)."""
-    import pyarrow as pa
-    from pyarrow import csv as arrow
-
-    kinds = {name: pa.float64() for name in wanted} | ({} if timestamp is None else {wanted[0]: pa.string()})
-    options = (
-        arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK),
-        arrow.ParseOptions(delimiter=dialect.delimiter),
-        arrow.ConvertOptions(
-            column_types=kinds,
-            include_columns=list(kinds),
-            decimal_point=dialect.decimal,
-            null_values=[*arrow.ConvertOptions().null_values, *ABSENT],
-        ),
-    )
-    with opened(path, dialect.encoding) as file:
-        lines = dialect.skip_rows + dialect.header + (dialect.unit_rows if dialect.header else 0)
-        _skip(file, lines, path)  # here, so that both readings count lines alike
-        try:
-            table = arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
-        except DataError:
-            raise
-        except (pa.ArrowException, ValueError, MemoryError) as error:
-            if "Empty CSV" in str(error):
-                return np.zeros((len(wanted), 0))
-            pass_on_shortage(error, path)
-            raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file.") from error
-    values = np.empty((len(wanted), table.num_rows))
-    for row, name in enumerate(wanted):
-        if row == 0 and timestamp is not None:
-            values[row] = seconds_of(table.column(name), timestamp)
-        else:
-            fill(values[row], table.column(name))
-    return values
 
 
 def _skip(file: LimitedFile, lines: int, path: Path) -> None:
@@ -200,7 +260,16 @@ def timestamp_pattern(order: str) -> str:
     return rf"^\s*(?:{DATES[order]}[T ]\s*)?{CLOCK}\s*$"
 
 
-def seconds_of(column: Any, order: str) -> npt.NDArray[np.float64]:
+def _since_first(column: Any) -> Array:
+    """Return times of a Parquet file as seconds since the first one, shape (n_rows,), s."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    since = pc.subtract(column.cast(pa.int64()), pc.min(column.cast(pa.int64())))
+    return np.asarray(1e-9 * since.cast(pa.float64()).to_numpy())
+
+
+def seconds_of(column: Any, order: str) -> Array:
     """Return timestamps as seconds since the first one, NaN where a cell holds none, shape (n_rows,), s."""
     import pyarrow as pa
     import pyarrow.compute as pc

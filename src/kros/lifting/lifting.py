@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
-from .program import Program
+from .program import Columns
 from .separation import FormulaSeparation
 from .window import Window
 
@@ -170,7 +170,7 @@ class Lifting:
 
         Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
         """
-        self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
+        self._columns[0].fill(lifted, self._values(parameters, lifted, earlier))
 
     def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
@@ -181,7 +181,7 @@ class Lifting:
         window = self._windows(window)
         out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
         values = self._values(parameters, window, window[..., self.n_states :], u)
-        self._programs[1].fill(out, values, len(self.inputs))
+        self._columns[1].fill(out, values)
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
@@ -220,7 +220,7 @@ class Lifting:
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
         if (names, u is None) not in self._derivatives:
             trees = [formula.derivative(name) for formula in formulas for name in names]
-            self._derivatives[names, u is None] = Program.of(trees)
+            self._derivatives[names, u is None] = Columns.of(trees)
         values = self._values(parameters, x, x[..., self.n_states :], u)
         self._derivatives[names, u is None].fill(slopes, values)
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
@@ -248,13 +248,13 @@ class Lifting:
         return FormulaSeparation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
-    def _programs(self) -> tuple[Program, Program]:
-        """Programs of the lifted functions and of the input functions."""
-        of, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
-        return Program.of(of), Program.of(gamma)
+    def _columns(self) -> tuple[Columns, Columns]:
+        """Columns of the lifted functions and of the input functions."""
+        functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
+        return Columns.of(functions, self.n_states), Columns.of(gamma, len(self.inputs))
 
     @cached_property
-    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Program]:
+    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Columns]:
         return {}
 
     @cached_property

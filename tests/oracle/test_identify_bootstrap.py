@@ -173,26 +173,24 @@ def whitened(models: KoopmanMatrices, T: np.ndarray) -> np.ndarray:
 
 
 def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
-    """Weights that differ from one by up to 0.006: models and refits agree but for what Gauss-Newton leaves out.
-
-    Larger weights cross the guard of the edge of stability, where the curvature jumps.
-    """
+    """Weights that differ from one by up to 0.06: models and refits agree but for what Gauss-Newton leaves out of the
+    curvature."""
     models, refinement, factors, normal, problem = drives
     T, information = refinement.whitening, refinement.information
     counts = np.array([[2.0, 1, 2, 0, 0], [0, 3, 0, 1, 1], [1, 0, 2, 2, 0]])
-    small = 1 + 0.003 * (counts - 1)
+    small = 1 + 0.03 * (counts - 1)
     step = bootstrap_refined(models, T, information, normal, small[:, None], "abc").samples
     start = whitened(models, T)
     moved = whitened(KoopmanMatrices(step.A[:, 0], step.B[:, 0]), T) - start
     data, drawn = replace(problem, prior=None, edged=False), resampled(factors, problem, counts)
 
     def evaluate(V: np.ndarray) -> np.ndarray:
-        return problem.evaluate(V) + 0.003 * (drawn.evaluate(V) - data.evaluate(V))
+        return problem.evaluate(V) + 0.03 * (drawn.evaluate(V) - data.evaluate(V))
 
     expected = settle(evaluate, start) - start
     root = np.linalg.cholesky(information)
     a, b = (np.einsum("upq,up->uq", root, d.reshape(3, -1)) for d in (moved, expected))
-    assert (np.linalg.norm(a - b, axis=1) < 0.15 * np.linalg.norm(b, axis=1)).all()
+    assert (np.linalg.norm(a - b, axis=1) < 0.3 * np.linalg.norm(b, axis=1)).all()
     assert (np.sum(a * b, axis=1) > 0.95 * np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)).all()
 
 

@@ -10,7 +10,7 @@ held-out training episodes: the strongest one whose error is as good as the best
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +25,7 @@ from ..factors import Factor, Ranges
 from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual_db
 from .model import Refinement, TradeOff, TrainingData
-from .problem import OneStep, RefinementProblem
+from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import Evaluate, GaussNewton, RefineOptions, Solution
 from .segments import Segments, held_segments, read_segments
 
@@ -101,7 +101,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     fitted = segments.first(count - held_segments(count, data.keys))
     start, problem, error = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
-    common = refine_pooled(start, one_model, error)
+    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V, np.inf).score)
     problem = _around(problem, one_model, common)
     path, rows = _path(data, problem, common)
     choice = _choose(rows, options)
@@ -219,36 +219,69 @@ def start_pooled(
     return V, replace(problem, sigma=error**options.balance), error
 
 
-def refine_pooled(V: Array, problem: RefinementProblem, error: Array) -> Array:
-    """Fit one model to all units, horizons growing, on some segments and at last on all; shape (n_lifted, p)."""
+def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Callable[[Array], float]) -> Array:
+    """Fit one model to all units, horizons growing, from every start; shape (n_lifted, p)."""
     options = problem.options
     count = max(2, -(-options.pooled_segments // problem.segments.n_units))
-    few = replace(problem, segments=problem.segments.first(count), sigma=error**options.first_balance)
-    for horizon in options.horizons:
-        stage = few.at(horizon)
-        V = options.search.minimise(stage.evaluate, stage.finite, V).V
-    V = _stabilised(V, few)
-    edged = normalised(replace(few, sigma=problem.sigma), V)
-    edged = replace(problem, sigma=edged.sigma, edged=True)
-    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, V).V[0])
+    few = replace(problem, segments=problem.segments.first(count))
+    briefly = replace(options.search, iterations=options.trial_iterations)
+    ends: list[tuple[float, float, Array]] = []
+    sigma = problem.sigma
+    for first, balance in options.starts:
+        inside = _stable_end(V, few, error**balance, first)
+        if inside is not None:
+            sigma = sigma if ends else normalised(few, inside).sigma
+            edged = replace(few, sigma=sigma, edged=True)
+            end = briefly.minimise(edged.evaluate, edged.admissible, inside)
+            ends.append((score(end.V[0]), float(end.cost[0]), end.V))
+            log.debug("pooled model from horizon %d, balance %g: score %.6g, cost %.6g", first, balance, *ends[-1][:2])
+    if not ends:
+        raise IdentificationError(
+            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
+            "or the model is unstable; omit lifting functions that grow, or set identify.refine = false."
+        )
+    edged = replace(problem, sigma=sigma, edged=True)
+    best = min(ends, key=lambda row: row[:2])[2]
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, best).V[0])
 
 
-def _stabilised(V: Array, problem: RefinementProblem) -> Array:
-    """Bring a model inside the edge: by shorter rows of lifted functions, which free runs ignore, or by a penalty."""
-    n, edged = problem.lifting.n_states, replace(problem, edged=True)
-    if np.isfinite(problem.evaluate(V)).all():
-        for share in np.linspace(1.0, 0.0, 21):
-            trial = V.copy()
-            trial[:, n:] *= share
-            if problem.admissible(trial).all():
+def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
+    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
+    options = problem.options
+    stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
+    for stage in (*stages, problem):
+        solution = options.search.minimise(stage.evaluate, problem.finite, V)
+        if not np.isfinite(solution.cost).all():
+            return None
+        V = solution.V
+    return _stabilise(V, problem)
+
+
+def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
+    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
+    n, options = problem.lifting.n_states, problem.options
+    shortened = []
+    for share in np.linspace(1.0, 0.0, options.shortenings + 1):
+        shortened.append(V.copy())
+        shortened[-1][:, n:] *= share
+    for margin in (max(options.guard, options.margin), options.margin):
+        for trial in shortened:
+            if problem.admissible(trial, margin).all():
                 return trial
-        trial = problem.options.search.minimise(edged.evaluate, problem.finite, V).V
-        if problem.admissible(trial).all():
-            return trial
-    raise IdentificationError(
-        f"Refinement of the pooled model: free runs over {problem.options.horizons[-1]} samples diverge or the model "
-        "is unstable; omit lifting functions that grow, or set identify.refine = false."
-    )
+    V = min(shortened, key=lambda trial: float(problem.matrices(trial).spectral_radius().max()))
+    for heavier in 10.0 ** np.arange(options.penalties):
+
+        def evaluate(trial: Array, weight: float = heavier) -> Array:
+            edge = stability_barrier(trial, problem.T, options.guard, problem.edge_weight)
+            return problem.evaluate(trial) + weight * edge
+
+        solution = options.search.minimise(evaluate, problem.finite, V)
+        if not np.isfinite(solution.cost).all():
+            return None
+        V = solution.V
+        if problem.admissible(V).all():
+            return V
+    return None
 
 
 def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:

@@ -132,8 +132,7 @@ SMALL = [
 
 @pytest.mark.parametrize(("seed", "n", "gamma", "upper"), SMALL)
 def test_between_a_lower_bound_and_a_long_filter(seed, n, gamma, upper):
-    """One Lyapunov matrix for both channels costs at most half of the optimum here, and no controller is below the
-    bound."""
+    """The gap to a long filter is below five percent, and no controller is below the dual bound."""
     plant = two_channel(np.random.default_rng(seed), n=n)
     free, _ = free_optimum(plant)
     found = mixed(plant, gamma=gamma)
@@ -141,14 +140,14 @@ def test_between_a_lower_bound_and_a_long_filter(seed, n, gamma, upper):
     assert found.h2_norm == pytest.approx(h2_norm(plant.performance.close(found.controller)))
     assert found.hinf_norm < gamma
     assert found.controller.n_states == n
-    assert found.h2_norm <= 1.5 * upper
+    assert found.h2_norm <= 1.05 * upper
     assert free.h2_norm * (1 - 1e-9) <= found.lower_bound <= min(found.h2_norm, upper)
     assert found.gap_percent == pytest.approx(100 * (found.h2_norm / found.lower_bound - 1))
 
 
 def test_feedthrough_is_absorbed():
     plant = two_channel(np.random.default_rng(3), n=2)
-    gamma = 0.2
+    gamma = 0.2  # closer to the least that is in reach, rounding decides where the local improvement ends
     found = mixed(replace(plant, D22=[[0.3]]), gamma=gamma)
     assert found.h2_norm == pytest.approx(mixed(plant, gamma=gamma).h2_norm, rel=1e-6)
     assert found.hinf_norm < gamma

@@ -1,1 +1,1 @@
-"""Mixed H2/H-infinity synthesis: matrix inequalities, and the interior-point method that solves them."""
+"""Mixed H2/H-infinity synthesis: matrix inequalities and their solver, local improvement, lower bounds."""

@@ -1,17 +1,17 @@
 r"""Interior-point method for small dense matrix inequalities.
 
-It solves ``min c'x`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
+It solves ``min c'x + x'Qx/2`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
 
 Conic solvers spend their time on one large sparse matrix for all cones. The problems of this package have few variables
 and small, dense matrices. There the Newton step of the logarithmic barrier
 
-.. math:: c^T x - \mu \sum_k \log\det F_k(x) - \mu \sum_i \log (r^2 - x_i^2)
+.. math:: f(x) - \mu \sum_k \log\det F_k(x) - \mu \sum_i \log (r^2 - x_i^2)
 
 costs one dense factorisation. It does not depend on the units of x nor on congruences of F. With ``D_k = F_k^{-1/2}
 dF_k F_k^{-1/2}`` along the Newton step dx, the matrices ``mu F_k^{-1/2} (I - D_k) F_k^{-1/2}`` are feasible for the
 dual problem when ``D_k <= I``, so that
 
-    c'(x + dx) - mu sum_k (tr I - tr D_k^2)
+    f(x + dx) - mu sum_k (tr I - tr D_k^2)
 
 is a lower bound of the optimum in the box ``|x_i| <= r``. The line search is exact: along a ray the barrier is a
 function of the eigenvalues of D_k.
@@ -83,10 +83,18 @@ class Outcome:
 
 
 def minimise(
-    c: Array, blocks: Sequence[Block], start: Array, *, rtol: float = 1e-5, time_limit_s: float = 20.0, box: float = 1e6
+    c: Array,
+    blocks: Sequence[Block],
+    start: Array,
+    *,
+    Q: Array | None = None,
+    rtol: float = 1e-5,
+    time_limit_s: float = 20.0,
+    box: float = 1e6,
 ) -> Outcome:
     """Minimise over the matrix inequalities."""
-    programme = _Programme(c, blocks, np.full(len(c), box), time.perf_counter() + time_limit_s)
+    n, end = len(c), time.perf_counter() + time_limit_s
+    programme = _Programme(c, np.zeros((n, n)) if Q is None else Q, blocks, np.full(n, box), end)
     if not programme.holds(start):
         feasible = _find_feasible(programme, start)
         if feasible.x is None:
@@ -105,7 +113,9 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
     inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
     point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
-    extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]), programme.end)
+    extended = _Programme(
+        goal, np.zeros((n + 1, n + 1)), lifted, np.append(programme.box, 10 * point[n]), programme.end
+    )
     outcome = _follow(extended, point, 1e-9, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
         return replace(outcome, x=outcome.x[:n])
@@ -118,15 +128,16 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
 
     With `stop_below`, end at a centred point whose value lies clearly below it.
     """
-    c, size = programme.c, programme.size
-    mu, lower, ending = max(abs(float(c @ x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
+    size = programme.size
+    mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
     for _ in range(_STEPS):
         if time.perf_counter() > programme.end:
             ending = Ending.TIME
             break
         try:
+            slope = programme.c + programme.Q @ x
             gradient, hessian, roots = programme.derivatives(x)
-            gradient = c / mu + gradient
+            gradient, hessian = slope / mu + gradient, programme.Q / mu + hessian
             direction = -_solve(hessian, gradient)
         except np.linalg.LinAlgError:
             break
@@ -135,24 +146,26 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         if not np.isfinite(decrement):
             break
         if eigenvalues.max(initial=0.0) <= 1:
-            lower = max(lower, float(c @ (x + direction)) - mu * (size - float(eigenvalues @ eigenvalues)))
-        here, proven = float(c @ x), np.isfinite(stop_below) and lower > stop_below
+            lower = max(lower, programme.value(x + direction) - mu * (size - float(eigenvalues @ eigenvalues)))
+        here, proven = programme.value(x), np.isfinite(stop_below) and lower > stop_below
         if proven or here - lower <= rtol * max(abs(here), 1e-12) or (here < stop_below - 1e-7 and decrement < 1):
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
-        step = _line_search(float(c @ direction) / mu, eigenvalues)
+        curvature = float(direction @ programme.Q @ direction)
+        step = _line_search(float(slope @ direction) / mu, curvature / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
         if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
             break
         x = x + step * direction
         mu = mu * _SHRINK if decrement < _CENTRED else mu
-    return Outcome(x, float(c @ x), lower, ending)
+    return Outcome(x, programme.value(x), lower, ending)
 
 
 @dataclass(frozen=True, eq=False)
 class _Programme:
-    """``min c'x`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
+    """``min c'x + x'Qx/2`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
 
     c: Array
+    Q: Array
     blocks: Sequence[Block]
     box: Array
     end: float
@@ -161,6 +174,10 @@ class _Programme:
     def size(self) -> int:
         """Number of logarithms in the barrier."""
         return sum(b.constant.shape[0] * b.constant.shape[1] for b in self.blocks) + 2 * len(self.c)
+
+    def value(self, x: Array) -> float:
+        """Objective."""
+        return float(self.c @ x + x @ self.Q @ x / 2)
 
     def holds(self, x: Array) -> bool:
         """Whether a point satisfies all inequalities."""
@@ -178,7 +195,8 @@ class _Programme:
             root = np.linalg.inv(np.linalg.cholesky(block.at(x)))
             D = root @ block.basis @ root.swapaxes(-1, -2)
             gradient = gradient - np.trace(D, axis1=-2, axis2=-1).sum(axis=1)
-            flat = D.reshape(len(x), -1)
+            row, column = np.tril_indices(D.shape[-1])  # of symmetric matrices; entries below the diagonal count twice
+            flat = (D[..., row, column] * np.where(row > column, np.sqrt(2.0), 1.0)).reshape(len(x), -1)
             hessian = hessian + flat @ flat.T
             roots.append(root)
         return gradient, hessian, roots
@@ -202,16 +220,16 @@ def _solve(hessian: Array, gradient: Array) -> Array:
     return direction * scale
 
 
-def _line_search(slope: float, eigenvalues: Array) -> float:
-    """Minimise ``slope t - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
+def _line_search(slope: float, curvature: float, eigenvalues: Array) -> float:
+    """Minimise ``slope t + curvature t^2/2 - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
     lowest = float(eigenvalues.min(initial=0.0))
     limit = np.inf if lowest >= 0 else -1 / lowest
     low, high, t = 0.0, limit, min(1.0, 0.9 * limit)
     for _ in range(50):
         ratio = eigenvalues / (1 + t * eigenvalues)
-        first = slope - ratio.sum()
+        first, second = slope + curvature * t - ratio.sum(), curvature + ratio @ ratio
         low, high = (low, t) if first > 0 else (t, high)
-        step = t - first / (ratio @ ratio)
+        step = t - first / second
         t_new = step if low < step < high else (low + min(high, 4 * low + 1)) / 2
         if abs(t_new - t) <= 1e-3 * t_new:
             return float(min(t_new, 0.99 * limit))

@@ -1,7 +1,7 @@
 # Everything is built in .venv from the two lock files; nothing outside this folder changes.
 # A Python other than the newest found:  make install PYTHON=/path/to/python3.12
 
-.PHONY: help install demo test coverage check bench embedded docs dist lock clean
+.PHONY: help install demo test coverage check bench docs dist lock clean
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
 
@@ -51,9 +51,6 @@ bench: $(INSTALLED_DEV)  ## compare every stage with other packages and write do
 	@$(PIP) install -q --no-deps --upgrade --target build/peers -r benchmarks/peers.txt || echo "dkpy and slycot could not be installed: they are left out"
 	$(ONE_THREAD) PYTHONPATH=build/peers $(BIN)/python -m pytest -q benchmarks --benchmark-only --benchmark-json build/benchmarks.json --benchmark-quiet
 	PYTHONPATH=build/peers $(BIN)/python benchmarks/benchmarks_page.py build/benchmarks.json
-
-embedded: $(INSTALLED)  ## run an exported observer on a Cortex-M4F under QEMU, where the tools for it are there
-	$(BIN)/python benchmarks/embedded/measure.py
 
 docs: $(INSTALLED_DEV)  ## build the documentation in docs/_build/html
 	$(BIN)/python -m sphinx -W --keep-going -n -q -b html docs docs/_build/html

@@ -31,7 +31,7 @@ from kros.uncertainty import Form, UncertainModel, quantify
 from kros.uncertainty.weights.weight import Weight
 
 Array = npt.NDArray[Any]
-HEADER = "| form | model | population | structure | orders | cover_max, fit | cover_max, independent | overbound, dB | seconds |"
+HEADER = "| form | model | population | orders | cover_max, fit | cover_max, independent | overbound, dB | seconds |"
 DENSER, MAXIMA, FINER = 20, 40, 200
 
 
@@ -50,7 +50,7 @@ def main() -> None:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         place = options.keep or Path(folder)
-        sys.stdout.write(f"{HEADER}\n{'|---' * 9}|\n")
+        sys.stdout.write(f"{HEADER}\n{'|---' * 8}|\n")
         for population in options.populations:
             made = models_of(place, population, options.units)
             for model in options.models:
@@ -87,7 +87,7 @@ def row(models: ModelSet, form: str, name: str, population: str, options: argpar
     weight: Weight = found.weight
     orders = f"{' '.join(map(str, weight.left_orders))}, {' '.join(map(str, weight.right_orders))}"
     return (
-        f"| {form} | {name} | {population} | {weight.structure.value} | {orders} | {weight.cover_max:.7f} | {ratio:.7f} "
+        f"| {form} | {name} | {population} | {orders} | {weight.cover_max:.7f} | {ratio:.7f} "
         f"| {weight.overbound_db_max:.2f} | {seconds:.2f} |"
     )
 

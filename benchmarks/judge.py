@@ -6,7 +6,7 @@
 
 A population is ``kind:spread:seed[:variant]``: `stiff` and `soft` drives of the project's simulator, `compliant` ones of another (`judging/`), `dc`
 motors with Coulomb friction; variant `limit` has a current limit that
-the motion reaches, in `declared` it is told, `cut` has episodes of 0.7 s. Its units are parted into three
+the motion reaches, `cut` has episodes of 0.7 s. Its units are parted into three
 folds, and for each everything is made from the other units with defaults. Parts: `accuracy`, errors of all observers on the test episodes of the
 units left out, of their first 50 samples and of the rest, against the recording and the truth; `sensor`, the same where the position's sensor is
 worse, of observers that were told of it and of those that were not. A result is a JSON file for each population, fold and part, and one that is
@@ -26,7 +26,7 @@ import time
 import traceback
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, is_dataclass, replace
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from table import FOLDS, LEARNED, LIMITED, say, table  # noqa: E402
 import kros  # noqa: E402
 from kros.core.artifacts import write_json  # noqa: E402
 from kros.data import EpisodeBatch, EpisodeKey, Population, from_arrays, split_episodes  # noqa: E402
-from kros.design.estimators import make_learned  # noqa: E402
+from kros.design.baselines import make_learned  # noqa: E402
 from kros.design.settings import ObserverSettings, SynthesisSettings  # noqa: E402
 from kros.design.synthesize import Designs, synthesize_all  # noqa: E402
 from kros.design.validation import TrainingSet  # noqa: E402
@@ -50,7 +50,6 @@ from kros.evaluate import true_errors  # noqa: E402
 from kros.evaluate.sensor import as_shown  # noqa: E402
 from kros.identify.calibration import segments_of  # noqa: E402
 from kros.observer import EstimatorSettings, Sensor, run_observer  # noqa: E402
-from kros.observer.limits import Limit  # noqa: E402
 from kros.plants import PLANTS  # noqa: E402
 from kros.uncertainty.quantify import UncertainModels  # noqa: E402
 
@@ -67,7 +66,6 @@ EVERYTHING = (  # what says most comes first
         "stiff:1:403:cut",
         "dc:1:403:cut",
         "compliant:1:403:limit",
-        "compliant:1:403:declared",
     ),
     *(
         "stiff:3:401",
@@ -200,14 +198,12 @@ class Fold:
         began = time.process_time()
         methods = tuple(m for m in SynthesisSettings().methods if m != "mixed")
         baselines = ObserverSettings(baselines=("open_loop", "kalman_tuned"))
-        limits = {"current": Limit.of((-LIMIT, LIMIT), "Judge")} if self.task.variant == "declared" else {}
         found = synthesize_all(
             self.uncertain,
             SynthesisSettings(methods=methods),
             baselines,
             EstimatorSettings(),
             sensor=sensor,
-            limits=limits,
         )
         self.seconds["synthesize"] = time.process_time() - began
         return found
@@ -216,7 +212,7 @@ class Fold:
         """Train the learned estimator for a sensor."""
         models = self.uncertain.models
         first = models.models(models.kinds[0])
-        return make_learned(TrainingSet.whole(models, first, sensor), models.lifting, first.measured)
+        return make_learned(TrainingSet.whole(models, first, sensor), first.measured)
 
     def batch(self, sensor: Mapping[str, Sensor]) -> EpisodeBatch:
         """Read the test episodes of the units left out, as a sensor shows them."""
@@ -316,16 +312,10 @@ def accuracy(fold: Fold) -> dict[str, Any]:
     return {
         "deployed": designs.deployed,
         "facts": designs.facts,
-        "running": {r.name: [plain_row(row) for row in r.rows] for r in designs.running},
         "rows": fold.rows(designs, batch, learned),
         "learned": learned.facts,
         "at_limit": [[k.unit, k.condition, float(share)] for k, share in zip(batch.keys, at_limit, strict=True)],
     }
-
-
-def plain_row(row: Any) -> Any:
-    """Return a row of a certificate's report as a mapping."""
-    return row.as_dict() if hasattr(row, "as_dict") else asdict(row) if is_dataclass(row) else row
 
 
 def sensor(fold: Fold) -> dict[str, Any]:

@@ -19,7 +19,7 @@ import numpy as np
 
 import kros
 from kros.data import EpisodeBatch, Population, split_episodes
-from kros.design.estimators import make_learned
+from kros.design.baselines import make_learned
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import EstimatorSettings, Recordings, identify_estimator, run_observer
@@ -62,7 +62,7 @@ def errors(
     observer = identify_estimator(
         "estimator", lifting, measured, population.inputs, recordings, population.sample_period_s, settings=settings
     ).observer
-    learned = make_learned(training, lifting, measured)
+    learned = make_learned(training, measured)
     test = [k for split in split_episodes(population.select([unit])).values() for k in split.test]
     rows = []
     for batch in (EpisodeBatch.read(population, [key]) for key in test):

@@ -25,7 +25,8 @@ import kros
 from kros.core import KrosError, gain
 from kros.core.artifacts import read_json
 from kros.core.work import Work
-from kros.design.methods.robust import design_mixed
+from kros.design.methods.gains import OpenLoop
+from kros.design.methods.robust import Mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
 from kros.study import validate_config
@@ -86,10 +87,8 @@ def tasks(folder: Path) -> list[DesignTask]:
     with open_executor(1) as executor:
         context = Context(config, Store(folder), Work(executor))
         found = context.uncertain
-        first = [
-            tasks_of(found, kind, ("open_loop",), config.synthesis, config.estimator)[0] for kind in found.models.kinds
-        ]
-        return [replace(task, name=f"{task.models.name}/mixed", method="mixed") for task in first]
+        first = [tasks_of(found, kind, [OpenLoop()])[0] for kind in found.models.kinds]
+        return [replace(task, name=f"{task.models.name}/mixed", method=Mixed()) for task in first]
 
 
 def solve(task: DesignTask) -> tuple[str, float, bool]:
@@ -99,7 +98,7 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     n_states = mixed_plant(task.problem).sizes[0]
     wall, start = time.perf_counter(), time.process_time()
     try:
-        result = design_mixed(task)
+        result = task.method.design(task)
     except KrosError as error:
         return (
             f"{n_states:2d} states FAILED after {time.perf_counter() - wall:.2f} s: {error}",
@@ -109,10 +108,10 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
     wall, used = time.perf_counter() - wall, time.process_time() - start
     judge, found = task.training.read(), result.synthesis
     nothing, _ = certify(
-        result.problem,
+        replace(task.problem, injection=result.synthesis.injection),
         gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s),
     )
-    error, free = judge.percent(result.observer), judge.percent(task.open_loop())
+    error, free = judge.percent(result.observer), judge.percent(task.observer(task.open_loop()))
     return (
         f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) {found.solver:9s} "
         f"H2 {found.h2_norm:.4g} Hinf {found.hinf_norm:.4f} worst case {found.worst_case_h2:.4g} (open {nothing:.4g}) "

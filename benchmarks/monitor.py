@@ -24,7 +24,7 @@ from scipy.stats import beta
 
 import kros
 from kros.data import EpisodeBatch, Unit
-from kros.design.monitor import MOVING, fit_monitor, monitor_facts
+from kros.design.monitor import MonitorSettings, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
@@ -98,7 +98,7 @@ def levels(observer: Observer, recorded: TrainingSet) -> list[tuple[str, str, np
         y = batch.measurements(observer.measured)
         nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), monitor.settle)
         step = np.abs(np.diff(y, axis=0, prepend=y[:1]))[..., 0]
-        motion = np.cumsum(step > MOVING * np.sqrt(np.mean(step**2)), axis=0) * dt
+        motion = np.cumsum(step > MonitorSettings().moving * np.sqrt(np.mean(step**2)), axis=0) * dt
         for i, key in enumerate(batch.keys):
             level = monitor.level(monitor.mean_squares(nu[:, i : i + 1], judged[:, i : i + 1])[:, 0])
             rows.append((key.unit, key.condition, level, motion[:, i]))
@@ -147,7 +147,7 @@ def main() -> None:
     logging.disable(logging.INFO)
     observer, training = designed(args.loop, args.method, args.work)
     if args.own:
-        own = replace(observer, monitor=fit_monitor(observer, training, args.rate))
+        own = replace(observer, monitor=fit_monitor(observer, training, MonitorSettings(args.rate)))
         print(json.dumps(monitor_facts(own.monitor)), own.monitor.bounds, flush=True)
         counts = {"any": Count(), "told": Count()}
         for start in range(0, args.own, 20):
@@ -165,7 +165,9 @@ def main() -> None:
         kinds = [(kind, s) for kind, severities in FAULTS.items() for s in severities]
         watched = replace(
             observer,
-            monitor=fit_monitor(observer, record(good.take(slice(args.units)), seed, args.loop, EPISODES), args.rate),
+            monitor=fit_monitor(
+                observer, record(good.take(slice(args.units)), seed, args.loop, EPISODES), MonitorSettings(args.rate)
+            ),
         )
         bounds = dict(watched.monitor.bounds)
         rows = levels(

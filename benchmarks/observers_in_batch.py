@@ -30,8 +30,7 @@ from kros.observer import (
     run_observers,
     track_parameter,
 )
-from kros.observer.baselines.learned import Features
-from kros.observer.baselines.learned_moments import Moments
+from kros.observer.baselines.learned import Moments
 from kros.synthesis import Injection
 
 DT = 0.001
@@ -79,10 +78,9 @@ def main() -> None:
         "filtered difference",
         lambda: every(lambda block: FilteredDifference(3, ((0, 1),), 100.0, DT).run(block.y, block.u)),
     )
-    features = Features.of(KOOPMAN, (0,), blocks[0].y, blocks[0].u)
     moments = timed(
         "learned estimator, moments",
-        lambda: Moments.of(features, (part for block in blocks for part in block.one_by_one())),
+        lambda: Moments.of((part for block in blocks for part in block.one_by_one()), (0,), 10),
     )
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * sum(COUNTS) + 3

@@ -52,7 +52,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, default=Path("outlier_rates"))
     options = parser.parse_args()
     print("| models | form | condition | nominal rate | " + header() + " |")
-    print("|---" * (8 + len(SEVERITIES)) + "|")
+    print("|---" * (7 + len(SEVERITIES)) + "|")
     factors = [factors_of(seed, options) for seed in range(*options.seeds)]
     for kind in options.kinds:
         for condition in CONDITIONS:
@@ -71,17 +71,16 @@ def header() -> str:
     """Return the columns that `count` fills."""
     alarms = "false alarms, 12 good | populations with one | false alarms beside a planted drive"
     detected = " | ".join(f"detected, severity {s:g}" for s in SEVERITIES)
-    return f"{alarms} | {detected} | nominals that agree, severity {', '.join(f'{s:g}' for s in SEVERITIES)}"
+    return f"{alarms} | {detected}"
 
 
 def count(populations: list[dict[float, tuple[Array, Array, Array]]], form: str, rate: float) -> list[str]:
-    """Return false alarms without and with a planted drive, detections at every severity, and the median share of agreeing nominals."""
+    """Return false alarms without and with a planted drive, and detections at every severity."""
     good = np.array([[s.outlier for s in scored(p[0.0], form, rate).scores] for p in populations])
     bad = {s: [scored(p[s], form, rate).scores for p in populations] for s in SEVERITIES}
     beside = np.array([[s.outlier for s in scores[:-1]] for s in SEVERITIES for scores in bad[s]])
     detected = [share(np.array([scores[-1].outlier for scores in bad[s]])) for s in SEVERITIES]
-    agreement = [f"{100 * np.median([scores[-1].agreement for scores in bad[s]]):.0f} %" for s in SEVERITIES]
-    return [share(good), share(good.any(axis=1)), share(beside), *detected, ", ".join(agreement)]
+    return [share(good), share(good.any(axis=1)), share(beside), *detected]
 
 
 def scored(population: tuple[Array, Array, Array], form: str, rate: float) -> OutlierModel:

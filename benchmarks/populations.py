@@ -78,7 +78,7 @@ def facts(metrics: dict[str, Any]) -> dict[str, Any]:
                 name
             ].get("reason")
         weight = metrics["uncertainty"][model]["weight"]
-        found[f"{model}/weight"] = {k: weight[k] for k in ("structure", "cover_max", "overbound_db_max", "orders")}
+        found[f"{model}/weight"] = {k: weight[k] for k in ("cover_max", "overbound_db_max", "orders")}
     loaded = sorted((r for r in metrics["outliers"] if r["condition"] == "load"), key=lambda r: -r["score"])
     found["top_loaded"] = [(r["unit"], round(r["score"], 2)) for r in loaded[:2]]
     found["flagged"] = [(r["unit"], r["condition"]) for r in metrics["outliers"] if r["outlier"]]

@@ -26,10 +26,9 @@ from kros.core.artifacts import read_json, write_json
 from kros.core.work import Work
 from kros.data import EpisodeBatch
 from kros.data.readers.parquet import read_parquet
-from kros.design.methods.design import design
-from kros.design.synthesize import tasks_of
+from kros.design.methods import methods_of
+from kros.design.synthesize import _design, tasks_of
 from kros.observer import Observer, ReliftScales, relift_certificate
-from kros.observer.certificate.report import relift_report
 from kros.observer.residual.one_step import one_step_residual
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
@@ -40,6 +39,7 @@ from kros.study.engine.store import Store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "support"))
 from adversary import attack, attack_running
+from frozen import compared
 
 KINDS = ("koopman", "linear")
 STUDY: dict[str, Any] = {
@@ -103,13 +103,13 @@ def study(folder: Path, seed: int, loop: str, spread: float, options: argparse.N
             tasks = [
                 task
                 for kind in KINDS
-                for task in tasks_of(context.uncertain, kind, wanted, config.synthesis, config.estimator)
+                for task in tasks_of(context.uncertain, kind, methods_of(wanted, config.estimator))
             ]
             made = []
-            for task, product in zip(tasks, context.work.map("synthesize", design, tasks), strict=True):
-                if product.observer is not None:
+            for task, product in zip(tasks, context.work.map("synthesize", _design, tasks), strict=True):
+                if not isinstance(product, str):
                     product.observer.save(run / "observers" / f"{task.name}.json")
-                made.append([task.name, product.facts.get("reason")])
+                made.append([task.name, product if isinstance(product, str) else None])
         write_json(run / "observers" / "made.json", made)
     return run
 
@@ -159,7 +159,7 @@ def judged(
     }
     if certificate.gain is None:
         return told | {"certified": False, "reason": certificate.reason}
-    rows = relift_report(certificate, observer, batch)
+    rows = compared(certificate, observer, batch)
     start = time.process_time()
     worst = attack(certificate, observer, steps=options.steps)
     share, steps = attack_running(certificate, observer, worst.disturbance, batch.states[0], batch.inputs, values)
@@ -167,11 +167,7 @@ def judged(
         "certified": True,
         "gain": certificate.gain,
         "lower_bound": certificate.lower_bound,
-        "mismatch_gain": certificate.mismatch_gain,
-    }
-    told |= {
         "error_of_bound": [r.error / r.bound for r in rows],
-        "error_of_gain_bound": [r.error / r.gain_bound for r in rows],
     }
     told |= {
         "attack": worst.share,
@@ -197,9 +193,6 @@ def summary(rows: list[dict[str, Any]]) -> dict[str, Any]:
                 "attack_running_share": [rounded(f([m["attack_running"] for m in made])) for f in (min, max)],
                 "error_of_bound": [
                     rounded(f([v for m in made for v in m["error_of_bound"]])) for f in (min, np.median, max)
-                ],
-                "error_of_gain_bound": [
-                    rounded(f([v for m in made for v in m["error_of_gain_bound"]])) for f in (min, np.median, max)
                 ],
                 "states_max": max(m["states"] for m in made),
                 "cpu_s_max": max(m["cpu_s"] for m in made),

@@ -10,6 +10,7 @@ sensor: percent of the largest value of velocity and current, mean over the unit
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,16 +18,16 @@ from typing import Any
 import numpy as np
 
 import kros
+from kros.core.errors import SynthesisError
 from kros.data import EpisodeBatch
-from kros.design.estimators import make_learned
-from kros.design.methods.design import design
-from kros.design.settings import SynthesisSettings
+from kros.design.baselines import make_learned
+from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent
 from kros.evaluate.sensor import as_shown
 from kros.identify.calibration import segments_of
-from kros.observer import EstimatorSettings, Sensor, run_observer
+from kros.observer import Sensor, run_observer
 from kros.observer.units import in_sizes
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.uncertainty.quantify import UncertainModels
@@ -73,13 +74,14 @@ def held_out(uncertain: UncertainModels, population: Any, units: list[str]) -> E
 def designs(uncertain: UncertainModels, sensor: dict[str, Sensor]) -> dict[str, Run]:
     """Design and train everything for a sensor."""
     found: dict[str, Run] = {}
-    for task in tasks_of(uncertain, "koopman", METHODS, SynthesisSettings(), EstimatorSettings(), sensor):
-        made = design(task).observer
-        if made is not None:
-            own = in_sizes(made, {})
-            found[task.method] = lambda b, o=own: run_observer(o, b.measurements(o.measured), b.inputs, b.parameters)  # type: ignore[misc]
+    for task in tasks_of(uncertain, "koopman", methods_of(METHODS), sensor):
+        with contextlib.suppress(SynthesisError):
+            own = in_sizes(task.method.design(task).observer, {})
+            found[task.method.name] = lambda b, o=own: run_observer(
+                o, b.measurements(o.measured), b.inputs, b.parameters
+            )  # type: ignore[misc]
     models = uncertain.models
-    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.lifting, models.models().measured)
+    learned = make_learned(TrainingSet.whole(models, models.models(), sensor), models.models().measured)
     return found | {"learned": lambda b: learned.run(b, b.parameters)}
 
 

@@ -70,7 +70,6 @@ def read(run: Path) -> tuple[dict[str, tuple[Observer, str | None]], HeldOut]:
     kinds["deployed"] = deployed, None
     kinds["deployed, late"] = replace(deployed, runtime=replace(deployed.runtime, delay=3)), None
     kinds["deployed, limited"] = replace(deployed, runtime=runtime), None
-    kinds["deployed, limits cut off"] = replace(deployed, runtime=replace(runtime, relift=False)), None
     if deployed.lifting.parameters:
         kinds["deployed, followed"] = deployed, deployed.lifting.parameters[0]
     return kinds, data

@@ -14,7 +14,7 @@ import numpy as np
 from kros.core.artifacts import read_json
 
 HOME, LEARNED, FOLDS = "noload", "learned", 3
-LIMITED = ("limit", "declared")  # variants of a population
+LIMITED = ("limit",)  # variants of a population
 REACHED = 0.005  # share of an episode's samples at the limit from which on it counts
 DRAWS = 4000  # of the bootstrap
 PROOFS = r"certified|robust|worst_case|bound|gain$|hidden_error"  # facts of the deployed observer that are printed

@@ -35,8 +35,6 @@ QUICK = (
     "identify.refine=false",
     "evaluate.robustness=false",
     'synthesis.methods=["residual_h2"]',
-    "synthesis.input_weight=3.0",
-    "uncertainty.max_order=1",
     "uncertainty.n_freqs=60",
 )
 STUDY = """name = "drives"
@@ -186,7 +184,7 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
     keys = (
         "identify.alpha",
         "uncertainty.n_freqs",
-        "uncertainty.max_order",
+        "uncertainty.form",
         "split.test_fraction",
         "evaluate.folds",
         "evaluate.reserve",
@@ -198,7 +196,6 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "sensor.angle.noise",
         "sensor.angle.dropout",
         "limits.speed",
-        "observer.deployed",
         "calibrate.angle",
     )
     keys += (
@@ -208,8 +205,8 @@ def more_toml(content: bytes, rng: random.Random) -> bytes:
         "estimator.order",
         "data.prepare",
         "data.source",
-        "identify.model_set",
-        "load.limit",
+        "identify.kinds",
+        "load.moment",
     )
     values = (
         "-1",
@@ -466,7 +463,7 @@ def run(count: int, seed: int) -> list[Tally]:
                 "Parquet",
                 root / "parquet",
                 PARQUET,
-                [["run", "parquet.toml", "--until", "read", *until], ["convert", "case", WRITTEN, "--workers", "1"]],
+                [["run", "parquet.toml", "--until", "read", *until]],
             ),
             (
                 "TOML",

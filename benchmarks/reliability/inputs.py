@@ -301,7 +301,7 @@ STUDY: dict[str, Any] = {
     },
     "lifting": {"functions": ["sin(position)"], "families": [{"kind": "harmonics", "angle": "position", "ratio": 3}]},
     "identify": {"alpha": 90.0, "refine": False},
-    "uncertainty": {"form": "additive", "max_order": 3},
+    "uncertainty": {"form": "additive"},
     "synthesis": {"methods": ["mixed"]},
     "sensor": {"position": {"noise": 1e-3}},
     "evaluate": {"folds": 2},

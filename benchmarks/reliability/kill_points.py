@@ -35,9 +35,7 @@ reader = "parquet"
 refine = false
 [uncertainty]
 n_freqs = 60
-max_order = 1
 [synthesis]
-input_weight = 3.0
 methods = ["residual_h2"]
 [observer]
 baselines = ["open_loop", "kalman_tuned"]

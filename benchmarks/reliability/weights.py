@@ -25,7 +25,6 @@ from kros.uncertainty import Form, quantify
 Array = np.ndarray[Any, Any]
 KINDS = ("generic", "lightly damped", "stiff", "nearly identical", "identical", "static", "delayed")
 SHAPES = ((1, 1),) * 6 + ((2, 1), (1, 2), (2, 2)) * 2 + ((3, 2), (2, 3))
-STRUCTURES = ("auto", "auto", "auto", "entrywise")
 ROUNDING = 1e-7  # of the ratio: products and inverses in double precision
 TIGHT_DB = 0.02  # rounding of what is compared with the tolerance
 EPS = 1e-15
@@ -39,7 +38,6 @@ class Case:
     kind: str
     units: list[StateSpace]
     form: Form
-    structure: str
     max_order: int
     tolerance_db: float
     freqs_hz: Array
@@ -66,8 +64,8 @@ def make(rng: np.random.Generator) -> Case:
     units = [_unit(rng, kind, base, B, C, D, spread, dt, continuous) for _ in range(count)]
     top = 0.4999 / dt
     freqs = np.geomspace(top * 10.0 ** -rng.uniform(2, 5), top, int(rng.integers(10, 30)))
-    form, structure = list(Form)[rng.integers(6)], STRUCTURES[rng.integers(len(STRUCTURES))]
-    return Case(kind, units, form, structure, 1 + int(8 * rng.random() ** 3), float(rng.choice([0.5, 1.0, 3.0])), freqs)
+    form = list(Form)[rng.integers(6)]
+    return Case(kind, units, form, 1 + int(8 * rng.random() ** 3), float(rng.choice([0.5, 1.0, 3.0])), freqs)
 
 
 def _modes(rng: np.random.Generator, kind: str) -> list[tuple[float, float]]:
@@ -209,11 +207,7 @@ def largest(ratio: Callable[[Array], Array], freqs_hz: Array) -> tuple[float, fl
 
 
 def excess(weight: Any, E: Array, freqs_hz: Array) -> Array:
-    """Largest ratio of residuals (unit, frequency, p', m') to a weight at every frequency; of entries where these are bounded."""
-    if weight.structure.value == "entrywise":
-        allowed = np.abs(response(weight.matrix(), freqs_hz))
-        found = np.abs(E) / np.where(allowed > 0, allowed, 1.0)
-        return np.where((allowed == 0) & (np.abs(E) > 1e-300), np.inf, found).max(axis=(0, 2, 3))
+    """Largest ratio of residuals (unit, frequency, p', m') to a weight at every frequency."""
     left, right = response(weight.left, freqs_hz), response(weight.right, freqs_hz)
     nothing = np.abs(left).max(axis=(1, 2)) == 0
     eye = np.eye(left.shape[1])
@@ -223,15 +217,12 @@ def excess(weight: Any, E: Array, freqs_hz: Array) -> Array:
 
 
 def loose_db(weight: Any, E: Array, freqs_hz: Array) -> float | None:
-    """Overbound over the optimal cover where that is known in closed form: one entry, scalar and entrywise weights."""
-    if weight.structure.value == "entrywise":
-        sizes, allowed = np.abs(E).max(axis=0), np.abs(response(weight.matrix(), freqs_hz))
-    elif E.shape[2:] == (1, 1):
-        sizes = np.linalg.norm(E, 2, axis=(-2, -1)).max(axis=0)
-        left, right = response(weight.left, freqs_hz), response(weight.right, freqs_hz)
-        allowed = np.abs(left[:, 0, 0] * right[:, 0, 0])
-    else:
+    """Overbound over the optimal cover where that is known in closed form: one entry."""
+    if E.shape[2:] != (1, 1):
         return None
+    sizes = np.linalg.norm(E, 2, axis=(-2, -1)).max(axis=0)
+    left, right = response(weight.left, freqs_hz), response(weight.right, freqs_hz)
+    allowed = np.abs(left[:, 0, 0] * right[:, 0, 0])
     some = sizes > 0
     return float(20 * np.log10(allowed[some] / sizes[some]).max()) if some.any() else 0.0
 
@@ -254,7 +245,6 @@ def limited(seconds: float) -> Iterator[None]:
 def models(case: Case) -> tuple[str, bool]:
     """Judge `quantify`: the bound between grid points, that of the remainder, and the statement about the tolerance."""
     options: dict[str, Any] = {
-        "structure": case.structure,
         "max_order": case.max_order,
         "tolerance_db": case.tolerance_db,
     }
@@ -335,7 +325,9 @@ def run(count: int, seed: int) -> list[Tally]:
             outcome, failed = judged(partial(judge), case)
             tally.add(outcome, time.process_time() - began, failed)
             if failed:
-                name = f"{k} {case.kind} {case.units[0].D.shape} {case.form.value} {case.structure} {case.max_order} dt {case.units[0].dt}"
+                name = (
+                    f"{k} {case.kind} {case.units[0].D.shape} {case.form.value} {case.max_order} dt {case.units[0].dt}"
+                )
                 tally.note = (tally.note + "; " if tally.note else "") + f"{name}: {outcome}"
                 logging.getLogger("campaign").warning("%s: %s", name, outcome)
     return tallies

@@ -22,7 +22,7 @@ import numpy as np
 import kros
 from kros.core.artifacts import load_artifact
 from kros.data import EpisodeBatch, Population, read, split_episodes
-from kros.design.estimators import make_difference, make_extended, make_learned
+from kros.design.baselines import make_difference, make_extended, make_learned
 from kros.design.validation import TrainingSet
 from kros.evaluate import error_percent, unit_interval
 from kros.identify import ModelSet
@@ -150,8 +150,7 @@ def baselines(training: TrainingSet, folder: Path) -> dict[str, Any]:
     return {
         f"{names[0]}/ekf": partial(make_extended, training, models, nominal, noise),
         "filtered_difference": partial(make_difference, training, models.measured),
-        "learned": partial(make_learned, training, models.lifting, models.measured),
-        "learned, linear": partial(make_learned, training, Lifting(models.lifting.states), models.measured),
+        "learned": partial(make_learned, training, models.measured),
     }
 
 

@@ -99,11 +99,7 @@ def claims(metrics: Metrics, method: str = "mixed") -> Iterator[tuple[str, str, 
     yield "IV-C, Fig. 7", text, f"peaks: {both(lambda kind: forms(metrics, kind))}"
     nominals = both(lambda kind: str(metrics["uncertainty"][kind]["nominal"]))
     yield "IV-C", "The unit with the lowest peak is the nominal one, the same for both", nominals
-    orders = both(
-        lambda kind: (
-            f"{metrics['uncertainty'][kind]['weight']['structure']} {metrics['uncertainty'][kind]['weight']['orders']}"
-        )
-    )
+    orders = both(lambda kind: f"{metrics['uncertainty'][kind]['weight']['orders']}")
     yield (
         "IV-C, Fig. 8",
         "Weights of order 1 to 2 (linear), 3 and once 1 (Koopman), an entry each",

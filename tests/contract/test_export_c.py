@@ -12,7 +12,6 @@ from machines import LIMITS, MACHINES, apart, drive, filters, in_python, samples
 
 from kros.core.errors import ConfigError, DataError
 from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c
-from kros.export.c99.board import missing_tools
 from kros.export.c99.golden import Golden
 from kros.loops import find_compiler
 from kros.motor_drive import AngleLoad
@@ -178,17 +177,6 @@ def test_the_numerical_error_on_held_out_recordings(tmp_path):
     assert abs(found["loss_percent"]["velocity"]) < 0.2  # its two filters are larger than the estimate, and single too
     assert found["loss_percent"]["current"] is None
     assert not list(folder.glob("*.so"))
-
-
-@pytest.mark.skipif(bool(missing_tools()), reason="the tools for a Cortex-M4F are not on the PATH")
-def test_the_selftest_passes_on_a_board(tmp_path):
-    found = json.loads(
-        (export_c(filters(), tmp_path / "c", "drive", "float", on_board=True) / "manifest.json").read_text()
-    )
-    assert found["cortex_m4f"]["selftest"] == 0
-    assert found["cortex_m4f"]["state"] == found["state_bytes"]
-    assert found["cortex_m4f"]["flash"] < 8192
-    assert found["cortex_m4f"]["instructions_a_step"] < 3000
 
 
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")

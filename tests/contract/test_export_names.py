@@ -11,7 +11,7 @@ from machines import drive, watched
 from kros.core.errors import ConfigError
 from kros.export import LoadOutput, export_c
 from kros.export.c99.numbers import Source
-from kros.export.fmu.write import rendered
+from kros.export.fmu.write import fmu_files
 from kros.export.text import plain, plain_names
 from kros.lifting import Lifting
 from kros.loops import find_compiler
@@ -79,7 +79,7 @@ def test_a_hostile_name_is_text_in_every_file(kind, slot, tmp_path):
     if (compiler := find_compiler()) is not None:
         command = [compiler, "-std=c99", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", *map(str, folder.glob("*.c"))]
         assert subprocess.run(command, capture_output=True, text=True, check=False).stderr == ""
-    files = rendered(Source.of(observer, "drive", "double"), 3, "guid")
+    files = fmu_files(Source.of(observer, "drive", "double"), 3, "guid")
     root = ET.fromstring(files["modelDescription.xml"])
     assert {child.tag for child in root} <= {
         "CoSimulation",

@@ -16,17 +16,14 @@ from machines import LIMITS, MACHINES, drive, samples
 
 from kros.core.artifacts import read_json
 from kros.core.errors import ConfigError
-from kros.evaluate.errors import summarise_all
 from kros.export import HeldOut, export_c, export_fmu
 from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
-from kros.loops import compiler, filtered, find_compiler, library, recursion
-from kros.observer import Monitor
+from kros.loops import compiler, find_compiler, library, recursion
 from kros.observer.baselines.extended_kalman import ExtendedKalman
-from kros.observer.monitor import octaves
-from kros.observer.simulate import run_innovations, run_observer, run_observers, run_some_at_a_time
+from kros.observer.simulate import run_innovations, run_observer, run_observers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
 MACHINE_COUNT = 37  # more than are side by side at once, and no multiple of a vector
@@ -86,48 +83,6 @@ def test_observers_side_by_side_run_alike(both):
     y, u, phase = machines_of()
     observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
     assert_same(*both(lambda: run_observers(observers, y, u, {"phase": phase})))
-
-
-@needs_compiler
-def test_monitors_remember_alike(both):
-    rng = np.random.default_rng(3)
-    noise, judged = rng.normal(size=(500, 3, 2)) * [1.0, 300.0], rng.random((500, 3)) < [0.9, 1.0, 0.0]
-    noise[rng.random(noise.shape) < 0.02] = np.nan
-    filters = octaves(9)  # more than are side by side at once
-    monitor = Monitor(
-        filters, 0.01, 0, np.array([1.0, 0.1]), np.ones((2, 9)), np.pad([[8], [8]], ((0, 0), (0, 8))), 0.02, first=0.1
-    )
-    assert_same(*both(lambda: [monitor.mean_squares(noise, judged)]))
-
-
-@needs_compiler
-def test_errors_and_spectra_are_alike(both):
-    """Episodes that end within a segment and between two, with memories behind the states and an estimate that is lost."""
-    rng, lengths = np.random.default_rng(4), np.array([1500, 40, 511, 512, 767, 768, 1023, 1024, 1279, 1280, 1499])
-    estimates = rng.normal(size=(1500, 3, 5, len(lengths))).transpose(1, 0, 3, 2)
-    estimates[1, 700, 3, 1], estimates[2, 1100, 9, 0] = np.inf, np.nan
-    truth = 2 * rng.normal(size=(1500, len(lengths), 2))
-    truth[:, 7, 1] = 0.0
-
-    def run():
-        found = summarise_all(estimates, truth, lengths, 0.01)
-        return [
-            getattr(own, name)
-            for own in found
-            for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz")
-        ]
-
-    assert_same(*both(run))
-
-
-def test_observers_some_at_a_time_find_what_all_of_them_do():
-    y, u, phase = machines_of(200)
-    observers = [drive(order=order, **LIMITS) for order in (0, 2, 5)]
-    together = run_observers(observers, y, u, {"phase": phase})
-    for count in (1, 2):
-        np.testing.assert_array_equal(
-            np.concatenate(list(run_some_at_a_time(observers, y, u, {"phase": phase}, count))), together
-        )
 
 
 def model_of(lifting, units, rng):
@@ -207,30 +162,10 @@ def test_extended_kalman_filters_are_alike(functions, measured, both):
 
 
 @needs_compiler
-@pytest.mark.parametrize("every", [1, 4, 70])
-def test_filters_and_recursions_are_alike(every, both):
+def test_recursions_are_alike(both):
     rng = np.random.default_rng(4)
-    x, rest = rng.normal(size=(3, 13, 301)) + 1e3, 1e3 * np.ones((3, 13))
     F, driven = 0.9 * np.eye(5) + 0.02 * rng.normal(size=(5, 5)), rng.normal(size=(200, MACHINE_COUNT, 5))
-
-    def run():
-        return (
-            *filtered(x, rest, -1.99, 0.9902, every),
-            recursion(F, driven, driven[0]),
-        )
-
-    found, wanted = both(run)
-    assert_same(found, wanted)
-
-
-@needs_compiler
-@pytest.mark.parametrize("lost", [0, 100, 139, 299, 300])
-def test_a_sample_that_is_no_number_is_not_felt_before_it_is_there(lost, both):
-    x = np.random.default_rng(6).normal(size=(1, 301))
-    x[0, lost] = np.nan
-    found, wanted = both(lambda: filtered(x, np.zeros(1), -1.2, 0.5))
-    assert_same(found, wanted)
-    assert np.isfinite(found[0]).sum() == lost + 1
+    assert_same(*both(lambda: [recursion(F, driven, driven[0])]))
 
 
 SOURCE = "int kros_answer(void);\nint kros_answer(void) { return 42; }\n"
@@ -342,17 +277,6 @@ def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, 
             assert use() is None
         assert reason in caplog.records[-1].getMessage()
         assert len([r for r in caplog.records if r.name == caplog.records[-1].name]) == 1
-
-
-@needs_compiler
-def test_a_user_without_a_home_compiles_among_temporary_files(tmp_path, monkeypatch):
-    def nowhere():
-        raise RuntimeError("Could not determine home directory.")
-
-    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
-    monkeypatch.setattr(compiler.Path, "home", nowhere)
-    monkeypatch.setattr(compiler.tempfile, "gettempdir", lambda: str(tmp_path))
-    assert compiler.load(SOURCE, FLAGS).kros_answer() == 42
 
 
 def test_an_unknown_choice_is_refused(monkeypatch):

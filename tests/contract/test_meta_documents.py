@@ -216,7 +216,7 @@ def test_every_key_of_a_study_is_on_the_page_of_keys(monkeypatch: pytest.MonkeyP
         for name, text in schema["properties"].items()
         if "$ref" in text
     }
-    assert len(tables) == 12
+    assert len(tables) == 11
     for name, table in tables.items():
         section = page.split(f"### `[{name}]`\n")[1].split("\n### ")[0]
         rows = {

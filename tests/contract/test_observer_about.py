@@ -19,7 +19,7 @@ from kros.export import CompiledObserver, HeldOut, export_c
 from kros.lifting import Lifting
 from kros.loops import find_compiler
 from kros.observer import Observer
-from kros.observer.recorded import recorded_channel
+from kros.observer.units import recorded_channel
 from kros.plants import PLANTS
 from kros.study.commands.estimate import estimate_recordings
 from kros.study.commands.export import export_run
@@ -59,9 +59,9 @@ def found(tmp_path_factory) -> tuple[Any, dict[str, Any]]:
         )
     quick: dict[str, Any] = {
         "identify": {"refine": False},
-        "uncertainty": {"n_freqs": 60, "max_order": 1},
-        "synthesis": {"methods": ["residual_h2"], "input_weight": 3.0},
-        "observer": {"baselines": ["open_loop"], "deployed": "linear_edmd/residual_h2"},
+        "uncertainty": {"n_freqs": 60},
+        "synthesis": {"methods": ["residual_h2"]},
+        "observer": {"baselines": []},
         "sensor": {"angle": {"noise": 1e-4}},
     }
     study = kros.run(kros.read(folder / "rec", mapping=MAPPING), folder / "run", until="synthesize", **quick)

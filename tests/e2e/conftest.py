@@ -36,9 +36,9 @@ def recorded(kros, tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="session")
 def demo(kros, recorded, tmp_path_factory) -> Path:
-    """A finished study: the input weight is fixed, which would take most of the time; fewer rows, points and trials."""
+    """A finished study, with fewer rows and points."""
     folder = tmp_path_factory.mktemp("demo")
-    quick = '[observer]\ndeployed = "koopman/estimator"\n[synthesis]\ninput_weight = 3.0\n[estimator]\nrows = 20000\n[uncertainty]\nn_freqs = 300\n'
+    quick = "[estimator]\nrows = 20000\n[uncertainty]\nn_freqs = 300\n"
     (folder / "demo.toml").write_text(f'[data]\nsource = "{recorded}"\nreader = "parquet"\n{quick}')
     result = kros("run", folder / "demo.toml", "--out", folder / "run", "--workers", 1)
     assert result.exit_code == 0, result.output

@@ -7,8 +7,6 @@ import pytest
 FAST = (
     "identify.refine=false",
     "uncertainty.n_freqs=60",
-    "uncertainty.max_order=1",
-    "synthesis.input_weight=3.0",
     'synthesis.methods=["residual_h2"]',
     'observer.baselines=["open_loop", "learned"]',
     "evaluate.robustness=false",

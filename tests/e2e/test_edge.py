@@ -71,8 +71,7 @@ def said(result, code, *words):
     ids=lambda value: type(value).__name__,
 )
 @pytest.mark.parametrize(
-    "command",
-    ["run", "report", "check", "estimate", "figures", "convert", "simulate", "demo", "doctor", "init", "list"],
+    "command", ["run", "report", "check", "estimate", "figures", "simulate", "demo", "doctor", "init", "list"]
 )
 def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command, error, words):
     def fail(*_, **__):
@@ -84,24 +83,13 @@ def test_any_exception_becomes_one_message(kros, tmp_path, monkeypatch, command,
         "check": "kros.study.commands.check.check_units",
         "estimate": "kros.study.commands.estimate.estimate_recordings",
         "figures": "kros.study.stages.report.write_figures",
-        "convert": "kros.study.commands.convert.convert_recordings",
         "simulate": "kros.study.commands.demo.simulate_to",
         "demo": "kros.study.commands.demo.run_demo",
         "doctor": "kros.study.commands.doctor.diagnose",
         "init": "kros.study.commands.init.init_study",
         "list": "kros.study.commands.summary.list_run",
     }
-    arguments = {
-        "run": 1,
-        "report": 1,
-        "check": 2,
-        "estimate": 3,
-        "figures": 2,
-        "convert": 2,
-        "simulate": 1,
-        "init": 1,
-        "list": 1,
-    }
+    arguments = {"run": 1, "report": 1, "check": 2, "estimate": 3, "figures": 2, "simulate": 1, "init": 1, "list": 1}
     monkeypatch.setattr(places[command], fail)
     said(kros(command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))]), 1, *words)
     debugged = kros("--debug", command, *[tmp_path / f"{i}" for i in range(arguments.get(command, 0))])
@@ -118,9 +106,6 @@ def test_folders_that_cannot_be_made(kros, store, tmp_path, out):
             pytest.skip("nothing is forbidden to root")
         (tmp_path / "locked").chmod(0o500)
     result = kros("run", study, "--out", tmp_path / out, "--until", "read", "--workers", 1)
-    assert result.exit_code in (1, 2)
-    said(result, result.exit_code)
-    result = kros("convert", tmp_path / "recordings", tmp_path / out, "--workers", 1)
     assert result.exit_code in (1, 2)
     said(result, result.exit_code)
 
@@ -157,14 +142,13 @@ def test_a_study_that_is_no_file(kros, tmp_path, kind):
     else:
         path.mkdir()
     said(kros("run", path, "--out", tmp_path / "out"), 2, "a regular file is needed", kind)
-    said(kros("convert", tmp_path, tmp_path / "out", "--mapping", path), 2, "a regular file is needed")
 
 
 @pytest.mark.parametrize(
     ("content", "word"),
     [
         ("a = " + "[" * 5000, "nested"),
-        ("[data]\nsource = 'recordings'\n[identify]\nalpha_factor = inf\n", "alpha_factor"),
+        ("[data]\nsource = 'recordings'\n[identify]\nalpha = inf\n", "alpha"),
         ("[data]\nsource = 'recordings'\n[load]\ninertia = nan\n", "inertia"),
         ('[data]\nsource = "a\\u0000b"\n', "nul"),
         ("[data]\nsource = 'recordings'\n[[lifting.families]]\nkind = 'harmonics'\nangle = 5\nratio = []\n", "lifting"),

@@ -25,7 +25,6 @@ def test_double_pendulum(recordings, tmp_path):
         'synthesis.methods=["residual_h2"]',
         'observer.baselines=["open_loop", "learned"]',
         "uncertainty.n_freqs=100",
-        "uncertainty.max_order=1",
         "evaluate.robustness=false",
     ]
     metrics = run_example(
@@ -74,7 +73,7 @@ def test_the_other_joint_is_what_makes_drives_of_double_pendulums_unlike(recordi
 
 def test_a_drive_that_was_left_out_is_estimated_as_well_as_by_a_regression(recordings, tmp_path):
     small = ["identify.refine=false", 'synthesis.methods=["residual_h2"]', 'observer.baselines=["open_loop"]']
-    small += ["uncertainty.n_freqs=50", "uncertainty.max_order=1"]
+    small += ["uncertainty.n_freqs=50"]
     settings = [part for setting in small for part in ("--set", setting)]
     options = ["--out", tmp_path / "out", "--json", "--drives", "C.0-elbow", "--alone", *settings]
     found = json.loads(run_script("left_out.py", recordings, *options))

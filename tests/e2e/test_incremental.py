@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from collections.abc import Callable, Sequence
@@ -10,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_results import results
 
 import kros
 from kros.core.work import Work
 from kros.study import Stage, validate_config
 from kros.study import run as run_study
-
-TIMES = {"seconds", "solve_s", "timing_s", "checksum"}
 
 
 @pytest.fixture(scope="module")
@@ -49,25 +47,6 @@ def study(source: Path, out: Path, **identify: Any) -> Path:
     content = {"name": "grown", "data": {"source": str(source)}, "identify": {"refine": False, **identify}}
     content["data"]["reader"] = "motor-drive-raw"
     return run_study(validate_config(content, source), out, until=Stage.IDENTIFY).folder
-
-
-def results(run: Path) -> dict[str, Any]:
-    """What a run left, without times."""
-
-    def cleaned(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {k: cleaned(v) for k, v in value.items() if k not in TIMES}
-        return [cleaned(v) for v in value] if isinstance(value, list) else value
-
-    files = [
-        p
-        for p in sorted(run.rglob("*"))
-        if p.is_file() and p.relative_to(run).parts[0] not in ("store", "manifest.json")
-    ]
-    return {
-        p.relative_to(run).as_posix(): cleaned(json.loads(p.read_text())) if p.suffix == ".json" else p.read_bytes()
-        for p in files
-    }
 
 
 def folders(raw: Path) -> list[Path]:

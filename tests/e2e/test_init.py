@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -112,32 +111,6 @@ def test_every_dialect_is_read_back_as_it_was_written(kros, tmp_path, motors, ki
         np.testing.assert_allclose(found.read(ours), motors.read(theirs), rtol=1e-8, atol=1e-10)
 
 
-def test_european_csv_to_a_report_with_two_commands(kros, tmp_path, motors):
-    folder = written(tmp_path / "Messungen", motors, "european")
-    result = kros("init", folder, "--out", tmp_path / "study.toml")
-    assert result.exit_code == 0, result.output
-    assert "winkel_abtrieb [rad]" in result.output
-    quick = [
-        "uncertainty.n_freqs=60",
-        "synthesis.input_weight=3.0",
-        'synthesis.methods=["worst_case_h2"]',
-        "identify.refine=false",
-    ]
-    quick += ["evaluate.robustness=false", 'observer.baselines=["open_loop"]', "estimator.rows=20000"]
-    result = kros(
-        "run",
-        tmp_path / "study.toml",
-        "--out",
-        tmp_path / "run",
-        "--workers",
-        1,
-        *(a for q in quick for a in ("--set", q)),
-    )
-    assert result.exit_code == 0, result.output
-    assert (tmp_path / "run" / "report.html").stat().st_size > 10_000
-    assert json.loads((tmp_path / "run" / "metrics.json").read_text())["study"]["units"] == 4
-
-
 def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tmp_path, motors):
     folder, study = written(tmp_path / "recordings", motors, "plain"), tmp_path / "study.toml"
     units = sorted(p.name for p in folder.iterdir())
@@ -170,44 +143,29 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
 
 
 def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, tmp_path, motors):
-    folder = tmp_path / "recordings"
+    folder, study = tmp_path / "recordings", tmp_path / "study.toml"
     folder.mkdir()
+    form = {"delimiter": ",", "header": "aa,bb,cc,dd", "comments": "", "fmt": "%.10g"}
     for key in motors.episodes[:8]:
-        np.savetxt(
-            folder / f"{key.unit}_{key.episode}.csv",
-            motors.read(key),
-            delimiter=",",
-            header="aa,bb,cc,dd",
-            comments="",
-            fmt="%.10g",
-        )
-    result = kros("init", folder, "--out", tmp_path / "study.toml")
-    assert result.exit_code == 2
-    assert "--period SECONDS" in result.output
-    result = kros("init", folder, "--out", tmp_path / "study.toml", "--period", 0.002)
-    assert result.exit_code == 2
-    assert (
-        "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd"
-        in result.output
-    )
-    result = kros(
-        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "d"
-    )
-    assert result.exit_code == 2
-    assert "there is no column 'd'" in result.output
-    result = kros(
-        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd"
-    )
+        np.savetxt(folder / f"{key.unit}_{key.episode}.csv", motors.read(key), **form)
+
+    def refused(words: str, *options: object) -> None:
+        result = kros("init", folder, "--out", study, *options)
+        assert result.exit_code == 2
+        assert words in result.output
+
+    period, roles = ("--period", 0.002), ("--measured", "aa", "--input", "dd")
+    refused("--period SECONDS")
+    name = "no column is a measured state by its name; name it, --measured NAME. The columns are aa, bb, cc, dd"
+    refused(name, *period)
+    refused("there is no column 'd'", *period, "--measured", "aa", "--input", "d")
+    result = kros("init", folder, "--out", study, *period, *roles)
     assert result.exit_code == 0, result.output
-    found = open_source(load_config(tmp_path / "study.toml"))
+    found = open_source(load_config(study))
     assert (found.measured, found.states, found.inputs) == (("aa",), ("aa", "bb", "cc"), ("dd",))
-    before = (tmp_path / "study.toml").read_bytes()
-    result = kros(
-        "init", folder, "--out", tmp_path / "study.toml", "--period", 0.002, "--measured", "aa", "--input", "dd"
-    )
-    assert result.exit_code == 2
-    assert "exists; name another file" in result.output
-    assert (tmp_path / "study.toml").read_bytes() == before
+    before = study.read_bytes()
+    refused("exists; name another file", *period, *roles)
+    assert study.read_bytes() == before
 
 
 def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path, motors):

@@ -31,12 +31,10 @@ refine = false
 
 [uncertainty]
 n_freqs = 100
-max_order = 1
 
 [evaluate]
 robustness = false
 [synthesis]
-input_weight = 3.0
 methods = ["worst_case_h2"]
 
 [observer]
@@ -87,7 +85,7 @@ def test_observers_run_with_it(run, kros, recorded, tmp_path):
     assert result.exit_code == 4, result.output  # of seven units none can be told from the others
 
 
-def machines(n_samples, still_input=False):
+def machines(n_samples):
     """Recordings of three linear machines, an episode of given length each time."""
     rng = np.random.default_rng(0)
     channels = [
@@ -101,8 +99,6 @@ def machines(n_samples, still_input=False):
         data[unit] = {"default": {}}
         for number, length in enumerate(n_samples):
             u = rng.normal(size=(length, 2))
-            if still_input and unit == "2" and number < len(n_samples) - 1:  # it moves in the test episode only
-                u[:, 1] = 0
             x = np.zeros((length, 2))
             for k in range(length - 1):
                 x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], 0.8 * x[k, 1] + u[k].sum() * (1 + 0.1 * int(unit))]

@@ -25,7 +25,7 @@ def pendulums(kros, tmp_path_factory):
         '[lifting]\nfunctions = ["sin(position)"]\n'
         "[identify]\nrefine = true\n"
         "[uncertainty]\nn_freqs = 200\n"
-        '[synthesis]\ninput_weight = 3.0\nmethods = ["worst_case_h2"]\n'
+        '[synthesis]\nmethods = ["worst_case_h2"]\n'
         "[evaluate]\nrobustness = false\n"
         '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     )

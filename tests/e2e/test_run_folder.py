@@ -14,23 +14,24 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from run_results import files, results
 
+from kros.core.errors import IdentificationError
 from kros.core.locks import NAME as LOCK
 from kros.core.locks import locked
 from kros.core.store import recorded_files
-from kros.study import Stage, load_config
+from kros.study import learning, load_config
 from kros.study import run as run_study
 
 pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (
     'name = "fast"\n[data]\nsource = "{source}"\nreader = "parquet"\n'
     "[identify]\nrefine = false\n"
-    "[uncertainty]\nn_freqs = 60\nmax_order = 1\n"
-    '[synthesis]\ninput_weight = 3.0\nmethods = ["residual_h2"]\n'
+    "[uncertainty]\nn_freqs = 60\n"
+    '[synthesis]\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     "[evaluate]\nrobustness = false\n"
 )
-TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 
 
 @pytest.fixture(scope="module")
@@ -64,27 +65,6 @@ def run(finished, tmp_path) -> Path:
 
 def again(kros: Callable[..., Any], fast: Path, run: Path, *options: Any) -> Any:
     return kros("run", fast, "--out", run, "--workers", 1, "--set", "evaluate.folds=2", *options)
-
-
-def files(folder: Path) -> set[str]:
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file() or p.is_symlink()}
-
-
-def results(folder: Path) -> dict[str, Any]:
-    """Contents of all files but manifests and the store; without times."""
-    return {
-        name: timeless(json.loads((folder / name).read_text()))
-        if name.endswith(".json")
-        else (folder / name).read_bytes()
-        for name in files(folder)
-        if not name.startswith("store/") and not name.endswith("manifest.json")
-    }
-
-
-def timeless(content: Any) -> Any:
-    if isinstance(content, dict):
-        return {k: timeless(v) for k, v in content.items() if k not in TIMES}
-    return [timeless(v) for v in content] if isinstance(content, list) else content
 
 
 def digest(run: Path, stage: str) -> str:
@@ -127,7 +107,7 @@ def test_any_file_that_was_changed_is_made_again(kros, fast, run, finished, patt
 
 
 @pytest.mark.parametrize(
-    "settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.false_alarm_rate=0.01")]
+    "settings", [(), ("--set", "uncertainty.n_freqs=61"), ("--set", "uncertainty.outlier_form=additive")]
 )
 def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     for _ in range(2):
@@ -136,15 +116,19 @@ def test_a_stage_may_run_many_times_in_one_folder(kros, fast, run, settings):
     assert recorded_files(run) >= {name for name in files(run) if name.startswith(("uncertainty/", "outliers/"))}
 
 
-def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished):
-    found = again(kros, fast, run, "--set", "uncertainty.nominal=nobody")
-    assert found.exit_code == 1
+def test_a_stage_that_fails_leaves_the_earlier_run_as_it_was(kros, fast, run, finished, monkeypatch):
+    def fails(*args, **options):
+        raise IdentificationError("two units are needed")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(learning, "quantify", fails)
+        assert again(kros, fast, run, "--set", "uncertainty.n_freqs=61").exit_code == 1
     assert results(run) == results(finished)
     assert kros("figures", run, run.parent / "figures").exit_code == 0
 
 
 def test_what_does_not_follow_from_the_study_any_more_goes(kros, fast, run):
-    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.max_order=2").exit_code == 0
+    assert again(kros, fast, run, "--until", "identify", "--set", "uncertainty.n_freqs=62").exit_code == 0
     assert not any(
         name.startswith(("uncertainty/", "observers/", "evaluation/", "left_out/left_out")) for name in files(run)
     )
@@ -165,15 +149,6 @@ def test_another_study_is_refused_and_the_same_one_may_change(kros, fast, run, p
         assert results(run) == before
     assert kros("demo", "--out", run).exit_code == 2
     assert results(run) == before
-
-
-def test_a_folder_that_looks_like_a_demo_is_left_alone(kros, tmp_path):
-    folder = tmp_path / "mine"
-    (folder / "thesis").mkdir(parents=True)
-    for name in ("demo.json", "thesis/chapter.tex"):
-        (folder / name).write_text('{"schema": 1}')
-    assert kros("demo", "--out", folder, "--units", 2, "--episodes", 2, "--seconds", 5).exit_code == 2
-    assert files(folder) == {"demo.json", "thesis/chapter.tex"}
 
 
 def crafted(run: Path, names: list[str], matching: Path | None = None) -> None:
@@ -229,9 +204,7 @@ def test_files_of_others_in_a_run_folder_stay(kros, fast, run):
         (run / name).write_text("remember")
     crafted(run, ["notes.txt"])
     assert (
-        kros(
-            "run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha_factor=5"
-        ).exit_code
+        kros("run", fast, "--out", run, "--workers", 1, "--until", "synthesize", "--set", "identify.alpha=90").exit_code
         == 0
     )
     assert {"notes.txt", "observers/notes.txt", "left_out/0/notes.txt"} <= files(run)
@@ -255,15 +228,6 @@ def test_a_damaged_artefact_is_computed_again_and_no_other(kros, fast, run, fini
     found = again(kros, fast, run)
     assert found.exit_code == 0
     assert found.stderr.count("unchanged") >= 7
-    assert results(run) == results(finished)
-
-
-def test_what_is_gone_from_its_place_comes_from_the_store(kros, fast, run, finished):
-    shutil.rmtree(run / "models")
-    (run / "observers" / "deployed.json").write_text("{}")
-    found = again(kros, fast, run, "--set", "uncertainty.n_freqs=60")
-    assert found.exit_code == 0
-    assert "identify" in found.stderr
     assert results(run) == results(finished)
 
 
@@ -416,9 +380,3 @@ def test_a_run_killed_in_the_middle_of_a_stage_leaves_only_its_draft(kros, fast,
     assert kros("run", fast, "--out", run, "--workers", 1, "--until", "quantify").exit_code == 0
     assert not [name for name in files(run) if Path(name).name.startswith(".") or name.startswith(".")]
     assert results(run)["uncertainty/choice.json"] == results(finished)["uncertainty/choice.json"]
-
-
-def test_a_script_is_not_told_twice_who_owns_a_folder(fast, run):
-    """From Python as from the command line: strings are paths."""
-    found = run_study(load_config(fast, ["evaluate.folds=2"]), str(run), until=Stage.REPORT)  # type: ignore[arg-type]
-    assert found.metrics["study"]["units"] == 4

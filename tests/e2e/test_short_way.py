@@ -16,7 +16,8 @@ import pytest
 import kros
 from kros.data import write_parquet
 from kros.design import Design
-from kros.design.methods import table
+from kros.design.methods import METHODS, suitable
+from kros.design.methods.robust import WorstCaseH2
 from kros.observer import Observer
 from kros.plants import PLANTS
 from kros.study import load_config
@@ -32,10 +33,12 @@ ROLES = {
 STATE = 'role = "state"'
 # Fewer candidates, and methods that take long for one kind of models each: what chooses among them is the same.
 FEWER: dict[str, Any] = {
-    "design.synthesize.suitable": lambda *asked: [
-        m for m in table.suitable(*asked) if ONCE.get(m.name, asked[1]) == asked[1]
+    "design.synthesize.suitable": lambda methods, kind, kinds: [
+        m for m in suitable(methods, kind, kinds) if ONCE.get(m.name, kind) == kind
     ],
-    "design.methods.disturbance_model._CORNERS": (1e-3,),
+    "design.methods.METHODS": tuple(
+        WorstCaseH2(corners=(None, 1e-3)) if m.name == "worst_case_h2" else m for m in METHODS
+    ),
 }
 ONCE = {"estimator": "koopman", "worst_case_h2": "linear", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
 LIFTING = "sin(100*position + phase)"
@@ -100,11 +103,10 @@ def test_the_short_way_is_the_study(example: tuple[Path, dict[str, Any]]) -> Non
     assert without_study(observers / "deployed.json") == saved(names["design"], folder / "deployed.json")
     named = kros.synthesize(names["uncertain"], method="linear/worst_case_h2")
     assert without_study(observers / f"{named.name}.json") == saved(named, folder / "named.json")
-    spectrum = kros.synthesize(names["uncertain"], method="linear/worst_case_h2", methods=(), input_weight=3.0)
-    assert spectrum.lower_bound == spectrum.synthesis.lower_bound > 0
-    other = replace(spectrum.synthesis, worst_case_h2=None)
+    assert named.lower_bound == named.synthesis.lower_bound > 0
+    other = replace(named.synthesis, worst_case_h2=None)
     # the optimum of another norm is no lower bound of the worst case
-    assert replace(spectrum, synthesis=other).lower_bound is None
+    assert replace(named, synthesis=other).lower_bound is None
     assert study.folder == Path("runs/x")
     assert (folder / "runs" / "x" / "report.html").is_file()
 
@@ -130,8 +132,8 @@ def test_a_study_of_arrays_of_a_folder_and_of_a_file_is_the_same(few_figures: No
     population = kros.read(folder / "recordings", mapping=folder / "mapping.toml")
     quick: dict[str, Any] = {
         "identify": {"refine": False},
-        "uncertainty": {"n_freqs": 60, "max_order": 1},
-        "synthesis": {"methods": ["residual_h2"], "input_weight": 3.0},
+        "uncertainty": {"n_freqs": 60},
+        "synthesis": {"methods": ["residual_h2"]},
         "observer": {"baselines": ["open_loop", "kalman_tuned"]},
     }
     file = [f"{table}.{key}={json.dumps(value)}" for table, keys in quick.items() for key, value in keys.items()]

@@ -6,10 +6,9 @@ from scipy.linalg import solve_discrete_are
 
 import kros
 from kros.data import EpisodeBatch
-from kros.design.methods.gains import design_kalman_tuned
-from kros.design.settings import SynthesisSettings
+from kros.design.methods import methods_of
 from kros.design.synthesize import tasks_of
-from kros.observer import EstimatorSettings, run_observer
+from kros.observer import run_observer
 from kros.observer.residual.one_step import one_step_covariance
 from kros.observer.units import in_sizes
 from kros.plants import DcMotorPopulation
@@ -22,7 +21,7 @@ def uncertain():
 
 
 def task(uncertain, method):
-    return tasks_of(uncertain, "linear_edmd", {method}, SynthesisSettings(), EstimatorSettings())[0]
+    return tasks_of(uncertain, "linear_edmd", methods_of([method]))[0]
 
 
 def percent(estimate, batch):
@@ -52,7 +51,8 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
     facts, population = uncertain.models.facts, uncertain.models.population
     train, test = (EpisodeBatch.read(population, getattr(facts, part)) for part in ("train", "test"))
     known = textbook(train, test, facts.resolution["position"])
-    found = design_kalman_tuned(task(uncertain, "kalman_tuned"))
+    kalman, alone = task(uncertain, "kalman_tuned"), task(uncertain, "open_loop")
+    found = kalman.method.design(kalman)
     observer = in_sizes(found.observer, {})
     own = percent(run_observer(observer, test.states[..., :1], test.inputs), test)
     assert np.sqrt(np.prod(own / known)) < 1.01
@@ -60,12 +60,10 @@ def test_the_tuned_filter_is_at_least_as_good_as_the_textbooks(uncertain):
         own[0]
         < 0.2
         * percent(
-            run_observer(in_sizes(task(uncertain, "open_loop").open_loop(), {}), test.states[..., :1], test.inputs),
-            test,
+            run_observer(in_sizes(alone.method.design(alone).observer, {}), test.states[..., :1], test.inputs), test
         )[0]
     )
     assert "position" in found.facts["rows_fitted_to_single_steps"]
-    assert "rows fitted to single steps" in found.uncovered
 
 
 def test_covariance_of_residuals_counts_every_sample_of_every_episode_once():

@@ -7,12 +7,10 @@ import pytest
 from batches import batch_of
 
 from kros.core.errors import DataError
-from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer
 from kros.observer.baselines.extended_kalman import start_covariance
-from kros.observer.baselines.learned import Features
-from kros.observer.baselines.learned_moments import Choice, Moments
+from kros.observer.baselines.learned import Moments, Ridge
 from kros.synthesis import Injection, kalman
 
 DT = 0.001
@@ -86,89 +84,30 @@ def test_filtered_difference_of_a_ramp_and_a_sine():
     assert changed[2001, 0, 1] != found[2001, 0, 1]
 
 
-def linear_in_the_past(seed=3, units=3, n_samples=900):
-    """Recordings in which the hidden states are linear in the last samples, those before the start the first, and differ from unit to unit."""
-    rng = np.random.default_rng(seed)
-    lifting = Lifting(("x", "v"), ("sin(3*x + phase)", "x*v"), ("phase",))
-    phases = rng.normal(size=units)
-    u = rng.normal(size=(n_samples, units, 1))
-    y = 2 * u + 0.3 + 0.5 * rng.normal(size=u.shape)
-    size = 1 + np.arange(units)[:, None]
-    y1, y2, y3, u2 = (a[np.maximum(np.arange(n_samples) - lag, 0)] for a, lag in ((y, 1), (y, 2), (y, 3), (u, 2)))
-    ripple = 0.5 * np.sin(3 * y1[..., 0] + phases) + np.cos(3 * y2[..., 0] + phases)
-    v = size * (0.7 + y1 - 2 * y3 + 0.4 * u2) + ripple[..., None]
-    return lifting, np.concatenate([y, v], axis=-1), u, {"phase": phases}
-
-
-def test_learned_estimator_is_ridge_regression_from_the_first_sample_on():
-    """Least squares on regressors written down one by one: two units of two and one episodes, a third measured only at run time."""
+def test_learned_estimator_is_ridge_regression_on_past_samples():
+    """Least squares on regressors written down one by one; an episode of another unit, and a longer one, count by their samples."""
     rng = np.random.default_rng(4)
-    lifting, taps, ridge, lengths = Lifting(("x", "v", "w")), 4, 1e-3, [9, 31, 20]
+    settings, lengths = Ridge(delays=4, penalty=1e-3), [9, 31, 20]
     states, u = rng.normal(size=(31, 3, 3)), rng.normal(size=(31, 3, 1))
     batch = batch_of(states, u, DT, None, lengths, ["a", "a", "b"])
-    features = Features.of(lifting, (1,), states[..., [1]], u, taps)
-    assert features.static[0, 1] == 0  # the input explains nothing of the measurement
-    rows, truths, weights = [], [], []
+    rows, truths = [], []
     for i, length in enumerate(lengths):
-        z = np.concatenate([states[:, i, [1]] - features.static[0, 0], u[:, i]], axis=1)
+        z = np.concatenate([states[:, i, [1]], u[:, i]], axis=1)
         for k in range(length):
-            past = [z[max(k - 1 - j, 0)] for j in range(taps)]
-            rows.append(
-                [1.0, *(v[c] if j == 0 else v[c] - past[j - 1][c] for c in range(2) for j, v in enumerate(past))]
-            )
+            past = [z[max(k - 1 - j, 0)] for j in range(4)]
+            rows.append([1.0, *past[0], *(c for j in range(1, 4) for c in past[j] - past[j - 1])])
             truths.append(states[k, i, [0, 2]])
-            weights.append([1.0, 1.0, 2.0][i] / length / np.abs(states[:length, i][:, [0, 2]]).max(axis=0) ** 2)
-    rows, truths, weights = np.array(rows), np.array(truths), np.array(weights) / 4
-    batches = [batch.take([i]).head(lengths[i]) for i in range(3)]
-    found = Moments.of(features, batches).estimator(choices=[Choice(taps, ridge)] * 2).run(states[..., [1]], u)
-    for column, state in enumerate((0, 2)):
-        half = np.sqrt(weights[:, [column]])
-        penalty = np.diag(np.sqrt(ridge * np.sum((half * rows) ** 2, axis=0)) * [0, *[1] * (2 * taps)])
-        wanted = np.linalg.lstsq(
-            np.vstack([half * rows, penalty]), np.append(half[:, 0] * truths[:, column], np.zeros(1 + 2 * taps))
-        )[0]
-        np.testing.assert_allclose(found[: lengths[0], 0, state], (rows @ wanted)[: lengths[0]], rtol=1e-7, atol=1e-9)
-
-
-def test_learned_estimator_chooses_what_does_best_on_units_left_out():
-    lifting, states, u, phases = linear_in_the_past(units=5)
-    batch = batch_of(states, u, DT, phases)
-    moments = Moments.of(Features.of(lifting, (0,), states[..., :1], u, taps=12), [batch])
-    (chosen,) = moments.choose()
-    percent = {}
-    for choice in (chosen, *(Choice(taps, ridge) for taps in (2, 5, 12) for ridge in (1e-8, 1e-3, 0.1))):
-        folds = [[str(i) for i in range(fold, 5, 4)] for fold in range(4)]
-        runs = {
-            unit: moments.estimator(fold, [choice]).run(states[..., :1], u, phases) for fold in folds for unit in fold
-        }
-        errors = [runs[unit][:, int(unit), 1] - states[:, int(unit), 1] for unit in batch.units]
-        percent[choice] = np.mean(
-            [np.sqrt(np.mean(e**2)) / np.abs(states[:, i, 1]).max() for i, e in enumerate(errors)]
-        )
-    assert percent[chosen] == min(percent.values())
-
-
-def test_a_condition_that_misleads_is_not_trained_on():
-    lifting, states, u, phases = linear_in_the_past(units=6)
-    states[:, 3:, 1] = np.random.default_rng(0).normal(size=(900, 3))  # nothing to learn there, and no unit's own size
-    keys = tuple(EpisodeKey(unit, condition, "0") for condition in ("good", "noise") for unit in "abc")
-    batch = replace(batch_of(states, u, DT, phases), keys=keys)
-    batch.states[:, :3, 1] /= 1 + np.arange(3)
-    moments = Moments.of(Features.of(lifting, (0,), states[..., :1], u, taps=5), [batch])
-    assert moments.units == ("a", "b", "c")
-    assert moments.choose()[0].condition == "good"
-
-
-def test_a_unit_that_is_left_out_leaves_no_trace():
-    lifting, states, u, phases = linear_in_the_past()
-    features = Features.of(lifting, (0,), states[..., :1], u, taps=6)
-    moments = Moments.of(features, [batch_of(states, u, DT, phases, [900, 900, 700], list("abc"))])
+    rows, truths = np.array(rows), np.array(truths)
+    moments = Moments.of([batch], (1,), settings=settings)
+    found = moments.estimator().run(states[..., [1]], u)
+    penalty = np.diag(np.sqrt(1e-3 * np.sum(rows**2, axis=0)) * [0, *[1] * 8])
+    wanted = np.linalg.lstsq(np.vstack([rows, penalty]), np.vstack([truths, np.zeros((9, 2))]))[0]
+    np.testing.assert_allclose(found[:9, 0][:, [0, 2]], (rows @ wanted)[:9], rtol=1e-9, atol=1e-11)
+    assert np.isnan(found[..., 1]).all()
     changed = states.copy()
-    changed[:, 1] *= -3
-    others = Moments.of(features, [batch_of(changed, u, DT, phases, [900, 900, 700], list("abc"))])
-    y = states[..., :1]
-    kept, again = (m.estimator(["b"]).run(y, u, phases)[..., 1] for m in (moments, others))
-    np.testing.assert_array_equal(kept, again)
-    assert np.abs(moments.estimator().run(y, u, phases) - others.estimator().run(y, u, phases))[..., 1].max() > 0.1
+    changed[:, :2, 2] *= -3
+    others = Moments.of([replace(batch, states=changed)], (1,), settings=settings)
+    for one, other in zip(vars(moments.estimator(["a"])).values(), vars(others.estimator(["a"])).values(), strict=True):
+        np.testing.assert_array_equal(one, other)
     with pytest.raises(DataError, match="no unit is left"):
-        moments.estimator(["a", "b", "c"])
+        moments.estimator(["a", "b"])

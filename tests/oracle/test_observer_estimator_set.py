@@ -11,8 +11,7 @@ from scipy.special import hyp2f1
 
 import kros
 from kros.core import StateSpace, SynthesisError, gain, h2_norm, hinf_norm
-from kros.design.methods.estimator import design_estimator
-from kros.design.settings import SynthesisSettings
+from kros.design.methods.estimator import Estimator
 from kros.design.synthesize import tasks_of
 from kros.design.uncertain_set import certificate, error_maps
 from kros.lifting import Lifting
@@ -98,7 +97,7 @@ def member(case, E):
 
 
 def test_the_linear_estimate_is_the_observer_as_it_runs(found):
-    observer = replace(found.observer, runtime=Runtime(0, relift=False))
+    observer = replace(found.observer, runtime=Runtime(0))
     estimate, mean = linear_estimate(observer, LIFTING)
     _, batches = plant(spread=0.2)
     batch = next(iter(batches.values()))
@@ -189,8 +188,8 @@ def motors():
 
 
 def test_every_unit_of_a_population_is_below_its_bound(motors):
-    task = tasks_of(motors, "linear", ["estimator"], SynthesisSettings(), SETTINGS)[0]
-    result = design_estimator(task)
+    task = tasks_of(motors, "linear", [Estimator(SETTINGS)])[0]
+    result = task.method.design(task)
     facts = certificate(task, result, task.problem)
     errors, mean = error_maps(task, result, task.problem)
     bound = certify_errors(task.problem, errors, mean)[0]

@@ -6,15 +6,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from batches import batch_of
-from load_baselines import disturbance_observer, load_direction, ripple_power
+from load_baselines import ripple_power
 
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
 from kros.motor_drive import AngleLoad, LoadSettings, TorqueScale, known_load, load_observer
 from kros.motor_drive.signals import load_accuracy, without_level
-from kros.observer import Observer, ReliftScales, run_observer
+from kros.observer import ReliftScales, run_observer
 from kros.observer.estimator.certificate import filter_certificate
-from kros.observer.residual.one_step import one_step_residual
 from kros.plants import HarmonicDrivePopulation
 
 DT = 1e-3
@@ -72,25 +71,6 @@ def test_the_level_bears_a_controller_at_its_limit() -> None:
     assert np.abs(limited.current).max() <= 1.0
     with pytest.raises(DimensionError, match="n_samples, batch"):
         AngleLoad(2.0, DT).run(seen[:, 0], seen[:, 0], position[:, 0])
-
-
-def test_the_disturbance_observer_is_exact_in_the_steady_state() -> None:
-    """A mass with friction, pushed by its input and an unknown step: the innovation's mean vanishes, and with it every error."""
-    A, B, E = np.array([[1.0, 0.01], [0.0, 0.98]]), np.array([[0.0], [0.01]]), np.array([0.0, 0.03])
-    rng = np.random.default_rng(0)
-    u, load = rng.standard_normal((2000, 1, 1)), np.where(np.arange(2000) < 500, 0.0, 0.7)
-    x = np.zeros((2000, 1, 2))
-    for k in range(1999):
-        x[k + 1, 0] = A @ x[k, 0] + B @ u[k, 0] + E * load[k]
-    lifting = Lifting(("position", "velocity"))
-    direction = load_direction(one_step_residual(lifting, A, B, x, u), load[:-1])
-    np.testing.assert_allclose(direction, E, atol=1e-12)
-    model = Observer.open_loop("mass", lifting, A, B, (0,), ("force",), 0.01)
-    observer = disturbance_observer("mass/load", model, direction, 1e-6 * np.eye(2), [1e-3], 1e-2)
-    estimate = run_observer(observer, x[..., :1], u)
-    assert observer.lifting.states[-1] == "load"
-    np.testing.assert_allclose(estimate[-1, 0], [*x[-1, 0], 0.7], atol=1e-9)
-    np.testing.assert_allclose(estimate[499, 0], [*x[499, 0], 0.0], atol=1e-9)
 
 
 @pytest.fixture(scope="module")

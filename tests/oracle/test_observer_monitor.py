@@ -8,7 +8,7 @@ from machines import DT, LIMITS, drive, filters, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.design.monitor import bound_of_peaks, fit_monitor, monitor_facts
+from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus
@@ -119,7 +119,7 @@ def test_what_cannot_be_a_monitor_is_refused():
                 ),
                 false_alarm_rate=0.1,
             )
-    with pytest.raises(DimensionError, match="monitor of 1 measurements"):
+    with pytest.raises(DimensionError, match=r"monitor should have shape \(1,\)"):
         replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), np.full((2, 3), [4, 4, 0]), 0.1))
 
 
@@ -146,7 +146,8 @@ def test_the_bound_is_that_of_one_more_unit():
     )
     population = simulated.population
     training = TrainingSet(population, population.episodes, {u: {} for u in population.unit_ids})
-    monitor = fit_monitor(observer, training, 0.05)
+    settings = MonitorSettings(false_alarm_rate=0.05)
+    monitor = fit_monitor(observer, training, settings)
     own = replace(observer, monitor=monitor)
     records = {key: population.read(key) for key in population.episodes}
     found, watches = {}, {unit: Watch(monitor) for unit in population.unit_ids}
@@ -173,7 +174,7 @@ def test_the_bound_is_that_of_one_more_unit():
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide
     assert not (levels(own, y, u)[1] & SampleStatus.UNCERTIFIED).any()
     assert (levels(own, shaken, u)[1] & SampleStatus.UNCERTIFIED).any()
-    assert fit_monitor(observer, replace(training, keys=training.keys[:4]), 0.05) is None
+    assert fit_monitor(observer, replace(training, keys=training.keys[:4]), settings) is None
 
 
 @pytest.mark.parametrize(("units", "motions"), [(5, 3), (8, 4), (12, 3)])
@@ -183,8 +184,8 @@ def test_few_motions_widen_the_bound_until_its_rate_holds(units, motions):
     own, shared = rng.normal(size=(draws, units + 1, 1)), 0.7 * rng.normal(size=(draws, 2, 1, motions))
     peaks = own[:, :units] + shared[:, 0]
     new = (own[:, units] + shared[:, 1, 0]).max(axis=1)
-    bounds = np.array([bound_of_peaks(one.tolist(), rate) for one in peaks])
+    bounds = np.array([bound_of_peaks(one.tolist(), MonitorSettings(rate)) for one in peaks])
     assert np.mean(new > bounds) < rate
     assert np.mean(new > prediction_bound(peaks.max(axis=2), rate)) > np.mean(new > bounds)
     many = peaks[0].repeat(3, axis=1)
-    assert bound_of_peaks(many.tolist(), rate) == prediction_bound(many.max(axis=1), rate)
+    assert bound_of_peaks(many.tolist(), MonitorSettings(rate)) == prediction_bound(many.max(axis=1), rate)

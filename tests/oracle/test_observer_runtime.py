@@ -72,11 +72,7 @@ def test_filtered_estimate_of_a_kalman_predictor_is_the_kalman_filter():
 @pytest.mark.parametrize("lifting", [LIFTING, LATE], ids=["drive", "delays"])
 def test_batched_and_single_runs_agree_with_gaps_delays_and_limits(lifting, delay):
     n, m = lifting.n_states, 2 if lifting is LIFTING else 1
-    limits = {
-        "lower": np.full(n, -0.8),
-        "upper": np.array([np.inf, 0.5, 0.7][:n]),
-        "correction": np.full(lifting.n_lifted, 0.2),
-    }
+    limits = {"lower": np.full(n, -0.8), "upper": np.array([np.inf, 0.5, 0.7][:n])}
     o = observer(lifting, Runtime(delay, **limits), m=m)
     y, u = recordings(m)
     y[[5, 6, 20]] = np.nan

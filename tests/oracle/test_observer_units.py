@@ -61,11 +61,6 @@ def test_a_filter_bank_bridges_gaps_in_any_units():
     np.testing.assert_allclose(found[..., :3] * [0.01, 60.0, 3e3], wanted, rtol=1e-9, atol=1e-12)
 
 
-def test_a_correction_limit_goes_with_the_sizes():
-    one = observer(runtime=Runtime(correction=np.array([0.01, 0.02, 0.03])))
-    np.testing.assert_allclose(in_sizes(one, SIZES).runtime.correction, [0.01 / 1e9, 0.02 / 3e-9, 0.03 / 0.7])
-
-
 def test_the_certificate_says_the_same_in_other_sizes():
     one, box = observer(), {"x": (-1.0, 2.0)}
     scales = ReliftScales(np.array([2.0, 3.0]), np.array([0.1, 0.2]), np.array([0.01]))

@@ -10,7 +10,6 @@ from tests.support.batches import batch_of
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
 from kros.design.synthesize import measurement_noise
-from kros.design.validation import ValidationSet
 from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor, run_observers
@@ -86,15 +85,6 @@ def test_units_of_measure_change_nothing():
     np.testing.assert_allclose(
         as_shown(scaled, {"position": own.in_unit(4.0)}, STATES).measurements((0,)) * 4, y, rtol=0, atol=1e-12
     )
-
-
-def test_what_is_fitted_knows_neither_the_delay_nor_the_bias_that_candidates_are_ranked_with():
-    plain, sensor = recorded(300), {"position": Sensor(noise=1e-3, bias=0.5, delay_samples=3, dropout=0.1)}
-    data = ValidationSet(as_shown(plain, sensor, STATES), sensor, STATES)
-    only = as_shown(plain, {"position": Sensor(noise=1e-3, dropout=0.1)}, STATES)
-    np.testing.assert_array_equal(data.on_time.measurements((0,)), only.measurements((0,)))
-    shift = data.measurements((0,))[3:] - only.measurements((0,))[:-3]
-    assert np.nanmean(shift) == pytest.approx(0.5, abs=1e-3)
 
 
 def test_what_syntheses_assume_is_the_declared_noise_and_the_coarser_resolution():

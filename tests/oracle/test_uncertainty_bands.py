@@ -9,7 +9,7 @@ import pytest
 
 from kros.core import StateSpace
 from kros.core.errors import DimensionError
-from kros.uncertainty.coprime.bands import BandEnergies, band_edges, cover
+from kros.uncertainty.band_energies import BandEnergies, band_edges, cover
 
 RNG = np.random.default_rng(5)
 
@@ -68,10 +68,10 @@ def test_bound_over_bands_holds_with_start_and_tail_and_is_close_for_fine_bands(
     for k in range(2000):
         output[k] = (x @ system.C.T)[:, 0]
         x = x @ system.A.T + (driven[k] if k < len(driven) else 0)
-    actual = np.sum(output**2, axis=0) / 80
+    actual = np.sum(output**2, axis=0) / 81
     excess = {}
     for bands in (50, 400):
-        energies = BandEnergies.of(driven, [81] * 3, np.linspace(0, np.pi, bands + 1), samples=[80] * 3)
+        energies = BandEnergies.of(driven, [81] * 3, np.linspace(0, np.pi, bands + 1))
         inside = np.linspace(energies.edges[:-1], energies.edges[1:], 40, axis=-1)  # fine enough for a smooth T
         T = system.frequency_response(inside.ravel() / 2 / np.pi).reshape(bands, 40, 2)
         squares = np.einsum("bti,btj->tbij", T.conj(), T)

@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
-from dataclasses import replace
-from pathlib import Path
-
 import numpy as np
-import pytest
 from tests.support.residuals import of_function
 
 from kros.core import StateSpace
-from kros.uncertainty import Form, quantify
 from kros.uncertainty.weights.fit import Target, fit_weight
 from kros.uncertainty.weights.sections import Sections
 
@@ -51,16 +45,6 @@ def test_systems_have_the_magnitudes_of_the_sections_and_are_stable_with_their_i
     assert sections.orders.tolist() == [2, 3]
 
 
-def test_poles_on_zeros_change_nothing_until_they_are_taken_out_again() -> None:
-    sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
-    more = sections.with_pairs(np.array([0, 1]), np.array([0.3, -0.4]), 0.7)
-    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
-    assert more.orders.tolist() == [4, 5]
-    for entry in (0, 1):
-        more = more.without(more.weakest(entry, tau))
-    np.testing.assert_allclose(more.logs(tau), sections.logs(tau), atol=1e-12)
-
-
 def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
     """Diagonal residuals of one unit whose moduli are of order two and one."""
     w = 1j * np.tan(np.pi * np.minimum(np.asarray(freqs), 500 - 1e-9) * DT)
@@ -72,9 +56,7 @@ def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() 
     weight, cover = fit_weight(of_function(lags_and_leads), FREQS, Target(DT, tolerance_db=0.3))
     assert weight.overbound_db_max <= 0.3
     assert weight.within_tolerance
-    assert (
-        sum(weight.left_orders) + sum(weight.right_orders) < 12
-    )  # three would do; what is left out is sought step by step, not the fewest
+    assert sum(weight.left_orders) + sum(weight.right_orders) <= 4  # three would do
     used = weight.magnitudes(FREQS).entries()
     exact = np.abs(np.einsum("kfii->fi", lags_and_leads(FREQS)))
     assert (np.einsum("fii->fi", used) >= exact * (1 - 1e-9)).all()
@@ -94,24 +76,3 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
     six, _ = fit_weight(of_function(peaks), freqs, Target(DT, max_order=6))
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max
-
-
-def benchmark():
-    path = Path(__file__).parents[2] / "benchmarks" / "covers.py"
-    spec = importlib.util.spec_from_file_location("covers", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize("form", ["additive", "inverse_output_multiplicative"])
-def test_bounds_hold_by_the_means_of_the_benchmark(form: str) -> None:
-    rng = np.random.default_rng(2)
-    A = np.array([[0.9, 0.05], [-0.1, 0.7]]) * (1 + 0.01 * rng.normal(size=(4, 2, 2)))
-    B = np.array([[0.1, 0.02], [0.0, 0.3]]) * (1 + 0.05 * rng.normal(size=(4, 2, 2)))
-    units = StateSpace(A, B, np.broadcast_to(np.eye(2), A.shape), np.zeros(A.shape), DT)
-    found = quantify(units, Form(form), np.geomspace(0.1, 500.0, 60), max_order=2, tolerance_db=2.0)
-    covers = benchmark()
-    assert covers.independent_cover_max(found, units) <= 1 + 1e-6
-    lowered = found.weight.mapped(lambda s: StateSpace(s.A, s.B, 0.9 * s.C, 0.9 * s.D, s.dt))
-    assert covers.independent_cover_max(replace(found, weight=lowered), units) > 1

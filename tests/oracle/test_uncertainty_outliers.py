@@ -8,8 +8,7 @@ from scipy import stats
 
 from kros.uncertainty import Form, score_outliers
 from kros.uncertainty.outliers.score import FEWEST_UNITS, Status
-from kros.uncertainty.outliers.separation import margins, separate
-from kros.uncertainty.outliers.tail import factor, prediction_bound, scale, scales_without_one
+from kros.uncertainty.outliers.tail import factor, margins, prediction_bound, scale, scales_without_one, separate
 
 FREQS = np.geomspace(0.1, 100.0, 60)
 
@@ -120,9 +119,7 @@ def test_a_gross_outlier_is_found_in_every_form_and_with_every_nominal(form: For
     model = score_outliers(population([*GOOD, 25.0]), FREQS, form)
     assert model.scores[-1].outlier
     assert int(np.argmax([s.score_db for s in model.scores])) == 11
-    assert model.scores[-1].agreement > max(s.agreement for s in model.scores[:-1])
     assert model.scores[-1].lowest_db > 10  # beyond the cover of the others whatever the nominal, as the paper has it
-    assert all(s.agreement <= 0.5 for s in model.scores[:-1])
 
 
 def test_units_that_differ_in_nothing_but_gain_are_flagged_at_the_rate() -> None:
@@ -163,12 +160,7 @@ def test_excess_with_one_nominal_is_that_of_its_residuals(form: Form) -> None:
         Form.INVERSE_INPUT_MULTIPLICATIVE: lambda g, p: (p - g) / p,
         Form.INVERSE_OUTPUT_MULTIPLICATIVE: lambda g, p: (p - g) / p,
     }[form]
-    inliers = [int(u) for u in model.unit_ids]
-    for k in range(4):
-        E = 20 * np.log10(np.abs(by_hand(gains[k], np.delete(gains, k))))
-        if len(inliers) == 4:
-            assert model.by_nominal_db[k, 4] == pytest.approx(E[-1] - E[:-1].max(), abs=1e-9)
-    score = model.scores[4]
-    assert score.lowest_db == pytest.approx(np.nanmin(model.by_nominal_db[:, 4]))
-    assert score.highest_db == pytest.approx(np.nanmax(model.by_nominal_db[:, 4]))
-    assert np.isnan(model.by_nominal_db[4, 4])
+    E = [20 * np.log10(np.abs(by_hand(gains[k], np.delete(gains, k)))) for k in range(4)]
+    excess = [e[-1] - e[:-1].max() for e in E]
+    assert model.scores[4].lowest_db == pytest.approx(min(excess), abs=1e-9)
+    assert model.scores[4].highest_db == pytest.approx(max(excess), abs=1e-9)

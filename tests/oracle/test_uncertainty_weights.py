@@ -10,9 +10,7 @@ from tests.support.residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty import quantify
-from kros.uncertainty.weights.cover import Structure
 from kros.uncertainty.weights.fit import Target, fit_weight
-from kros.uncertainty.weights.weight import EntrywiseWeight
 
 Array = np.ndarray[Any, Any]
 
@@ -93,8 +91,10 @@ def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they
     allowed = np.abs(response(found.weight.matrix(), freqs))[:, 0, 0]
     ratio = np.abs(E).max(axis=0)[:, 0, 0] / allowed
     assert ratio.max() <= 1 + 1e-9
-    if period:  # the ends of a continuous grid are held, too
-        assert ratio.max() >= 0.9
+    if (
+        period
+    ):  # the ends of a continuous grid are held, too; between given points, on straight lines, it may touch first
+        assert ratio.max() >= 0.5
     loose = -20 * np.log10(ratio.min())
     assert found.overbound_db_max == pytest.approx(loose, abs=1e-6)
     assert found.weight.within_tolerance == (loose <= 1.0)
@@ -151,29 +151,10 @@ def test_remainders_are_covered_between_the_points_of_a_grid(form: str, wide: bo
     assert largest(weight, np.array(parts), freqs).max() <= 1 + 1e-8
 
 
-def test_one_entry_has_the_weight_of_the_structure_asked_for() -> None:
-    units = [single(0.9, 0.5), single(0.88, 0.5, 1.2)]
-    found = quantify(units, "additive", GRID, structure="entrywise")
-    assert isinstance(found.weight, EntrywiseWeight)
-    assert found.weight.structure is Structure.ENTRYWISE
-
-
-@pytest.mark.parametrize("structure", ["diagonal", "entrywise"])
-def test_every_structure_has_a_matrix_that_bounds_entries(structure: str) -> None:
-    units = [single(0.9, 0.5), single(0.88, 0.5, 1.2), single(0.92, 0.45, 0.9)]
-    found = quantify(units, "additive", GRID, structure=structure)
-    freqs = np.geomspace(1e-5, 0.5, 500)
-    E = np.array([response(u, freqs) - response(found.nominal_system, freqs) for u in units])
-    ratio = np.abs(E).max(axis=0) / np.abs(response(found.weight.matrix(), freqs))
-    assert 0.9 < ratio.max() <= 1
-
-
 def test_identical_units_and_single_frequencies_get_weights() -> None:
     units = [single(0.9, 0.5)] * 3
-    for structure in ("diagonal", "entrywise"):
-        found = quantify(units, "additive", GRID, structure=structure)
-        assert found.cover_max == 0
-        assert found.weight.remaining_margin == 1 or structure == "entrywise"
+    found = quantify(units, "additive", GRID)
+    assert found.cover_max == 0
     pair = [tall(0.9, 0.5, 1.0), tall(0.8, 0.6, 1.1)]
     for freqs in ([0.1], [0.0, 0.5], [0.5]):
         assert quantify(pair, "additive", freqs, max_order=2).cover_max <= 1
@@ -190,3 +171,19 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )
     assert not weight.within_tolerance
+
+
+def test_peaks_that_no_grid_point_meets_are_covered() -> None:
+    """Light resonances, continuous, a hundred points over four decades; an order in between whose best magnitude vanishes at infinity."""
+    tops = np.array([1.0, 0.93, 1.04])
+    A = np.zeros((3, 2, 2))
+    A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0, -(tops**2), -0.004 * tops
+    C = np.stack([tops[:, None] ** 2, np.zeros((3, 1))], axis=-1)
+    units = StateSpace(A, np.tile([[0.0], [1.0]], (3, 1, 1)), C, np.linspace(0.01, 0.02, 3).reshape(-1, 1, 1), 0.0)
+    model = quantify(
+        units, "additive", np.geomspace(1e-2, 1e2, 100) / (2 * np.pi), nominal=0, max_order=2, tolerance_db=60.0
+    )
+    freqs = np.geomspace(1e-2, 1e2, 20000) / (2 * np.pi)
+    response = units.frequency_response(freqs)[:, :, 0, 0]
+    allowed = np.abs(model.weight.left.frequency_response(freqs)[:, 0, 0])
+    assert (np.abs(response - response[0]) <= allowed).all()

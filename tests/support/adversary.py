@@ -21,8 +21,8 @@ import numpy.typing as npt
 from kros.core.errors import DimensionError
 from kros.observer import Observer
 from kros.observer.certificate.certificate import ReliftCertificate
+from kros.observer.certificate.course import first_error
 from kros.observer.certificate.error import ErrorSystem
-from kros.observer.certificate.report import first_error
 from kros.observer.certificate.search import frozen_gain
 from kros.observer.simulate import run_observer
 
@@ -73,7 +73,7 @@ class _Search:
     ) -> None:
         assert certificate.gain is not None
         self.system, self.rng, self.gain, self.steps = system, rng, certificate.gain, 0
-        self.R = certificate.roots[0]
+        self.R = certificate.root
         self.inverse = np.linalg.inv(self.R)
         n_w, n_p = system.B.shape[1], system.L.shape[1]
         self.d = rng.choice([-1.0, 1.0], (horizon, _BATCH, n_p))

@@ -50,11 +50,9 @@ MACHINES = {
     "gain": lambda: drive(order=0),
     "linear": lambda: drive(()),
     "delay": lambda: drive(delay=3),
-    "limits": lambda: drive(correction=np.full(5, 0.004), **LIMITS),
-    "delay and limits": lambda: drive(delay=2, correction=np.full(5, 0.004), **LIMITS),
-    "cut off": lambda: drive(relift=False, delay=2, **LIMITS),
-    "input limits": lambda: drive(input_lower=[-1, -2], input_upper=[1, 2]),
-    "through the input": lambda: drive(injection=Injection.INPUT, correction=np.full(2, 0.01)),
+    "limits": lambda: drive(**LIMITS),
+    "delay and limits": lambda: drive(delay=2, **LIMITS),
+    "through the input": lambda: drive(injection=Injection.INPUT),
     "every function": lambda: drive(SMOOTH),
     "earlier values": lambda: drive(("sin(position[-2])", "rate[-1]*velocity"), inputs=("target", "rate")),
     "earlier values and delay": lambda: drive(
@@ -95,7 +93,7 @@ def filters(functions=GEAR, cut=False):
     )
     none = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((p, 0)), np.zeros((p, 1)), DT)
     low, high = (np.append(LIMITS[side], np.full(n - 3, end)) for side, end in (("lower", -np.inf), ("upper", np.inf)))
-    runtime = Runtime(0, low, high, relift=False) if cut else Runtime()
+    runtime = Runtime(0, low, high) if cut else Runtime()
     return Observer(
         "filters",
         lifting,

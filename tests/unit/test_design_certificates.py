@@ -1,23 +1,21 @@
-"""What a study makes of the certificate as it runs: operating boxes, facts, the section of the report."""
+"""What a study makes of the certificate of the nonlinear observer: operating boxes, sizes, which one is deployed."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
-from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
-from kros.design.certificates import Running, certify
-from kros.design.synthesize import choose_deployed, robust_of
+from kros.design.certificates import certify_model
+from kros.design.synthesize import choose_deployed
+from kros.design.task import Design
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate, signal_bound
-from kros.observer.certificate.report import relift_report
-from kros.synthesis import Injection
+from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate
+from kros.synthesis import Injection, Status, Synthesis
 
 
 def observer(name: str, formula: str, slope: float) -> Observer:
@@ -52,26 +50,21 @@ def task() -> Any:
 
 def test_slopes_without_a_bound_get_an_operating_box(task: Any, caplog: pytest.LogCaptureFixture) -> None:
     scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
-    found = certify(observer("square", "x**2", 0.01), scales, task)
+    found = certify_model(observer("square", "x**2", 0.01), scales, task, 1.5)
     assert found.box["x"] == (-3.0, 3.0)
     assert found.gain == pytest.approx(1 / (1 - 0.8 - 0.06), rel=5e-3)
     assert any("x in [-3, 3]" in text for text in found.assumptions)
-    steep = certify(observer("steep", "x**2", 0.1), scales, task)
+    steep = certify_model(observer("steep", "x**2", 0.1), scales, task, 1.5)
     assert steep.status is ReliftStatus.UNSTABLE
-    assert "steep: no certificate covers it as it runs" in caplog.text
+    assert "steep: no certificate for the nonlinear observer" in caplog.text
 
 
 def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
-    found = certify(observer("sine", "sin(x + phase)", 0.1), ReliftScales(np.ones(1), np.ones(1), np.ones(1)), task)
+    scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
+    found = certify_model(observer("sine", "sin(x + phase)", 0.1), scales, task, 1.5)
     assert found.certified
     assert not found.box
     assert "any value of phase" in found.assumptions
-
-
-def test_an_observer_without_certificate_has_no_report() -> None:
-    square = observer("square", "x**2", 0.1)
-    with pytest.raises(DimensionError, match="certify it first"):
-        relift_report(relift_certificate(square), square, batch_of(np.zeros((5, 1, 1)), np.zeros((5, 1, 1)), 1.0))
 
 
 def test_typical_scales_give_the_residual_of_a_population_unit_power() -> None:
@@ -95,26 +88,25 @@ def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -
     certificate, refused = relift_certificate(good), relift_certificate(bad)
     assert certificate.certified
     assert not refused.certified
-    running = [
-        Running("koopman/open_loop", certificate, [], 3.0, 5.0),
-        Running("koopman/kalman_tuned", certificate, [], 2.0, 5.0),
-        Running("koopman/residual_h2", certificate, [], 1.0, float("inf")),
-        Running("linear/residual_h2", certificate, [], float("inf"), 5.0),
-        Running("koopman/worst_case_h2", refused, [], 0.5, 5.0),
+
+    def design(name: str, proof: Any, hidden: float, blind: float = 5.0, **facts: Any) -> Design:
+        facts |= {"hidden_error_percent": hidden, "loss_error_percent": blind}
+        return Design(name, good, Synthesis("", good.controller, Status.OPTIMAL), facts, proof)
+
+    designs = [
+        design("koopman/open_loop", certificate, 3.0),
+        design("koopman/kalman_tuned", certificate, 2.0),
+        design("koopman/residual_h2", certificate, 1.0, float("inf")),
+        design("linear/residual_h2", certificate, float("inf")),
+        design("koopman/worst_case_h2", refused, 0.5),
     ]
-    made = [r.name for r in running]
-    assert choose_deployed(None, made, running) == "koopman/kalman_tuned"
-    assert choose_deployed(None, made, running[2:3]) == "koopman/residual_h2"
-    unbounded = replace(
-        running[1], signals=signal_bound(refused, bad, batch_of(np.zeros((50, 1, 1)), np.zeros((50, 1, 1)), 1.0))
-    )
-    assert choose_deployed(None, made, [running[0], unbounded]) == "koopman/open_loop"
-    assert choose_deployed(None, made, [unbounded]) == "koopman/kalman_tuned"
-    assert choose_deployed("koopman/open_loop", made, running) == "koopman/open_loop"
-    assert choose_deployed(None, made, running[4:]) == "koopman/worst_case_h2"
-    with pytest.raises(SynthesisError, match="there is no such observer"):
-        choose_deployed("ours", made, running)
-    facts: dict[str, Any] = {name: {"worst_case_h2": None} for name in made}
-    assert robust_of(running, facts) is running
-    facts["koopman/open_loop"]["worst_case_h2"] = 0.3
-    assert choose_deployed(None, made, robust_of(running, facts)) == "koopman/open_loop"
+    assert choose_deployed(designs) == "koopman/kalman_tuned"
+    assert choose_deployed(designs[2:3]) == "koopman/residual_h2"
+    unbounded = design("koopman/kalman_tuned", certificate, 2.0, set_certified=False)
+    assert choose_deployed([designs[0], unbounded]) == "koopman/open_loop"
+    assert choose_deployed([unbounded]) == "koopman/kalman_tuned"
+    assert choose_deployed(designs[4:]) == "koopman/worst_case_h2"
+    near = design("koopman/worst_case_h2", certificate, 2.01)
+    assert choose_deployed([*designs[:3], near]) == "koopman/worst_case_h2"
+    with pytest.raises(SynthesisError, match="No observer could be designed"):
+        choose_deployed([])

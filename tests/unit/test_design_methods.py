@@ -1,41 +1,39 @@
-"""Which methods a study makes for which models, what starts first, and what is deployed."""
+"""Which methods a study uses for which models, and which observer is deployed where several are as accurate."""
 
 import logging
 
-from kros.design.methods.design import DESIGNS
-from kros.design.methods.table import METHODS, preferred, slowest_first, suitable
+from kros.design.methods import METHODS, methods_of, preferred, suitable
+from kros.design.settings import BASELINES
+from kros.design.settings import METHODS as NAMES
 
 BOTH = ("linear", "linear_edmd")
 
 
-def test_every_method_has_a_design():
-    assert {method.name for method in METHODS} == set(DESIGNS)
-    assert len({method.rank for method in METHODS}) == len(METHODS)
+def names(wanted, kind, kinds):
+    return [method.name for method in suitable(methods_of(wanted), kind, kinds)]
+
+
+def test_every_name_of_a_study_has_a_method():
+    known = {method.name for method in METHODS}
+    assert set(NAMES.__args__) < known
+    assert known - set(NAMES.__args__) == {"open_loop", "kalman_tuned"} <= set(BASELINES.__args__)
 
 
 def test_what_does_not_suit_refined_models_is_left_out_with_the_reason(caplog):
-    caplog.set_level(logging.INFO, logger="kros.design.methods.table")
+    caplog.set_level(logging.INFO, logger="kros.design.methods")
     wanted = ("mixed", "worst_case_h2", "open_loop", "filtered_difference")
-    assert [m.name for m in suitable(wanted, "koopman_edmd", ("koopman_edmd",))] == [
-        "open_loop",
-        "mixed",
-        "worst_case_h2",
-    ]
+    assert names(wanted, "koopman_edmd", ("koopman_edmd",)) == ["open_loop", "mixed", "worst_case_h2"]
     assert not caplog.records
-    assert [m.name for m in suitable(wanted, "koopman", ("koopman",))] == ["open_loop", "worst_case_h2"]
-    assert "koopman/mixed is not made for refined models" in caplog.text
-    assert [m.name for m in suitable(("residual_h2", "estimator"), "linear", BOTH)] == [
-        "residual_h2",
-        "estimator",
-    ]
-    assert [m.name for m in suitable(("residual_h2", "estimator"), "linear_edmd", BOTH)] == ["residual_h2"]
-    alone = suitable(("residual_h2", "estimator"), "linear_edmd", ("linear_edmd",))
-    assert [m.name for m in alone] == ["residual_h2", "estimator"]
-    assert "linear_edmd/estimator is made for refined models alone: it is fitted to recordings" in caplog.text
+    assert names(wanted, "koopman", ("koopman",)) == ["open_loop", "worst_case_h2"]
+    assert "koopman/mixed is not designed: the paper's problem" in caplog.text
+    two = ["residual_h2", "estimator"]
+    assert names(two, "linear", BOTH) == two
+    assert names(two, "linear_edmd", BOTH) == ["residual_h2"]
+    assert names(two, "linear_edmd", ("linear_edmd",)) == two
+    assert "linear_edmd/estimator is not designed: it is fitted to recordings" in caplog.text
 
 
-def test_the_slowest_start_first_and_the_best_guarantee_is_deployed():
-    assert slowest_first(["open_loop", "worst_case_h2", "residual_h2", "kalman_tuned"]) == [1, 2, 3, 0]
+def test_the_best_guarantee_is_deployed():
     made = ["koopman/open_loop", "koopman/residual_h2", "koopman_edmd/worst_case_h2", "linear/worst_case_h2"]
     assert preferred(made) == "koopman_edmd/worst_case_h2"
     assert preferred(["koopman/ekf"]) is None

@@ -7,13 +7,13 @@ import pytest
 from paper_plant import reduced_plant
 
 from kros.core.lti import StateSpace, gain
-from kros.design.methods.published import as_published, design_published, entrywise_weight
-from kros.design.task import DesignResult
+from kros.design.methods.robust import Published, as_published
+from kros.design.task import Design
 from kros.synthesis import Injection, ObserverProblem
 from kros.synthesis.problem.plants import mixed_plant
 from kros.uncertainty import residual
 
-DT, UNITS = 0.01, ("a", "b", "c")
+DT, UNITS, METHOD = 0.01, ("a", "b", "c"), Published(time_limit_s=20.0, max_order=2)
 
 
 def population() -> StateSpace:
@@ -32,8 +32,11 @@ def task():
     problem = ObserverProblem(
         nominal, np.eye(2)[[0]], wide, gain(np.eye(2), DT), np.ones(2), np.ones(2), np.array([1e-3])
     )
-    models = SimpleNamespace(systems=lambda ids: systems, output_scale=np.ones(2), input_scale=np.ones(2))
-    settings = SimpleNamespace(time_limit_s=20.0)
+    models = SimpleNamespace(
+        frequencies=lambda: np.geomspace(0.01, 50, 200),
+        scaled_responses=lambda freqs, ids: systems.frequency_response(freqs),
+        sample_period_s=DT,
+    )
     return SimpleNamespace(
         name="koopman_edmd/paper",
         models=models,
@@ -41,14 +44,12 @@ def task():
         problem=problem,
         covered=UNITS,
         unit="b",
-        max_order=2,
-        settings=settings,
-        designed=lambda synthesis, **facts: DesignResult("paper", None, synthesis, facts, problem),
+        designed=lambda synthesis, **facts: Design("paper", None, synthesis, facts),
     )
 
 
 def test_every_entry_of_every_residual_is_below_its_weight(task):
-    weight = entrywise_weight(task).matrix()
+    weight = METHOD.weights(task).system
     freqs = np.geomspace(0.01, 49, 200)
     responses = population().frequency_response(freqs)
     entries = np.abs(residual("inverse_input_multiplicative", responses[1], responses)).max(axis=0)
@@ -56,7 +57,7 @@ def test_every_entry_of_every_residual_is_below_its_weight(task):
 
 
 def test_the_plant_is_the_published_one_with_noise_and_penalty(task):
-    weight = entrywise_weight(task).matrix()
+    weight = METHOD.weights(task).system
     problem = as_published(task.problem, weight)
     assert problem.injection is Injection.INPUT
     published = reduced_plant(problem.nominal, problem.C / 1e-3, gain(np.eye(2), DT), gain(np.eye(2), DT), weight)
@@ -67,12 +68,12 @@ def test_the_plant_is_the_published_one_with_noise_and_penalty(task):
 
 
 def test_what_is_made_says_that_its_weights_cover_nothing(task):
-    found = design_published(task)
-    made, facts, problem = found.synthesis, found.facts, found.problem
+    found = METHOD.design(task)
+    made, facts = found.synthesis, found.facts
     assert made.method == "paper"
     assert made.worst_case_h2 is None  # nothing is certified for the set of these weights
     assert facts["unstructured_excess"] > 1
-    assert problem is task.problem
+    assert found.problem is None
     assert any("bound entries" in note for note in made.notes)
     loop = as_published(task.problem, gain(0.1 * np.eye(2), DT)).error_system(made.controller)
     assert float(loop.spectral_radius()) < 1

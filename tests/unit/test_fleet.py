@@ -7,9 +7,9 @@ import pytest
 
 from kros.core.lti import StateSpace
 from kros.identify.refine.metric import peak_residual_db
-from kros.uncertainty import FitSettings, quantify, residual, score_outliers
+from kros.uncertainty import quantify, residual
 from kros.uncertainty.forms import completion
-from kros.uncertainty.outliers import model as outlier_model
+from kros.uncertainty.settings import FitSettings
 from kros.uncertainty.weights.certificate import Method
 from kros.uncertainty.weights.cover import cover_ratio
 from kros.uncertainty.weights.residuals import Residuals
@@ -86,18 +86,3 @@ def test_the_spread_of_models_is_that_of_all_pairs():
     assert found == pytest.approx(20 * np.log10(min(peaks)), abs=1e-9)
     alike = units[np.zeros(5, int)]
     assert peak_residual_db(alike.A, alike.B, 50) == -np.inf
-
-
-def test_a_unit_scored_against_many_scores_as_it_would_among_them(monkeypatch):
-    freqs = np.geomspace(0.1, 40, 25)
-    responses = fleet(seed=5).frequency_response(freqs)
-    model = score_outliers(responses, freqs)
-    for factor in (1.02, 1.6):
-        found = model.score("new", factor * responses[7], without=("7",))
-        with monkeypatch.context() as patch:
-            patch.setattr(outlier_model, "MANY", 10**9)
-            expected = model.score("new", factor * responses[7], without=("7",))
-        assert (found.outlier, found.status) == (expected.outlier, expected.status)
-        # One unit more changes which 64 units are the nominals, and with them medians, and the largest of the others, by about a dB.
-        assert found.score_db == pytest.approx(expected.score_db, abs=1.5)
-        assert found.detectable_db == pytest.approx(expected.detectable_db, abs=1.5)

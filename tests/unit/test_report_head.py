@@ -173,11 +173,11 @@ def test_the_mean_is_geometric_and_infinite_where_an_estimate_diverged() -> None
 
 
 def test_a_run_ends_with_a_verdict_numbers_and_a_path(tmp_path: Path) -> None:
-    verdict, numbers, path = summary_lines(RunResult(tmp_path, metrics(outliers=[FLAGGED]), ()))
+    verdict, numbers, path = summary_lines(RunResult(tmp_path, metrics(outliers=[FLAGGED])))
     assert verdict.startswith("CHECK: “Koopman, estimator” estimates velocity from angle. Check 1 point")
     assert numbers == "error of velocity 0.200 % of the largest value (worst unit b: 0.200 %); units flagged 1 of 1 (b)"
     assert path == f"results: {tmp_path}"
-    early, alert, _ = summary_lines(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]}), ()))
+    early, alert, _ = summary_lines(RunResult(tmp_path, metrics(study={"deployed": None, "alerts": ["stuck"]})))
     assert early == "3 units: no observer has been designed yet"
     assert alert == "check: stuck"
 

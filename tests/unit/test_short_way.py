@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pytest
@@ -10,6 +10,8 @@ import pytest
 import kros
 from kros.core.errors import ConfigError, DataError, DimensionError, SynthesisError
 from kros.data import Population
+from kros.design.methods.gains import OpenLoop
+from kros.design.methods.robust import WorstCaseH2
 from kros.identify.presets import lifting_settings, resolve_lifting, resolve_phase
 from kros.identify.settings import CalibrationSettings
 from kros.plants import PLANTS
@@ -46,12 +48,29 @@ def test_from_arrays_to_a_step(uncertain: UncertainModels, population: Populatio
     assert design.facts["hidden_error_percent"] > 0
 
 
+class Refusing(OpenLoop):
+    """A method that is for no kind of model."""
+
+    def refusal(self, kind: str, kinds: Collection[str]) -> str:
+        return "it never is"
+
+
+def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
+    white = WorstCaseH2(corners=(None,), noises=((0.0, 0.0),), orders=(1,))
+    design = kros.synthesize(uncertain, white, methods=())
+    assert design.name == "linear_edmd/worst_case_h2"
+    assert design.facts["input_weight_hz"] is None
+    assert 0 < design.lower_bound <= design.facts["worst_case_h2"]  # type: ignore[operator]
+    with pytest.raises(ConfigError, match="it is not for these kinds of models"):
+        kros.synthesize(uncertain, Refusing(), methods=())
+
+
 def test_everything_is_designed_where_no_method_is_named(uncertain: UncertainModels) -> None:
     observer = {"baselines": ("open_loop", "kalman_tuned")}
     design = kros.synthesize(uncertain, methods=("residual_h2",), observer=observer)
     assert design.name.split("/")[1] in ("open_loop", "kalman_tuned", "residual_h2")
-    with pytest.raises(SynthesisError, match="there is no such observer"):
-        kros.synthesize(uncertain, methods=(), observer=observer | {"deployed": "koopman/estimator"})
+    with pytest.raises(SynthesisError, match="No observer could be designed"):
+        kros.synthesize(uncertain, methods=(), observer={"baselines": ()})
 
 
 def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Population) -> None:
@@ -69,12 +88,10 @@ def test_what_is_wrong_is_named(uncertain: UncertainModels, population: Populati
         kros.run(population, "out", data={"reader": "parquet"})
     with pytest.raises(ConfigError, match="'learned': it is a baseline"):
         kros.synthesize(uncertain, method="learned")
-    with pytest.raises(
-        ConfigError, match=r"Synthesize: penalti: unknown key; did you mean 'penalty'\? known are methods, input_weight"
-    ):
-        kros.synthesize(uncertain, penalti=1.0)
-    with pytest.raises(ConfigError, match="Identify: alpha_factor"):
-        kros.identify(population, alpha_factor=0.5)
+    with pytest.raises(ConfigError, match=r"Synthesize: metods: unknown key; did you mean 'methods'\?"):
+        kros.synthesize(uncertain, None, **{"metods": ()})
+    with pytest.raises(ConfigError, match="Identify: alpha"):
+        kros.identify(population, alpha=-0.5)
     with pytest.raises(ConfigError, match="is one text; give a list"):
         kros.identify(population, "sin(position)")
     with pytest.raises(ConfigError, match="Quantify: form"):

@@ -5,7 +5,8 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays
-from kros.study.stages import evaluate
+from kros.study.stages import held_out
+from kros.study.stages.held_out import HeldOut
 
 STATES = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE)
 CHANNELS = (*STATES, Channel("u", Role.INPUT), Channel("v_true", Role.TRUTH, of="v"))
@@ -26,23 +27,23 @@ def run(batch):
 @pytest.mark.parametrize("at_once", [1, 3, 7])
 def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypatch):
     population = population_of(8)
-    given = run, population, population.episodes, {}, (6, 0, 5, 1), {}
-    whole = evaluate._outcomes(*given)
-    monkeypatch.setattr(evaluate, "_EPISODES", at_once)
-    for found, wanted, share in zip(evaluate._outcomes(*given), whole, (0.9, 1.2), strict=True):
+    episodes = HeldOut(population, population.episodes, {}, (6, 0, 5, 1))
+    whole = episodes.outcomes(run)
+    monkeypatch.setattr(held_out, "SIDE_BY_SIDE", at_once)
+    for found, wanted, share in zip(episodes.outcomes(run), whole, (0.9, 1.2), strict=True):
         for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz"):
             np.testing.assert_allclose(getattr(found.summary, name), getattr(wanted.summary, name), rtol=1e-12)
         for name in ("states", "rms", "error_percent", "lag_s"):
             np.testing.assert_allclose(getattr(found.true, name), getattr(wanted.true, name), rtol=1e-9)
-        for piece, row in zip(found.shown, given[4], strict=True):
+        for piece, row in zip(found.shown, episodes.shown, strict=True):
             np.testing.assert_array_equal(piece, share * population.read(population.episodes[row])[:, :2])
 
 
 def test_no_episodes_are_refused_with_a_reason():
     with pytest.raises(DataError, match="no episodes were named; check the split"):
-        evaluate._outcomes(run, population_of(1), (), {}, (), {})
+        HeldOut(population_of(1), (), {}).outcomes(run)
 
 
 def test_an_episode_that_does_not_exist_is_named():
     with pytest.raises(DataError, match="unit 9"):
-        evaluate._outcomes(run, population_of(1), (EpisodeKey("unit 9", "default", "0"),), {}, (), {})
+        HeldOut(population_of(1), (EpisodeKey("unit 9", "default", "0"),), {}).outcomes(run)

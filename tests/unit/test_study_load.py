@@ -29,7 +29,7 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
         config=SimpleNamespace(load=LoadConfig(**options)),
         facts=facts,
         population=population,
-        phase_spec=None,
+        calibration=None,
         lifting=Lifting(population.states),
         identified=SimpleNamespace(
             kinds=("linear",),
@@ -69,7 +69,9 @@ def test_without_a_moment_nothing_is_done(tmp_path: Path) -> None:
 
 
 def test_a_study_says_what_its_load_lacks(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="condition 'rain'"):
-        run_load(context(tmp_path, moment=0.2, condition="rain"), {})
-    with pytest.raises(ConfigError, match="no state 'torque'"):
-        run_load(context(tmp_path, moment=0.2, units=("001001",), current="torque"), {})
+    with pytest.raises(ConfigError, match="condition 'load'; known 001001, 001002, others none"):
+        run_load(context(tmp_path, moment=0.2), {})
+    study = context(tmp_path, moment=0.2, units=("001001",))
+    study.population = SimpleNamespace(states=("position", "torque"))
+    with pytest.raises(ConfigError, match="no state 'current'"):
+        run_load(study, {})

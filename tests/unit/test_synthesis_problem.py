@@ -68,7 +68,6 @@ def test_models_of_another_population_are_refused(models, uncertain):
         ObserverProblem.from_uncertain(replace(models, A=0.9 * models.A), uncertain, [1e-3])
 
 
-def test_entrywise_weights_are_refused(models):
-    entrywise = quantify(models, form="additive", freqs_hz=models.frequencies(60), structure="entrywise", max_order=2)
-    with pytest.raises(SynthesisError, match="made for a diagonal perturbation"):
-        ObserverProblem.from_uncertain(models, entrywise, [1e-3])
+def test_a_nominal_that_is_no_unit_is_refused(models, uncertain):
+    with pytest.raises(SynthesisError, match="'pooled' is none of the models' units"):
+        ObserverProblem.from_uncertain(models, replace(uncertain, nominal_id="pooled"), [1e-3])

@@ -36,6 +36,8 @@ def log_grid(
     top = nyquist_hz(sample_period_s)
     low = top * 10.0**-decades
     if longest_s is not None:
+        if not longest_s > 0:
+            raise ConfigError(f"Frequency grid: the longest recording should have a length, found {longest_s} s.")
         low = min(max(low, 1 / longest_s), _WIDEST * top)
     grid = np.geomspace(low, top, n_freqs)
     grid[-1] = top

@@ -18,17 +18,12 @@ Structures of weights to choose from are no longer part of kros; remove the key 
 Systems and responses are no longer quantified by functions of their own; use quantify, which takes systems, responses
 (form before freqs_hz) and models of kros.identify.
     kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses
-What the fit of a weight is made of is no longer public; use quantify.
-    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
 Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db.
     kros.uncertainty.magnitude_tightness
 Where a form is exact is no longer a function of its own; use misfit, which is zero there.
     kros.uncertainty.completion kros.uncertainty.existence
 The nominals of all forms are no longer one function; use choose_nominal for each form.
     kros.uncertainty.choose_nominals
-Margins of stability and the largest residual of identification are no longer settings; identify.alpha_factor keeps
-models away from the edge.
-    identify.margin identify.largest_residual
 Parameters of a lifting are not named; a formula that reads phase has one for every unit, remove the key parameters.
     lifting.parameters
 What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is a
@@ -36,8 +31,8 @@ two-hundredth of an episode.
     calibrate.settle_s
 Steps of the design of predictors and residual-shaped observers are no longer public; use synthesize with method
 estimator or residual_h2.
-    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal
-    kros.observer.residual_models kros.observer.tune_observer kros.observer.in_sizes
+    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal kros.observer.residual_models
+    kros.observer.tune_observer kros.observer.in_sizes
 Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.
     kros.observer.EstimateKind
 Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.
@@ -83,9 +78,6 @@ Readers of one format are no longer public; use kros.read, which finds the forma
     kros.data.read_csv_folder kros.data.read_motor_drive_raw
 The check of a population and the class of a split are no longer public; kros.identify checks, split_episodes splits.
     kros.data.Split kros.data.check_population
-Certificates for any pattern of lost measurements are no longer part of kros; use kros.observer.dropout_bound for losses
-at a rate.
-    kros.observer.Dropped
 The function run_study is no longer part of kros; use kros.run, which takes a study too.
     kros.study.run_study
 The load's angle and the size of its observer are no longer settings; remove the keys, and let the step offset make the
@@ -104,6 +96,35 @@ Families are joined as tuples, and a lifting refuses functions that repeat; writ
     kros.lifting.concatenate
 TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).
     kros.data.TrueChannel
+How weights and outlier scores are computed is no longer set in a study; use kros.quantify, which takes nominal,
+max_order, tolerance_db and false_alarm_rate.
+    uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate
+Flagged units are no longer dropped by a study itself; name them under data.exclude.
+    uncertainty.drop_outliers
+What the fit of a weight is made of is no longer public; use quantify.
+    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
+    kros.uncertainty.FitSettings
+Margins of stability, the largest residual of identification and the factor of alpha are no longer settings; remove the
+keys, or set identify.alpha to a number.
+    identify.margin identify.largest_residual identify.alpha_factor
+The spectrum of the inputs, the penalty on corrections and the time limit are no longer settings of a study; remove the
+keys, and use kros.design.methods for a method with other options.
+    synthesis.input_weight synthesis.penalty synthesis.time_limit_s
+Limits of states are no longer declared; remove the table limits, kros detects limits that recordings reach.
+    limits
+The deployed observer is no longer named in a study; remove the key deployed, and use kros export c --observer.
+    observer.deployed
+The rate of false alarms of the monitor is no longer a setting of a study; remove the key, it is 0.02.
+    observer.false_alarm_rate
+Names of condition, angle and current, limit and time constant of a load are no longer settings; remove the keys, name
+the condition load and the states position and current.
+    load.condition load.angle load.current load.limit load.level_s
+Requirements are no longer part of a study; remove the table require, and read certificates and outliers in
+metrics.json.
+    require require.robust require.no_outliers
+Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
+for any pattern of losses, and the report's figure of lost measurements.
+    kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
 Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known load,
 with LoadSettings.
     kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load

@@ -10,6 +10,7 @@ Examples
 'linear_edmd/kalman_tuned'
 """
 
-from .synthesize import Design, synthesize
+from .synthesize import synthesize
+from .task import Design
 
 __all__ = ["Design", "synthesize"]

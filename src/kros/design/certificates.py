@@ -1,154 +1,90 @@
-"""The certificate of every observer as it runs, with what it says about training episodes; observers of one lifting run side by side."""
+"""Certificates of observers as nonlinear systems, with their errors and guards from training episodes."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import save_artifact
-from ..lifting import Lifting
+from ..loops.filtering import recursion
 from ..observer import (
-    DropoutBound,
     Guard,
     Observer,
     ReliftCertificate,
     ReliftScales,
     ReliftStatus,
-    Sensor,
     SignalBound,
-    dropout_bound,
     relift_certificate,
     run_observer,
     run_observers,
     signal_bound,
 )
-from ..observer.certificate.report import ReliftRow, course, relift_report
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
+from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
-from ..observer.units import factors
-from ..uncertainty.coprime.bands import BandEnergies
-from .guard import guarded
-from .task import DesignResult, DesignTask
-from .validation import SHORT_SAMPLES, TrainingSet, ValidationSet, hidden_mean
+from ..observer.screen import Screen
+from ..observer.units import factors, in_sizes
+from ..uncertainty.band_energies import BandEnergies
+from .monitor import settling
+from .task import Design, DesignTask
+from .validation import TrainingSet, ValidationSet, hidden_mean
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-_SAMPLES = 5_000  # of an episode
-_LOSS_SAMPLES, _LOSS_SHARE, _LOSS_AFTER, _LOSS_EPISODES = (
-    2_000,
-    0.4,
-    0.25,
-    3,
-)  # a loss ends there or at that share of an episode; when it begins
-DIVERGED = 100.0  # percent of the largest value: an estimate that says nothing
-_BOX = 1.5  # operating box in units of the recorded ranges, where a lifting has no global slope bounds
 
 
-@dataclass(frozen=True, eq=False)
-class Running:
-    """What is known about one observer as it runs."""
+@dataclass(frozen=True)
+class CertificateSettings:
+    """On how much of the recordings certificates and guards rest."""
 
-    name: str
-    certificate: ReliftCertificate
-    rows: list[ReliftRow]
-    hidden_percent: float
-    dropout_percent: float
-    signals: SignalBound | None = None
-    measured: tuple[int, ...] = ()
-    dropout: DropoutBound | None = None
-    guard: Guard | None = None
-
-    @property
-    def certified(self) -> bool:
-        """Whether it is certified as it runs, for any machine, for the recorded signals of all units, and in mean square for losses that are declared."""
-        proven = self.dropout is None or self.dropout.gain is not None
-        return self.certificate.certified and proven and (self.signals is None or self.signals.certified)
-
-    def facts(self) -> dict[str, Any]:
-        """Return what goes into the metrics."""
-        found = self.certificate
-        facts: dict[str, Any] = {
-            "relift_certified": found.certified,
-            "relift_gain": found.gain,
-            "hidden_error_percent": self.hidden_percent,
-            "blind_error_percent": self.dropout_percent,
-        }
-        if self.signals is not None:
-            facts |= self.signals.facts(self.measured)
-        if self.dropout is not None:
-            lost = self.dropout
-            facts |= {
-                "dropout_rate": lost.rate,
-                "dropout_certified": lost.gain is not None,
-                "dropout_mean_square_gain": lost.gain,
-            }
-            facts |= {"dropout_reason": lost.reason} if lost.reason else {}
-        if not found.certified:
-            return facts | {"relift_reason": found.reason}
-        return facts | {
-            "relift_mismatch_gain": found.mismatch_gain,
-            "relift_bound_worst": max((r.bound for r in self.rows), default=None),
-        }
+    samples: int = 5_000  # of an episode, at most
+    losses: int = 12  # patterns of lost measurements that are simulated; in the first one they stop
+    box: float = 1.5  # operating box in ranges, where slopes of a lifting have no global bounds
+    room: float = 1.0  # by which estimates may leave what they and the recordings were in training, in ranges
 
 
-def certify_running(task: DesignTask, results: Sequence[DesignResult]) -> list[Running]:
-    """Certify observers of one kind of model; `task` is that of any of them, and what could not be made is left out."""
-    observers = [found.observer for found in results if found.observer is not None]
-    data, others = certified_on(task), other_conditions(task)
-    facts = {r.name: r.facts for r in results}
-    found = {
-        r.name: r
-        for group in by_lifting([o for o in observers if o.bank is None])
-        for r in running_of(group, data, task, others)
-    }
-    found |= {o.name: running_filters(o, data, task, others, facts[o.name]) for o in observers if o.bank is not None}
-    return [found[observer.name] for observer in observers]
+DEFAULT = CertificateSettings()
 
 
-def certified_on(task: DesignTask) -> ValidationSet:
-    """Return the episodes whose signals make the set that observers are certified for: the beginning of the first one of every unit, or some short ones."""
-    return _beginnings(task.training)
+def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSettings = DEFAULT) -> list[Design]:
+    """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
+    data, others = certified_on(task.training, settings), other_conditions(task, settings)
+    if designs[0].observer.bank is not None:
+        return [_certified_filters(design, data, others, task, settings) for design in designs]
+    return _certified_models(designs, data, others, task, settings)
 
 
-def other_conditions(task: DesignTask) -> list[ValidationSet]:
-    """Return the same episodes of the same units for every condition that observers are not certified for, on which they are compared as well."""
-    training, recordings = task.training, task.recordings or task.training
-    home, units = {k.condition for k in training.keys}, {k.unit for k in training.keys}
-    known = [k for k in recordings.keys if k.condition not in home and k.unit in units]
-    parts = [
-        replace(recordings, keys=tuple(k for k in known if k.condition == c))
-        for c in dict.fromkeys(k.condition for k in known)
-    ]
-    return [_beginnings(part) for part in parts]
+def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> ValidationSet:
+    """Return episodes whose signals make the certified set: the start of the first one of every unit, or short ones."""
+    first = training.first_of_units().read().first(settings.samples)
+    return first if len(first.batch.states) > training.settings.short else training.read()
 
 
-def _beginnings(training: TrainingSet) -> ValidationSet:
-    first = training.first_of_units().read().first(_SAMPLES)
-    return first if len(first.batch.states) > SHORT_SAMPLES else training.read()
+def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[ValidationSet]:
+    """Return the same of every condition that observers are not certified for."""
+    home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
+    keys = [k for k in task.recordings.keys if k.condition not in home and k.unit in units]
+    groups = [tuple(k for k in keys if k.condition == c) for c in dict.fromkeys(k.condition for k in keys)]
+    return [certified_on(replace(task.recordings, keys=group), settings) for group in groups]
 
 
-def by_lifting(observers: Sequence[Observer]) -> list[list[Observer]]:
-    """Return observers in groups that can run side by side: some have been fitted to their own liftings."""
-    groups: dict[Lifting, list[Observer]] = {}
-    for observer in observers:
-        groups.setdefault(observer.lifting, []).append(observer)
-    return list(groups.values())
-
-
-def running_of(
-    observers: Sequence[Observer], data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet] = ()
-) -> list[Running]:
-    """Certify observers of one lifting, and compare with what they do, in other conditions too; certificates come back in the recordings' units."""
-    first, batch = observers[0], data.batch
+def _certified_models(
+    designs: Sequence[Design],
+    data: ValidationSet,
+    others: Sequence[ValidationSet],
+    task: DesignTask,
+    settings: CertificateSettings,
+) -> list[Design]:
+    """Certify corrected models, which run side by side."""
+    observers, batch = [design.observer for design in designs], data.batch
+    first = observers[0]
+    guards = guards_of(observers, [data, *others], settings)
     scales = scales_of(observers, data, task)
-    guards = [o.guard for o in guarded(observers, [data, *others])]
-    certificates = [certify(observer, own, task) for observer, own in zip(observers, scales, strict=True)]
+    certificates = [certify_model(o, s, task, settings.box) for o, s in zip(observers, scales, strict=True)]
     estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, first.own(batch.parameters))
     arrived = estimates
     if batch.lost is not None:  # bounds are for measurements that arrive
@@ -156,49 +92,66 @@ def running_of(
         arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
-    dropout = dropout_error_percent(observers, data)
-    rates = [task.sensor.get(first.lifting.states[i], Sensor()).dropout for i in first.measured]
-    lost = [dropout_bound(c, o, rates) if any(rates) else None for o, c in zip(observers, certificates, strict=True)]
+    lost = loss_error_percent(observers, data, settings)
     known: dict[bytes, BandEnergies] = {}
-    rows, bounds = [], []
-    for o, c, x in zip(observers, certificates, arrived, strict=True):
-        seen = course(o, batch, x)
-        rows.append(relift_report(c, o, batch, x, seen) if c.certified else [])
-        bounds.append(signal_bound(c, o, batch, x, known, seen))
-    bounds = [b.in_sizes(factors(o, {})[0][: len(b.states)]) for o, b in zip(observers, bounds, strict=True)]
-    certificates = [c.in_sizes(o, {}) for o, c in zip(observers, certificates, strict=True)]
-    found = zip(observers, certificates, rows, hidden, dropout, bounds, lost, guards, strict=True)
-    return [Running(o.name, c, r, float(h), float(d), b, o.measured, p, g) for o, c, r, h, d, b, p, g in found]
+    certified = []
+    for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
+        observer = observers[k]
+        bound = signal_bound(certificate, observer, batch, arrived[k], known)
+        bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
+        certificate = certificate.in_sizes(observer, {})
+        facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
+        observer = replace(observer, guard=guards[k])
+        certified.append(replace(design, observer=observer, certificate=certificate, facts={**design.facts, **facts}))
+    return certified
 
 
-def running_filters(
-    observer: Observer, data: ValidationSet, task: DesignTask, others: Sequence[ValidationSet], facts: dict[str, Any]
-) -> Running:
+def _certified_filters(
+    design: Design,
+    data: ValidationSet,
+    others: Sequence[ValidationSet],
+    task: DesignTask,
+    settings: CertificateSettings,
+) -> Design:
     """Certify a filter bank; its errors in training are raised to those on units that were left out."""
-    batch, n, measured = data.batch, len(observer.recorded), observer.measured
+    observer, batch = design.observer, data.batch
+    n, measured = len(observer.recorded), observer.measured
     estimates = run_observer(observer, data.measurements(measured), batch.inputs, observer.own(batch.parameters))
-    missed = estimates[..., :n] - batch.states
-    inside = (np.arange(len(missed))[:, None] < batch.lengths)[..., None]
-    square = np.sum(np.where(inside, missed, 0.0) ** 2, axis=0) / batch.lengths[:, None]
+    error = estimates[..., :n] - batch.states
+    inside = (np.arange(len(error))[:, None] < batch.lengths)[..., None]
+    square = np.sum(np.where(inside, error, 0.0) ** 2, axis=0) / batch.lengths[:, None]
     units = list(dict.fromkeys(batch.units))
     errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
-    sizes = task.models.output_scale[:n]
+    sizes, by = task.models.output_scale[:n], factors(observer, {})[0]
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
-    growth = facts["left_out_to_training"]
-    grown = np.array([growth.get(name, 1.0) for name in observer.recorded])
+    growth = design.facts["left_out_to_training"]
+    left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
     percents = [data.compare([estimates])[0], *(other.percent(observer) for other in others)]
-    hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * grown, measured)) for percent in percents])))
-    dropout = float(dropout_error_percent([observer], data)[0])
+    hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * left_out, measured)) for percent in percents])))
+    lost = float(loss_error_percent([observer], data, settings)[0])
     certificate = filter_certificate(observer, scales)
-    bound = left_out_bound(observer, sizes, units, errors, facts["left_out_worst_percent"])
-    by = factors(observer, {})[0]
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
     certificate = replace(certificate, scales=scales)
-    return Running(observer.name, certificate, [], hidden, dropout, bound.in_sizes(by[:n]), measured)
+    bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"]).in_sizes(by[:n])
+    facts = _facts(certificate, bound, measured, (hidden, lost))
+    return replace(design, certificate=certificate, facts={**design.facts, **facts})
+
+
+def _facts(
+    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: tuple[float, float]
+) -> dict[str, Any]:
+    """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
+    facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
+    facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
+    facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
+    facts["set_bound"] = {
+        s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
+    }
+    return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
 def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
-    """Return the sizes that every observer's gain refers to: ranges, the residual of its own model in this population, quantisation."""
+    """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
     known: dict[bytes, ReliftScales] = {}
     for observer in observers:
         model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
@@ -209,38 +162,74 @@ def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTa
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 
-def dropout_error_percent(observers: Sequence[Observer], data: ValidationSet) -> Array:
-    """Return the largest error of a state in percent of the largest value where measurements stop arriving, shape (observer,); infinite where it grows on."""
-    some, first = data.part(range(min(_LOSS_EPISODES, len(data.batch.keys)))), observers[0]
-    short = some.first(min(_LOSS_SAMPLES, max(2, round(_LOSS_SHARE * int(some.batch.lengths.min())))))
-    y = short.measurements(first.measured)
-    y[max(1, round(_LOSS_AFTER * len(y))) :] = np.nan
-    values = short.parameters if first.lifting.parameters else None
-    return np.asarray(short.compare(run_observers(observers, y, short.batch.inputs, values)).max(axis=-1))
+def loss_error_percent(observers: Sequence[Observer], data: ValidationSet, settings: CertificateSettings) -> Array:
+    """Return the largest error in percent of the largest value where measurements are lost, shape (observer,)."""
+    rows, first = np.arange(settings.losses) % len(data.batch.keys), observers[0]
+    some = data.part(rows.tolist()).first(int(data.batch.lengths[rows].min()))
+    y, x = some.measurements(first.measured), some.batch.states
+    lost = losses(np.random.default_rng(0), len(y), len(rows))
+    lost[len(y) // 4 :, 0] = True
+    estimates = run_observers(
+        observers, np.where(lost[..., None], np.nan, y), some.batch.inputs, first.own(some.parameters)
+    )
+    size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
+    return np.where(np.isfinite(errors), 100 * errors, np.inf)
 
 
-def certify(observer: Observer, scales: ReliftScales, task: DesignTask) -> ReliftCertificate:
-    """Certify one observer everywhere, or in an operating box where slopes have no bound of their own."""
-    found = relift_certificate(observer, scales=scales)
-    if found.status is ReliftStatus.UNBOUNDED:
-        models = task.models
-        sizes = [
+def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, size: float) -> ReliftCertificate:
+    """Certify one observer everywhere, or in an operating box where slopes have no global bound."""
+    certificate, models = relift_certificate(observer, scales=scales), task.models
+    if certificate.status is ReliftStatus.UNBOUNDED:
+        ranges = [
             *zip(models.lifting.states, models.output_scale, strict=False),
             *zip(models.recorded_inputs, models.input_scale, strict=False),
         ]
-        box = {name: (-_BOX * size, _BOX * size) for name, size in sizes}
-        own = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
-        found = relift_certificate(observer, box, scales, own)
-    if not found.certified:
-        log.warning("%s: no certificate covers it as it runs. %s", observer.name, found.reason)
-    return found
+        box = {name: (-size * value, size * value) for name, value in ranges}
+        values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
+        certificate = relift_certificate(observer, box, scales, values)
+    if not certificate.certified:
+        log.warning("%s: no certificate for the nonlinear observer. %s", observer.name, certificate.reason)
+    return certificate
 
 
-def save_running(folder: Path, found: Sequence[Running]) -> None:
-    """Write certificates and rows below the folder of the observers."""
-    rows = {r.name: [row.as_dict() for row in r.rows] for r in found}
-    notes = {r.name: {"assumptions": r.certificate.assumptions, "method": r.certificate.method} for r in found}
-    signals = {r.name: r.signals.as_dict() for r in found if r.signals is not None}
-    save_artifact(folder, "relift", {"rows": rows, "certificates": notes, "signals": signals})
-    for running in found:
-        running.certificate.save(folder / "relift" / running.name)
+def guards_of(
+    observers: Sequence[Observer], data: Sequence[ValidationSet], settings: CertificateSettings
+) -> list[Guard | None]:
+    """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
+    n, q = observers[0].lifting.n_states, list(observers[0].measured)
+    low, high = np.full((len(observers), n), np.inf), np.full((len(observers), n), -np.inf)
+    largest = [np.zeros(o.controller.n_states) for o in observers]
+    for part in data:
+        batch, y, recorded = part.batch, part.measurements(q), part.batch.states.shape[-1]
+        for first in (0, len(y) // 2):
+            x = run_observers(observers, y[first:], batch.inputs[first:], observers[0].own(batch.parameters))
+            inside = (np.arange(first, len(y))[:, None] < batch.lengths)[..., None]
+            states, least, most = batch.states[first:], np.full(n, np.inf), np.full(n, -np.inf)
+            least[:recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
+            most[:recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+            low = np.minimum(low, np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least))
+            high = np.maximum(high, np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most))
+            for i, o in enumerate(observers):
+                nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
+                corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
+                largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
+    return [_guard(o, a, b, c, settings.room) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
+
+
+def _guard(observer: Observer, low: Array, high: Array, correction: Array, room: float) -> Guard | None:
+    """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
+    if not all(np.isfinite(side).all() for side in (low, high, correction)):
+        return None
+    wider = room * np.maximum(high - low, np.finfo(float).tiny)
+    low, high, at = low - wider, high + wider, list(observer.measured)
+    screen = Screen.of(observer).measured
+    low[at], high[at] = np.minimum(low[at], screen.least), np.maximum(high[at], screen.most)
+    return Guard(low, high, (1 + 2 * room) * np.maximum(correction, np.finfo(float).tiny), settling(observer))
+
+
+def in_recorded_units(design: Design) -> Design:
+    """Return a design whose observer and controller are in the recordings' units."""
+    observer = in_sizes(design.observer, {})
+    return replace(design, observer=observer, synthesis=replace(design.synthesis, controller=observer.controller))

@@ -1,4 +1,4 @@
-"""The baseline for machines that repeat a motion: made from training episodes whose inputs are those of the episodes it is asked for."""
+"""The baseline for machines that repeat a motion: the mean of training episodes that have the same inputs."""
 
 from __future__ import annotations
 
@@ -11,12 +11,10 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from ..data.population import EpisodeKey, Population
-from .estimators import Baseline
+from .baselines import DEFAULT, Baseline, BaselineSettings
 from .validation import TrainingSet
 
 Array = npt.NDArray[np.float64]
-SAME = 0.01  # of the largest input: RMS difference of inputs that are the same motion
-_SAMPLES = 5_000_000  # read at most, once every unit and condition has been read
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +32,7 @@ class MeanProfile:
         return sizes_of(self.inputs)
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest to its own."""
+        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
         del parameters
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for i in range(y.shape[1]):
@@ -44,7 +42,7 @@ class MeanProfile:
 
 
 def held(signal: Array, n_samples: int) -> Array:
-    """Return a signal, shape (n, ...), of so many samples: cut, or held at its last one."""
+    """Return a signal, shape (n, ...), of `n_samples` samples: cut, or held at its last one."""
     longer = len(signal) >= n_samples
     return signal[:n_samples] if longer else np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
 
@@ -61,63 +59,66 @@ def difference(u: Array, motion: Array, sizes: Array) -> float:
 
 
 def make_mean_profile(
-    training: TrainingSet, measured: tuple[int, ...], population: Population, keys: Iterable[EpisodeKey]
+    training: TrainingSet,
+    measured: tuple[int, ...],
+    population: Population,
+    keys: Iterable[EpisodeKey],
+    settings: BaselineSettings = DEFAULT,
 ) -> Baseline:
-    """Average the states of training episodes that are the same motions as some episodes, over units, once for every unit without it."""
+    """Average the states of training episodes that have the same motions, over units, and without each unit."""
     n = len(population.states)
-    estimated = [i for i in range(n) if i not in measured]
+    estimated = tuple(i for i in range(n) if i not in measured)
     if not population.inputs or not estimated:
-        raise DataError("Mean profile: it needs inputs that tell a motion, and a state that is not measured.")
-    motions: list[Array] = []
-    named: list[EpisodeKey] = []
-    for key in keys:
-        u = population.read_parts(key)[1]
-        sizes = sizes_of([*motions, u])
-        if not motions or min(difference(u, motion, sizes) for motion in motions) > SAME:
-            motions.append(u)
-            named.append(key)
-    sizes = sizes_of(motions)
-    sums: list[dict[str, Array]] = [{} for _ in motions]
-    counts: list[dict[str, int]] = [{} for _ in motions]
-    closest = np.full(len(motions), np.inf)
-    total, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
-    for part in training.one_by_one():
-        (unit,), states, u = part.batch.units, part.batch.states[:, 0, estimated], part.batch.inputs[:, 0]
-        apart = np.array([difference(motion, u, sizes) for motion in motions])
-        closest = np.minimum(closest, apart)
-        if apart.min() <= SAME:
-            at = int(apart.argmin())
-            profile = held(states, len(motions[at]))
-            sums[at][unit] = sums[at].get(unit, 0.0) + profile
-            counts[at][unit] = counts[at].get(unit, 0) + 1
-        read, total = read + 1, total + len(states)
-        if read >= groups and total > _SAMPLES:
-            break
-    for key, found, apart_by in zip(named, sums, closest, strict=True):
-        if len(found) < 2:
+        raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
+    motions = different_motions(population, keys, settings.same_motion)
+    means, closest, episodes = unit_means(training, list(motions.values()), estimated, settings)
+    for key, of_units, apart in zip(motions, means, closest, strict=True):
+        if len(of_units) < 2:
+            distance = f"{100 * apart:.3g} % of the largest (RMS), {100 * settings.same_motion:g} % counts as the same"
             raise DataError(
-                f"Mean profile: held-out episode {key} is no motion that training episodes of two units repeat; the nearest inputs differ by "
-                f"{100 * apart_by:.3g} % of the largest (RMS), {100 * SAME:g} % counts as the same."
+                f"Mean profile: held-out episode {key} is no motion that training episodes of two units repeat; the "
+                f"nearest inputs differ by {distance}."
             )
-    profiles = [{unit: total / counts[at][unit] for unit, total in found.items()} for at, found in enumerate(sums)]
 
     def without(left_out: str) -> MeanProfile:
-        means = [np.mean([p for unit, p in found.items() if unit != left_out], axis=0) for found in profiles]
-        return MeanProfile(n, tuple(estimated), motions, means)
+        states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
+        return MeanProfile(n, estimated, list(motions.values()), states)
 
-    by_unit = {unit: without(unit) for unit in dict.fromkeys(unit for found in profiles for unit in found)}
-    facts = {
-        "status": "averaged",
-        "motions": len(motions),
-        "episodes": sum(sum(c.values()) for c in counts),
-        "left_out": "the unit under test",
-    }
-    return Baseline(
-        by_unit | {"": without("")},
-        measured,
-        tuple(estimated),
-        facts,
-        takes_missing=True,
-        restarts=False,
-        seen=training.seen,
-    )
+    units = dict.fromkeys(unit for of_units in means for unit in of_units)
+    facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
+    by_unit = {unit: without(unit) for unit in (*units, "")}
+    return Baseline(by_unit, measured, estimated, facts, takes_missing=True, restarts=False, seen=training.seen)
+
+
+def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
+    """Return the inputs of episodes that differ, (n_samples, m) each."""
+    motions: dict[EpisodeKey, Array] = {}
+    for key in keys:
+        u = population.read_parts(key)[1]
+        sizes = sizes_of([*motions.values(), u])
+        if all(difference(u, motion, sizes) > same for motion in motions.values()):
+            motions[key] = u
+    return motions
+
+
+def unit_means(
+    training: TrainingSet, motions: Sequence[Array], estimated: Sequence[int], settings: BaselineSettings
+) -> tuple[list[dict[str, Array]], Array, int]:
+    """Return the mean states of every motion by unit, how near inputs came to it, and the episodes that were used."""
+    sizes, closest = sizes_of(motions), np.full(len(motions), np.inf)
+    profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
+    n_samples, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
+    for part in training.one_by_one():
+        (unit,), states, u = part.batch.units, part.batch.states[:, 0, list(estimated)], part.batch.inputs[:, 0]
+        apart = np.array([difference(motion, u, sizes) for motion in motions])
+        closest = np.minimum(closest, apart)
+        if apart.min() <= settings.same_motion:
+            at = int(apart.argmin())
+            profiles[at].setdefault(unit, []).append(held(states, len(motions[at])))
+        read, n_samples = read + 1, n_samples + len(states)
+        if read >= groups and n_samples > settings.profile_samples:
+            break
+    means: list[dict[str, Array]] = [
+        {unit: np.mean(some, axis=0) for unit, some in of_units.items()} for of_units in profiles
+    ]
+    return means, closest, sum(len(some) for of_units in profiles for some in of_units.values())

@@ -1,9 +1,9 @@
 """The monitor of a deployed observer: its bound from what the innovation does on the machines of training.
 
-Of every unit the highest level over its training episodes counts, one after the other as on a machine that goes on, so that a unit is one draw however
-long it was recorded; the bound is what one more unit exceeds with the stated probability on motions of its own (`bound_of_peaks`). It holds for units
-that move as those in training did, for as long. Where the observer was designed on the same units, new ones have larger innovations by what it learned
-of those.
+Of every unit the highest level over its training episodes counts, one after the other as on a machine that does not
+stop, so that a unit is one draw however long it was recorded. The bound is what one more unit exceeds with the stated
+rate on other motions (`bound_of_peaks`). It holds for units that move as those in training did, for as long. If the
+observer was designed on the same units, new ones have larger innovations.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -18,7 +19,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.work import Work
-from ..data.population import EpisodeKey
 from ..observer import Observer
 from ..observer.monitor import WEIGHT, Monitor, octaves, poisson_interval
 from ..observer.simulate import run_innovations
@@ -27,86 +27,68 @@ from .validation import TrainingSet, spread
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-UNITS, EPISODES = 60, 12  # most units, and most episodes of each in every condition
-MEMORY, BEGINNING = 8000, 500  # samples that mean squares remember, and that they count as quiet in the beginning
-FORGOTTEN = 1e-3  # of a start, when innovations are judged
-SETTLE = (100, 1000)
-SHRINK, QUIETEST = 0.7, 0.5  # of covariances to their diagonal; of the median variance
-MOTIONS = 6  # from which on motions add nothing to a bound
-MOVING = 0.1  # of the RMS step of a measurement: less is rest
+Group = tuple[str, str]  # unit and condition
 
 
-def fit_monitor(observer: Observer, training: TrainingSet, rate: float, work: Work | None = None) -> Monitor | None:
+@dataclass(frozen=True)
+class MonitorSettings:
+    """How the monitor of the deployed observer is fitted."""
+
+    false_alarm_rate: float = 0.02  # share of good machines that may be reported
+    units: int = 60  # at most
+    episodes: int = 12  # of a unit in a condition, at most
+    memory: int = 8000  # samples that mean squares remember
+    beginning: int = 500  # samples that count as quiet in the beginning
+    forgotten: float = 1e-3  # share of a start that may be left when innovations are judged
+    settle: tuple[int, int] = (100, 1000)  # samples that are not judged after a start, at least and at most
+    shrink: float = 0.7  # of covariances to their diagonal
+    quietest: float = 0.5  # least variance of a band, share of the median
+    motions: int = 6  # of a unit; more of them add nothing to a bound
+    moving: float = 0.1  # share of the RMS step of a measurement, below which a machine rests
+
+
+DEFAULT = MonitorSettings()
+
+
+def fit_monitor(
+    observer: Observer, training: TrainingSet, settings: MonitorSettings = DEFAULT, work: Work | None = None
+) -> Monitor | None:
     """Return the monitor of an observer; None with fewer than three units."""
-    tasks = list(_tasks(observer, training, settling(observer)))
-    met = (work or Work()).map("monitor", _met, tasks)
-    own = {task.group: found for task, found in zip(tasks, met, strict=True) if found}
-    episodes, units = [e for found in own.values() for e in found], list(dict.fromkeys(unit for unit, _ in own))
+    settle, rate = settling(observer, settings), settings.false_alarm_rate
+    groups = dict(_groups(training, settings))
+    runs = (work or Work()).run("monitor", [partial(_judged, observer, part, settle) for part in groups.values()])
+    episodes = {group: run for group, run in zip(groups, runs, strict=True) if run}
+    units, every = list(dict.fromkeys(unit for unit, _ in episodes)), [e for run in episodes.values() for e in run]
     if len(units) < LEAST_SCORES:
-        log.info(
-            "%s has no monitor: its bound needs training episodes of %d units, found %d.",
-            observer.name,
-            LEAST_SCORES,
-            len(units),
-        )
+        needed = f"its bound needs training episodes of {LEAST_SCORES} units, found {len(units)}"
+        log.info("%s has no monitor: %s.", observer.name, needed)
         return None
-    size = np.sqrt(np.mean([e.mean_square() for e in episodes], axis=0))
+    size = np.sqrt(np.mean([e.mean_square() for e in every], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
-    even = np.ones((len(size), len(filters)))
-    free = Monitor(
-        filters, 1 / MEMORY, settling(observer), size, even, weighted(even), rate, units=len(units), first=1 / BEGINNING
-    )
-
-    def squares(
-        group: tuple[str, str],
-    ) -> list[Array]:  # found anew wherever they are needed: all of them fill a memory
-        return free.in_turn([(e.innovation, e.judged) for e in own[group]])
-
+    even, forget, first = np.ones((len(size), len(filters))), 1 / settings.memory, 1 / settings.beginning
+    free = Monitor(filters, forget, settle, size, even, weighted(even), rate, units=len(units), first=first)
+    squares = {group: partial(_mean_squares, free, run) for group, run in episodes.items()}
     largest = {
-        group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in squares(group)], axis=0), 1e-30))
-        for group in own
+        group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in of()], axis=0), 1e-30))
+        for group, of in squares.items()
     }
-    weights = weighted(steady(largest))
-    peaks = {group: [float(_decibels(p, weights).max()) for p in squares(group)] for group in own}
-    conditions = list(dict.fromkeys(condition for _, condition in own))
-    of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions}
-    loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
-    bound = bound_of_peaks(loudest, rate)
-    bounds = {
-        c: bound_of_peaks(p, rate) - bound for c, p in of.items() if len(conditions) > 1 and len(p) >= LEAST_SCORES
-    }
+    weights = weighted(steady(largest, settings))
+    peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
+    bound, bounds = _bounds(peaks, units, settings)
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
-    step = np.sqrt(np.nanmean([e.step_square() for e in episodes], axis=0))
-    moving = sum(e.moving(MOVING * step) for e in episodes)
-    alarms = sum(
-        _alarms(_decibels(p, weights) > bound) for group in own if max(peaks[group]) > bound for p in squares(group)
-    )
-    return replace(
-        free,
-        limits=limits,
-        weights=weights,
-        bounds=bounds,
-        hours=moving * observer.sample_period_s / 3600,
-        alarms=alarms,
-    )
+    step = np.sqrt(np.nanmean([e.step_square() for e in every], axis=0))
+    hours = sum(e.moving(settings.moving * step) for e in every) * observer.sample_period_s / 3600
+    loud = [p for group, of in squares.items() if max(peaks[group]) > bound for p in of()]
+    alarms = sum(_alarms(_decibels(p, weights) > bound) for p in loud)
+    return replace(free, limits=limits, weights=weights, bounds=bounds, hours=hours, alarms=alarms)
 
 
 @dataclass(frozen=True, eq=False)
-class _Task:
-    """Episodes of a unit in a condition, as an observer meets them."""
-
-    group: tuple[str, str]
-    observer: Observer
-    training: TrainingSet
-    settle: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Met:
-    """What an observer met in an episode: innovations and measurements, shape (n_samples, q), and which samples are judged."""
+class Judged:
+    """Innovations and measurements of an episode, shape (n_samples, q), and which samples are judged."""
 
     innovation: Array
     judged: npt.NDArray[np.bool_]
@@ -121,57 +103,74 @@ class _Met:
         return np.asarray(np.nanmean(np.diff(self.y, axis=0) ** 2, axis=0))
 
     def moving(self, least: Array) -> int:
-        """How many samples are judged in which some measurement makes a step of at least a size, shape (q,)."""
+        """Return how many judged samples have a step of at least a size, shape (q,), in some measurement."""
         return int(np.count_nonzero(self.judged[1:] & (np.abs(np.diff(self.y, axis=0)) > least).any(axis=-1)))
 
 
-def _tasks(observer: Observer, training: TrainingSet, settle: int) -> Iterator[_Task]:
-    """Take some episodes of some units."""
-    groups: dict[tuple[str, str], list[EpisodeKey]] = {}
-    for key in training.keys:
-        groups.setdefault((key.unit, key.condition), []).append(key)
-    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), UNITS))
-    for (unit, condition), keys in groups.items():
+def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[Group, TrainingSet]]:
+    """Take some episodes of some units, by unit and condition."""
+    groups = list(dict.fromkeys((key.unit, key.condition) for key in training.keys))
+    units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
+    for unit, condition in groups:
         if unit in units:
-            population, chosen = training.population.select([unit], [condition]), tuple(spread(keys, EPISODES))
-            own = replace(
-                training, population=population, keys=chosen, parameters={unit: training.parameters.get(unit, {})}
+            keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
+            population, parameters = training.population.select([unit], [condition]), training.parameters.get(unit, {})
+            chosen = tuple(spread(keys, settings.episodes))
+            yield (
+                (unit, condition),
+                replace(training, population=population, keys=chosen, parameters={unit: parameters}),
             )
-            yield _Task((unit, condition), observer, own, settle)
 
 
-def _met(task: _Task) -> list[_Met]:
+def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
     """Run the observer on episodes as the sensor shows them, and return those in which something is judged."""
-    observer, batch = task.observer, task.training.read_whole().batch
+    batch = training.read_whole().batch
     y = batch.measurements(observer.measured)
-    nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), task.settle)
-    every = [_Met(nu[:n, i].copy(), judged[:n, i].copy(), y[:n, i].copy()) for i, n in enumerate(batch.lengths)]
-    return [met for met in every if met.judged.any()]
+    nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
+    episodes = [Judged(nu[:n, i].copy(), judged[:n, i].copy(), y[:n, i].copy()) for i, n in enumerate(batch.lengths)]
+    return [episode for episode in episodes if episode.judged.any()]
+
+
+def _mean_squares(monitor: Monitor, episodes: Sequence[Judged]) -> list[Array]:
+    """Return mean squares of bands; they are computed wherever they are needed, all of them would fill a memory."""
+    return monitor.in_turn([(e.innovation, e.judged) for e in episodes])
 
 
 def _alarms(above: npt.NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(above[1:] & ~above[:-1]))
 
 
-def bound_of_peaks(peaks: Sequence[Sequence[float]], rate: float) -> float:
-    r"""Return what the highest level of one more unit, on as many motions of its own, exceeds with probability `rate`, in dB."""
+def _bounds(
+    peaks: Mapping[Group, list[float]], units: Sequence[str], settings: MonitorSettings
+) -> tuple[float, dict[str, float]]:
+    """Return the bound of levels over all conditions, dB, and what is added to it in every condition."""
+    conditions = list(dict.fromkeys(condition for _, condition in peaks))
+    loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
+    bound = bound_of_peaks(loudest, settings)
+    of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions if len(conditions) > 1}
+    return bound, {c: bound_of_peaks(p, settings) - bound for c, p in of.items() if len(p) >= LEAST_SCORES}
+
+
+def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings = DEFAULT) -> float:
+    r"""Return what the highest level of one more unit, on as many other motions, exceeds with the stated rate, dB."""
     from scipy.special import stdtrit
 
-    highest, shared = np.array([max(own) for own in peaks]), min(map(len, peaks))
+    rate = settings.false_alarm_rate
+    highest, shared = np.array([max(levels) for levels in peaks]), min(map(len, peaks))
     mean, bound = float(highest.mean()), float(prediction_bound(highest, rate))
-    if not 1 < shared < MOTIONS or bound <= mean:
+    if not 1 < shared < settings.motions or bound <= mean:
         return bound
-    every, half = np.array([own[:shared] for own in peaks]), shared // 2
+    every, half = np.array([levels[:shared] for levels in peaks]), shared // 2
     means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), half)}
     apart = [
         means[one] - means[other] for one in means for other in combinations(sorted({*range(shared)} - {*one}), half)
     ]
-    wider = stdtrit(shared - 1, 1 - rate) ** 2 - stdtrit(MOTIONS - 1, 1 - rate) ** 2
+    wider = stdtrit(shared - 1, 1 - rate) ** 2 - stdtrit(settings.motions - 1, 1 - rate) ** 2
     return mean + float(np.sqrt((bound - mean) ** 2 + wider * np.mean(np.square(apart))))
 
 
-def steady(largest: Mapping[tuple[str, str], Array]) -> Array:
-    """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition; largest (q, bands)."""
+def steady(largest: Mapping[Group, Array], settings: MonitorSettings = DEFAULT) -> Array:
+    """Return weights of levels, shape (q, bands), whose mean differs least from unit to unit of a condition."""
     from scipy.optimize import nnls
 
     by_condition: dict[str, list[Array]] = {}
@@ -180,11 +179,12 @@ def steady(largest: Mapping[tuple[str, str], Array]) -> Array:
     apart = np.concatenate([np.array(levels) - np.mean(levels, axis=0) for levels in by_condition.values()])
     covariance = apart.T @ apart / max(len(apart) - len(by_condition), 1)
     variance = np.diag(covariance)
-    floor = max(QUIETEST * float(np.median(variance)), 1e-12)
-    covariance = (1 - SHRINK) * covariance + np.diag(SHRINK * variance + np.maximum(floor - variance, 0.0))
+    floor = max(settings.quietest * float(np.median(variance)), 1e-12)
+    diagonal = settings.shrink * variance + np.maximum(floor - variance, 0.0)
+    covariance = (1 - settings.shrink) * covariance + np.diag(diagonal)
     root, large = np.linalg.cholesky(covariance).T, 1e3 * float(np.sqrt(np.trace(covariance)))
-    found, _ = nnls(np.vstack([root, np.full((1, len(root)), large)]), np.append(np.zeros(len(root)), large))
-    return np.asarray((found / found.sum()).reshape(next(iter(largest.values())).shape))
+    shares, _ = nnls(np.vstack([root, np.full((1, len(root)), large)]), np.append(np.zeros(len(root)), large))
+    return np.asarray((shares / shares.sum()).reshape(next(iter(largest.values())).shape))
 
 
 def weighted(shares: Array) -> Array:
@@ -196,7 +196,7 @@ def weighted(shares: Array) -> Array:
 
 
 def _decibels(mean_squares: Array, weights: Array) -> Array:
-    """Weighted means of levels, shape (n_samples,), of mean squares of shape (n_samples, q, bands): band by band, as they lie in memory."""
+    """Return weighted means of levels, shape (n_samples,), of mean squares (n_samples, q, bands), band by band."""
     level = np.zeros(len(mean_squares))
     for channel, band in np.argwhere(weights > 0):
         level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], 1e-30))
@@ -204,22 +204,18 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 
 
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:
-    """Return both rates of false alarms: of one more good unit as stated, an hour of motion as counted in training, with its 95 % interval."""
+    """Return both rates of false alarms: of one more good unit as stated, and an hour as counted, 95 % interval."""
     low, high = poisson_interval(monitor.alarms)
-    found = {
-        "false_alarm_rate": monitor.false_alarm_rate,
-        "units": monitor.units,
-        "hours": monitor.hours,
-        "alarms": monitor.alarms,
-    }
     per_hour = (None, None) if monitor.hours == 0 else (low / monitor.hours, high / monitor.hours)
-    return found | {"alarms_per_hour": per_hour, "settle_samples": monitor.settle}
+    names = ("false_alarm_rate", "units", "hours", "alarms")
+    facts = {name: getattr(monitor, name) for name in names}
+    return facts | {"alarms_per_hour": per_hour, "settle_samples": monitor.settle}
 
 
-def settling(observer: Observer) -> int:
-    """Return the samples in which what the observer began with is forgotten, by the slowest mode of its linear part."""
-    n, own, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
-    step = observer.one_step[:, [*range(n), *range(nl, nl + own)]]
+def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
+    """Return the samples in which a start is forgotten, by the slowest mode of the observer's linear part."""
+    n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
+    step = observer.one_step[:, [*range(n), *range(nl, nl + r)]]
     radius = float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
-    samples = SETTLE[1] if radius >= 1 else np.log(FORGOTTEN) / np.log(max(radius, 1e-9))
-    return int(np.clip(np.ceil(samples), *SETTLE)) + observer.runtime.delay
+    samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, 1e-9))
+    return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

@@ -1,26 +1,114 @@
-"""What every method of observer design gets, and what it returns."""
+"""What a method of observer design is, what it gets, and what it returns."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
-from ..observer import EstimatorSettings, Observer, Runtime
-from ..observer.limits import Limits, sides
-from ..observer.sensor import Sensors, delay_of
+from ..observer import Observer, ReliftCertificate, Runtime
+from ..observer.sensor import Limits, Sensors, delay_of, sides
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
-from .settings import SynthesisSettings
 from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
+FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
+
+
+@dataclass(frozen=True)
+class Method(ABC):
+    """One way to an observer; its options are fields."""
+
+    name: ClassVar[str]
+    assumes_disturbances: ClassVar[bool] = False  # chooses those that all observers of its models are certified for
+
+    def refusal(self, kind: str, kinds: Collection[str]) -> str:
+        """Return why the method is not used for one of some kinds of models; empty where it is."""
+        return ""
+
+    @abstractmethod
+    def design(self, task: DesignTask) -> Design:
+        """Design an observer, in channels divided by their ranges; raise `SynthesisError` with the reason."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Design:
+    """One observer with what is known about it, in the recordings' units.
+
+    Parameters
+    ----------
+    name : str
+        ``<kind of model>/<method>``.
+    observer : Observer
+    synthesis : Synthesis
+    facts : dict
+        What the metrics of a study say.
+    certificate : ReliftCertificate or None
+        Of the nonlinear observer that is deployed; its `certified` says whether it holds.
+    problem : ObserverProblem or None
+        The uncertain set with the disturbances that the method assumed, where these are its own.
+
+    Examples
+    --------
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
+    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50)
+    >>> design = kros.synthesize(uncertain, "kalman_tuned", methods=())
+    >>> design.observer.lifting.states, design.synthesis.status.value, design.facts["order"]
+    (('position', 'velocity', 'current'), 'optimal', 0)
+    """
+
+    name: str
+    observer: Observer
+    synthesis: Synthesis
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    certificate: ReliftCertificate | None = None
+    problem: ObserverProblem | None = None
+
+    def __repr__(self) -> str:
+        percent, known = self.facts.get("hidden_error_percent"), "certified" if self.certified else "not certified"
+        finite = percent is not None and np.isfinite(percent)
+        error = f"training error {percent:.3g} %" if finite else "diverges in training"
+        return f"<Design {self.name}: {self.facts.get('order')} states in the correction, {error}, {known}>"
+
+    @property
+    def certified(self) -> bool:
+        """Whether the observer is certified, for any machine and for recorded signals."""
+        stable = self.certificate is not None and self.certificate.certified
+        return stable and bool(self.facts.get("set_certified", True))
+
+    @property
+    def lower_bound(self) -> float | None:
+        """No observer of this kind has a smaller worst-case norm; None where nothing is proven."""
+        return self.synthesis.lower_bound if self.synthesis.worst_case_h2 is not None else None
+
+    def save(self, folder: Path | str) -> None:
+        """Write the observer, its synthesis and its certificate."""
+        folder = Path(folder)
+        self.observer.save(folder / "observer.json")
+        self.synthesis.save(folder / "synthesis")
+        if self.certificate is not None:
+            self.certificate.save(folder / "certificate")
+        save_artifact(folder, "design", {"name": self.name, "facts": self.facts})
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> Design:
+        """Read what `save` wrote."""
+        folder = Path(folder)
+        content, _ = load_artifact(folder, "design")
+        synthesis, proof = Synthesis.load(folder / "synthesis"), ReliftCertificate.load(folder / "certificate")
+        return cls(content["name"], Observer.load(folder / "observer.json"), synthesis, content["facts"], proof)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +116,16 @@ class DesignTask:
     """One observer to design, in channels divided by their ranges."""
 
     name: str
-    method: str
+    method: Method
     models: ModelSet
     unit: str
     problem: ObserverProblem | None
-    refusal: str
+    refusal: str  # why there is no problem
     noise: Array  # (q,)
     training: TrainingSet
+    recordings: TrainingSet
     covered: tuple[str, ...] = ()
-    max_order: int = 4
-    settings: SynthesisSettings = field(default_factory=SynthesisSettings)
-    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
     limits: Limits = field(default_factory=dict)
-    pooled: bool = True
-    recordings: TrainingSet | None = None
 
     def observer(
         self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None
@@ -64,22 +148,9 @@ class DesignTask:
             sensor=self.sensor,
         )
 
-    def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> DesignResult:
-        """Return the result of a method that corrects the nominal model; `problem` is the set that it was designed for, else the task's."""
-        return DesignResult(
-            self.name, self.observer(synthesis), synthesis, facts, self.problem if problem is None else problem
-        )
-
-    @property
-    def nominals(self) -> tuple[tuple[str, Array, Array], ...]:
-        """Names and models that may be the nominal: the unit, and the mean over the covered units."""
-        models, rows = self.models, [self.models.index(unit) for unit in self.covered]
-        unit = (self.unit, models.A[models.index(self.unit)], models.B[models.index(self.unit)])
-        return (
-            (unit, ("mean", models.A[rows].mean(axis=0), models.B[rows].mean(axis=0)))
-            if self.pooled and rows
-            else (unit,)
-        )
+    def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> Design:
+        """Return the design of a synthesis that corrects the nominal model."""
+        return Design(self.name, self.observer(synthesis), synthesis, facts, problem=problem)
 
     @property
     def sensor(self) -> Sensors:
@@ -88,63 +159,37 @@ class DesignTask:
 
     @property
     def runtime(self) -> Runtime:
-        """What observers have to know of the machine: that measurements arrive late, and its limits, which cut off estimates."""
+        """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
         lower, upper = sides(self.limits, self.models.lifting.states) if self.limits else (None, None)
-        return Runtime(delay_of(self.sensor), lower, upper, relift=False)
-
-    @property
-    def dynamics(self) -> Array:
-        """Dynamics of the nominal unit."""
-        return self.models.A[self.models.index(self.unit)]
+        return Runtime(delay_of(self.sensor), lower, upper)
 
     @property
     def selector(self) -> Array:
-        """Selects the measured states."""
+        """Matrix that selects the measured states."""
         return np.eye(self.models.lifting.n_lifted)[list(self.models.measured)]
 
     def require_problem(self) -> ObserverProblem:
-        """Return the uncertain set, or say that there is none."""
+        """Return the uncertain set, or say why there is none."""
         if self.problem is None:
             raise SynthesisError(self.refusal)
         return self.problem
 
-    def open_loop(self) -> Observer:
-        """Return the nominal model without correction."""
-        return self.observer(without_correction(self))
+    def open_loop(self) -> Synthesis:
+        """Return the synthesis that corrects nothing."""
+        models = self.models
+        controller = gain(np.zeros((models.lifting.n_lifted, len(models.measured))), models.sample_period_s)
+        return Synthesis("open_loop", controller, Status.OPTIMAL, Injection.STATE)
 
-    def ranked(self, observers: Sequence[Observer]) -> list[tuple[bool, float]]:
-        """Return the rank of every observer on the training episodes, see `validation.rank`; least is best."""
-        limit, *errors = self.training.read().percent_of_all([self.open_loop(), *observers])
-        return [rank(error, limit, self.models.measured) for error in errors]
-
-
-@dataclass(frozen=True, eq=False)
-class DesignResult:
-    """One observer in channels divided by their ranges, or the reason why there is none."""
-
-    name: str
-    observer: Observer | None
-    synthesis: Synthesis | None
-    facts: dict[str, Any]
-    problem: ObserverProblem | None = None
-    uncovered: str = ""
-
-
-def without_correction(task: DesignTask) -> Synthesis:
-    """Return the synthesis that corrects nothing."""
-    controller = gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s)
-    return Synthesis("open_loop", controller, Status.OPTIMAL, Injection.STATE)
-
-
-def first_of(ranks: Sequence[tuple[bool, float]]) -> int:
-    """Return which rank is the least, the first of equal ones."""
-    return min(range(len(ranks)), key=lambda i: ranks[i])
+    def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
+        """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
+        limit, *errors = self.training.read().percent_of_all([self.observer(self.open_loop()), *observers])
+        ranks = [rank(error, limit, self.models.measured) for error in errors]
+        first = min(range(len(ranks)), key=lambda i: ranks[i])
+        return first, ranks[first][1]
 
 
 def is_robust(facts: Mapping[str, Any]) -> bool:
-    """Tell from the facts about an observer whether it is certified for a set of machines: that around the nominal, or the one that it was designed for."""
-    if facts.get("set") == "signals":
-        return bool(facts.get("set_certified"))
+    """Return whether the facts about an observer hold a certificate for the set of plants."""
     return facts.get("worst_case_h2") is not None
 
 

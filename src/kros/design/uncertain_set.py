@@ -18,19 +18,16 @@ from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..synthesis.worst_case.unit_check import unit_ratios
 from ..uncertainty import UncertainModel
-from .settings import SynthesisSettings
-from .task import DesignResult, DesignTask
+from .task import FITTED, Design, DesignTask
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 
 
-def usable_problem(
-    models: ModelSet, uncertain: UncertainModel, noise: Array, settings: SynthesisSettings
-) -> tuple[ObserverProblem | None, str]:
+def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) -> tuple[ObserverProblem | None, str]:
     """Return the synthesis problem of one kind of model, or None and why there is none."""
     try:
-        problem = ObserverProblem.from_uncertain(models, uncertain, noise, correction_penalty=settings.penalty)
+        problem = ObserverProblem.from_uncertain(models, uncertain, noise)
         problem.require_sound()
         return problem, ""
     except SynthesisError as error:
@@ -38,61 +35,55 @@ def usable_problem(
         return None, str(error)
 
 
-def certificate(task: DesignTask, found: DesignResult, problem: ObserverProblem | None) -> dict[str, Any]:
+def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
     """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
-    observer, synthesis = found.observer, found.synthesis
-    assert observer is not None
-    assert synthesis is not None
+    observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
     facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
-    if found.uncovered:
-        return facts | {"reason": found.uncovered}
+    if design.facts.get("rows_fitted_to_single_steps"):
+        return facts | {"reason": FITTED}
     if problem is None:
         return facts | {"reason": task.refusal}
-    problem = replace(problem, injection=synthesis.injection)
+    problem = replace(problem, injection=design.synthesis.injection)
     try:
-        errors, mean = error_maps(task, found, problem)
+        errors, mean = error_maps(task, design, problem)
         loop = float(errors.spectral_radius())
         facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
         bound = certify_errors(problem, errors, mean)[0]
-        if observer.bank is not None:
+        if observer.bank is None:
+            facts |= of_units(task, design, problem)
+        else:
             facts["constant_h2"] = float(np.linalg.norm(mean))
             facts["worst_case_h2_attained"] = attained(problem, errors, mean)
             require_useful(problem, observer, bound)
-        facts["worst_case_h2"] = bound
-        return facts | (of_units(task, found, problem) if task.method == "worst_case_h2" else {})
+        return facts | {"worst_case_h2": bound}
     except SynthesisError as error:
         log.warning("%s: no certificate, %s", task.name, error)
         return facts | {"reason": str(error)}
 
 
 def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -> None:
-    """Refuse a bound that is no better than that of no estimate at all: inputs of the set are not related as recorded ones are."""
+    """Refuse a bound that is no better than that of no estimate: the set does not relate inputs as recordings do."""
     columns = len(observer.measured) + problem.nominal.n_outputs + problem.nominal.n_inputs
     nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
     without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
     if bound >= without:
-        raise SynthesisError(
-            f"the bound of the set is {bound:.3g} and that of no estimate {without:.3g}: the inputs of the set are independent, recorded ones are not."
-        )
+        both = f"the bound of the set is {bound:.3g} and that of no estimate {without:.3g}"
+        raise SynthesisError(f"{both}: the inputs of the set are independent, recorded ones are not.")
 
 
-def error_maps(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> tuple[StateSpace, Array]:
+def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tuple[StateSpace, Array]:
     """Return the system from what drives plants of the set to the weighted error of an observer, and the mean error."""
-    assert found.observer is not None
-    assert found.synthesis is not None
-    if found.observer.bank is None:
-        return problem.error_system(found.synthesis.controller), np.zeros(1)
-    outside = found.facts["outside_models_percent"]
-    estimate, mean = linear_estimate(found.observer, task.models.lifting, outside)
+    if design.observer.bank is None:
+        return problem.error_system(design.synthesis.controller), np.zeros(1)
+    estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
     weight = problem.performance.frequency_response([0.0])[0].real
     return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
 
 
-def of_units(task: DesignTask, found: DesignResult, problem: ObserverProblem) -> dict[str, Any]:
+def of_units(task: DesignTask, design: Design, problem: ObserverProblem) -> dict[str, Any]:
     """Return whether the bound holds for the models of all units."""
-    assert found.synthesis is not None
-    ratios = unit_ratios(problem, found.synthesis.controller, task.models.systems(task.covered))
+    ratios = unit_ratios(problem, design.synthesis.controller, task.models.systems(task.covered))
     of_norm, of_density = (float(ratio.max(initial=0.0)) for ratio in ratios)
     if of_norm > 1:
         log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, of_norm)

@@ -6,8 +6,8 @@ Examples
 >>> from kros.evaluate import error_percent, error_rms
 >>> recorded = np.array([0.0, 2.0, -4.0]).reshape(3, 1, 1)  # sample, episode, channel
 >>> estimated, lengths = recorded + 0.1, np.array([3])
->>> error_rms(estimated, recorded, lengths).round(9).tolist(), error_percent(estimated, recorded, lengths).round(9).tolist()
-([[0.1]], [[2.5]])
+>>> [error(estimated, recorded, lengths).round(9).tolist() for error in (error_rms, error_percent)]
+[[[0.1]], [[2.5]]]
 """
 
 from ..core.removed import refusing

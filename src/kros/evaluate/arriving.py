@@ -18,7 +18,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Arriving:
-    """Some episodes as they arrive: measurements y, shape (n_samples, batch, q), and inputs u, shape (n_samples, batch, m)."""
+    """Episodes as they arrive: y (n_samples, batch, q), and u (n_samples, batch, m)."""
 
     batch: EpisodeBatch
     y: Array

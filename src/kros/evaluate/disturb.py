@@ -1,8 +1,8 @@
-"""Disturbed measurements: what an observer gets when the sensor, the line or the calibration is worse than in the recordings.
+"""Disturbed measurements: a sensor, line or calibration worse than in the recordings.
 
-The batch of episodes is repeated for every disturbance, disturbance outermost, so that observers run on all of them in one pass. Disturbances
-of one kind share their random draws (the samples that are lost at 5 % are lost at 10 %, too), so that errors over severity are smooth.
-Estimates are compared with the recordings as they are.
+The batch of episodes is repeated for every disturbance, disturbance outermost, so that observers run on all of them in
+one pass. Disturbances of one kind share their random draws (the samples that are lost at 5 % are lost at 10 %, too), so
+that errors over severity are smooth. Estimates are compared with the recordings as they are.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ class Kind(str, Enum):
     DROPPED
         Single samples are missing at random: share of samples, 0 to 1.
     GAP
-        Samples are missing in pieces of so many samples, at random places, a tenth of all samples and at least one piece an episode.
+        Samples are missing in pieces of this many samples, at random places, a tenth of all samples and at least one
+        piece an episode.
     BIAS
         A constant is added to every measurement: share of its largest value.
     QUANTISATION
@@ -38,7 +39,7 @@ class Kind(str, Enum):
     PHASE
         The machine's lifting parameter is wrong, by so much in its own unit, rad for a phase.
     DELAY
-        Measurements are delayed by so many samples, unknown to the observer.
+        Measurements are delayed by this many samples, unknown to the observer.
 
     Examples
     --------
@@ -129,7 +130,8 @@ class Measured:
     def __post_init__(self) -> None:
         if self.y.ndim != 3 or self.size.shape != self.y.shape[2:]:
             raise DimensionError(
-                f"Measurements {self.y.shape} should be (n_samples, batch, q), with a range for each, found {self.size.shape}."
+                f"Measurements {self.y.shape} should be (n_samples, batch, q), with a range for each, found "
+                f"{self.size.shape}."
             )
 
     def under(self, disturbances: Sequence[Disturbance | None], seed: int = 0) -> Measured:

@@ -8,12 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..loops import library
-
 Array = npt.NDArray[np.float64]
 START = 50  # samples in which an observer finds out what it does not know at first
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
-_TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache, five times as fast as all at once
+_TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache
 _TURNED = 256  # samples of all signals that are put in order at once: they stay in the cache
 
 
@@ -47,69 +45,27 @@ def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt:
 
 def summarise_all(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
     """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), otherwise as `summarise`."""
-    loops, n = library(), truth.shape[2]
     with np.errstate(over="ignore", invalid="ignore"):
-        if loops is None:
-            return [_summary(estimate[..., :n], truth, lengths, dt) for estimate in estimates]
-        x = estimates.transpose(1, 0, 3, 2)
-        (samples, count, states, batch), turn = x.shape, 2 * np.pi * np.arange(_SEGMENT) / _SEGMENT
-        largest, squares, powers = (
-            np.empty((n, batch)),
-            np.empty((count, n, 2, batch)),
-            np.empty((count, n, _SEGMENT // 2 + 1, batch)),
-        )
-        job = {
-            "samples": samples,
-            "estimates": count,
-            "states": states,
-            "n": n,
-            "batch": batch,
-            "begun": START,
-            "lengths": lengths,
-        }
-        job |= {
-            "x": x,
-            "truth": truth.swapaxes(1, 2),
-            "window": _window(_SEGMENT),
-            "turns": np.stack([np.cos(turn), np.sin(turn)], axis=-1),
-        }
-        loops.call("kros_errors", ("error_job", job | {"largest": largest, "squares": squares, "powers": powers}))
-        spectra = np.moveaxis(_density(np.moveaxis(powers, 2, -1), _window(_SEGMENT), _SEGMENT, dt), (2, 1), (1, 3))
-        for row in np.flatnonzero(lengths < _SEGMENT):
-            own = slice(None, lengths[row])
-            spectra[:, row] = error_spectrum(estimates[:, own, row, :n] - truth[own, row], dt, axis=1)[1]
-    sums = np.moveaxis(squares, 1, -1)  # (estimate, 2, batch, n)
-    return [_of_squares(*own, largest.T, lengths, dt) for own in zip(sums, spectra, strict=True)]
+        return [_summary(estimate[..., : truth.shape[2]], truth, lengths, dt) for estimate in estimates]
 
 
 def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
-    """`summarise` where nothing is compiled."""
     error = _signals(estimate, truth)
-    for own, length in zip(error, lengths, strict=True):
-        own[:, length:] = 0.0
+    for signals, length in zip(error, lengths, strict=True):
+        signals[:, length:] = 0.0
     spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
     for length in np.unique(lengths):
         episodes = np.flatnonzero(lengths == length)
         for rows in np.split(episodes, range(_TOGETHER, len(episodes), _TOGETHER)):
             spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
-    squares = np.stack([np.einsum("bns,bns->bn", part, part) for part in (error[..., :START], error)])
-    return _of_squares(squares, spectra, _largest(truth, lengths), lengths, dt)
-
-
-def _of_squares(
-    squares: Array, spectra: Array, largest: Array, lengths: npt.NDArray[np.int64], dt: float
-) -> ErrorSummary:
-    """The summary of sums of squares of the start and the whole, shape (2, batch, n), and largest values, shape (batch, n)."""
-    first, whole = squares
-    rest = np.maximum(whole - first, 0.0)
+    first, whole = (np.einsum("bns,bns->bn", part, part) for part in (error[..., :START], error))
     counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
-    rms, start, behind = (
-        np.sqrt(sums / count[:, None]) for sums, count in zip((whole, first, rest), counts, strict=True)
-    )
-    percent, of_start, of_rest = (_percent(values, largest) for values in (rms, start, behind))
-    return ErrorSummary(
-        rms, percent, of_start, of_rest, spectra, np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
-    )
+    squares = (whole, first, np.maximum(whole - first, 0.0))
+    rms = [np.sqrt(sums / count[:, None]) for sums, count in zip(squares, counts, strict=True)]
+    largest = _largest(truth, lengths)
+    freqs = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
+    percent, start, rest = (_percent(values, largest) for values in rms)
+    return ErrorSummary(rms[0], percent, start, rest, spectra, freqs)
 
 
 def _signals(estimate: Array, truth: Array) -> Array:
@@ -140,7 +96,7 @@ def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> 
 
 
 def error_percent(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero; arguments as in `summarise`.
+    """Return ``100 rms(x_hat - x) / max|x|`` of every episode, shape (batch, n), NaN for a state at zero.
 
     Examples
     --------
@@ -167,7 +123,7 @@ def _percent(rms: Array, largest: Array) -> Array:
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
-    """Return Welch's estimate of the error's power spectral density: Hann windows, half overlapping, each without its mean.
+    """Return Welch's estimate of the error's power spectral density: half overlapping Hann windows.
 
     Parameters
     ----------
@@ -203,7 +159,7 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
 
 
 def _window(size: int) -> Array:
-    """Hann's, of so many samples."""
+    """Hann's window."""
     return np.asarray(0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size))
 
 

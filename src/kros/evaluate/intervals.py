@@ -60,7 +60,7 @@ def _interval(means: Array) -> tuple[Array, Array]:
 
 
 def mean_intervals(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal") -> dict[Cell, tuple[float, float]]:
-    """Return the 95 % interval of the mean error over units, by observer, condition and channel; the same resampled units for all."""
+    """Return the 95 % interval of the mean error over units, by observer, condition and channel."""
     found: dict[Cell, dict[str, float | None]] = {}
     for row in rows:
         if row["role"] == role:

@@ -1,11 +1,12 @@
 """What the errors of units that took part in nothing say about the next one: split conformal prediction.
 
-Of ``n`` units that nothing was made from, and one more that is exchangeable with them, every order of their errors is equally likely. So the
-error of the next unit is at most the ``ceil(confidence (n + 1))``-th smallest of theirs with a probability of at least ``confidence``, whatever
-their distribution, the observer or the plant. Several errors are bounded together by the largest one relative to a scale that was fixed before.
+Of ``n`` units that nothing was made from, and one more that is exchangeable with them, every order of their errors is
+equally likely. So the error of the next unit is at most the ``ceil(confidence (n + 1))``-th smallest of theirs with a
+probability of at least ``confidence``, whatever their distribution, the observer or the plant. Several errors are
+bounded together by the largest one relative to a scale that was fixed before.
 
-Source: V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, Springer 2005, section 4.2; H. Papadopoulos et al., Inductive
-Confidence Machines for Regression, ECML 2002.
+Source: V. Vovk, A. Gammerman and G. Shafer, Algorithmic Learning in a Random World, Springer 2005, section 4.2; H.
+Papadopoulos et al., Inductive Confidence Machines for Regression, ECML 2002.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ _ROUNDING = 1e-9  # 0.9 / (1 - 0.9) is a little more than 9
 
 
 def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
-    """Draw units that take part in nothing, by place alone, in the order of `units`; more of them include those that fewer would be."""
+    """Draw units that take part in nothing, by place alone; more of them include fewer."""
     drawn = np.random.default_rng(seed).permutation(len(units))[:n]
     return tuple(units[i] for i in sorted(drawn))
 
 
 def fewest_units(confidence: float) -> int:
-    """Return how many units bound the next one at all with some confidence: ``1 / (1 - confidence) - 1``, rounded up."""
+    """Return how many units bound the next one: ``1 / (1 - confidence) - 1``, rounded up."""
     return ceil(confidence / (1 - confidence) - _ROUNDING)
 
 
@@ -39,7 +40,8 @@ def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: flo
     Parameters
     ----------
     errors : array_like, shape (unit, k)
-        Of units that nothing was made from, exchangeable with each other and with the next; what is not finite counts as infinite.
+        Of units that nothing was made from, exchangeable with each other and with the next; what is not finite counts
+        as infinite.
     scale : array_like, shape (k,)
         Positive, and fixed without a look at these units: errors divided by it are compared with each other.
     confidence : float

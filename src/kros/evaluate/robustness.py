@@ -1,4 +1,4 @@
-"""Errors against severity: estimators on disturbed measurements of a few episodes, compared with the recordings as they are."""
+"""Errors against severity: estimators on disturbed measurements of a few episodes."""
 
 from __future__ import annotations
 
@@ -38,8 +38,10 @@ class DisturbedEpisodes:
     >>> from kros.evaluate import Disturbance, DisturbedEpisodes
     >>> arrays = {unit: [np.random.default_rng(0).normal(size=(50, 2))] for unit in ("a", "b")}
     >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
-    >>> episodes = DisturbedEpisodes(kros.data.EpisodeBatch.read(population, population.keys()), (0,), (Disturbance("bias", 0.1),))
-    >>> episodes.errors(lambda given, inputs: given.y[None]).round(1).tolist()  # with the measurement as the estimate: disturbance, episode, state
+    >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
+    >>> episodes = DisturbedEpisodes(batch, (0,), (Disturbance("bias", 0.1),))
+    >>> # with the measurement as the estimate: disturbance, episode, state
+    >>> episodes.errors(lambda given, inputs: given.y[None]).round(1).tolist()
     [[[[0.0], [0.0]], [[10.0], [10.0]]]]
     """
 
@@ -60,15 +62,16 @@ class DisturbedEpisodes:
         Parameters
         ----------
         run : callable
-            Takes measurements and inputs (n_samples, batch, m) and returns the estimates of every estimator, shape (estimator, n_samples, batch, ...);
-            states beyond the recorded ones are left out.
+            Takes measurements and inputs (n_samples, batch, m) and returns the estimates of every estimator, shape
+            (estimator, n_samples, batch, ...); internal states are left out.
         estimators : int
             How many `run` returns, which limits what is run at once.
 
         Returns
         -------
         ndarray, shape (estimator, 1 + disturbance, batch, n)
-            ``100 rms(x_hat - x) / max|x|``; first of the measurements as they are. Not finite where an estimate diverged or there is none.
+            ``100 rms(x_hat - x) / max|x|``; first of the measurements as they are. Not finite where an estimate
+            diverged or there is none.
         """
         batch, given = self.batch, self.given
         n, pieces = batch.states.shape[-1], []
@@ -97,7 +100,7 @@ def robustness_rows(
     channels: Sequence[str],
     estimated: Sequence[int] | None = None,
 ) -> list[dict[str, Any]]:
-    """Return a row for every disturbance, severity, condition and channel: mean and worst unit of `DisturbedEpisodes.errors`, first draws alone.
+    """Return a row a disturbance, severity, condition and channel: mean and worst unit, first draws alone.
 
     Parameters
     ----------
@@ -112,7 +115,8 @@ def robustness_rows(
     Returns
     -------
     list of dict
-        ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate diverged.
+        ``disturbance`` is "none" and ``severity`` 0 for the measurements as they are; errors are None where an estimate
+        diverged.
 
     Examples
     --------
@@ -121,8 +125,10 @@ def robustness_rows(
     >>> from kros.evaluate import Disturbance, DisturbedEpisodes, robustness_rows
     >>> arrays = {unit: [np.random.default_rng(0).normal(size=(50, 2))] for unit in ("a", "b")}
     >>> population = kros.from_arrays(arrays, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
-    >>> episodes = DisturbedEpisodes(kros.data.EpisodeBatch.read(population, population.keys()), (0,), (Disturbance("bias", 0.1),))
-    >>> rows = robustness_rows("measurement", episodes.errors(lambda given, inputs: given.y[None])[0], episodes, population.states)
+    >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
+    >>> episodes = DisturbedEpisodes(batch, (0,), (Disturbance("bias", 0.1),))
+    >>> errors = episodes.errors(lambda given, inputs: given.y[None])[0]
+    >>> rows = robustness_rows("measurement", errors, episodes, population.states)
     >>> [(row["disturbance"], row["severity"]) for row in rows]
     [('none', 0.0), ('bias', 0.1)]
     """

@@ -1,6 +1,7 @@
-"""Recordings as the sensor that was declared shows them: the one place where training, tuning and held-out episodes get their disturbed measurements.
+"""Recordings as the declared sensor shows them, for training, tuning and held-out episodes.
 
-Random draws belong to an episode, by its key: they are the same in whatever batch it is, however short it is cut, and in whatever units.
+Random draws belong to an episode, by its key: they are the same in whatever batch it is, however short it is cut, and
+in whatever units.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ def as_shown(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str], seed: 
 
 
 def as_arriving(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str]) -> EpisodeBatch:
-    """Return recordings as they arrive at an observer that was told of a sensor: as late as declared, nothing else added; arguments as in `as_shown`."""
+    """Return recordings as late as declared, nothing else added; arguments as in `as_shown`."""
     return as_shown(batch, {name: Sensor(delay_samples=own.delay_samples) for name, own in sensor.items()}, states)
 
 
 def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> tuple[Array, Array, Array]:
-    """Draw moments of measurement and noise, both Gaussian, and chances of arrival, shape (n_samples, batch) each: streams that a longer episode goes on."""
+    """Draw moments, noise and chances of arrival, (n_samples, batch) each; longer episodes go on."""
     found = np.empty((3, n_samples, len(keys)))
     for i, key in enumerate(keys):
         own = crc32("\0".join((key.unit, key.condition, key.episode)).encode())
@@ -49,7 +50,7 @@ def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> t
 
 
 def _late(y: Array, behind: Array) -> Array:
-    """Values of signals, shape (n_samples, batch), so many samples ago; between samples on a line, before the first as the first."""
+    """Delayed values of signals, (n_samples, batch), on a line between samples."""
     at = np.clip(np.arange(len(y))[:, None] - behind, 0, len(y) - 1)
     low = np.floor(at).astype(int)
     share = at - low

@@ -1,7 +1,8 @@
 """Errors against what states really were, and how late a signal is.
 
-A recorded state may itself be an estimate: a drive's velocity is a filtered difference of positions, which trails. An observer that was made to
-agree with the recording then trails as well, and its error against the recording does not show it; error and lag against the truth do.
+A recorded state may itself be an estimate: a drive's velocity is a filtered difference of positions, which trails. An
+observer that was made to agree with the recording then trails as well, and its error against the recording does not
+show it; error and lag against the truth do.
 """
 
 from __future__ import annotations
@@ -88,9 +89,10 @@ def true_errors(
 def delay_samples(signals: Array, truths: Array) -> Array:
     """Return the delay of truths that fits signals best in the least-squares sense.
 
-    Minimises ``J(d) = sum_k (y_k - x_{k-d})^2`` over a window of samples that is the same for all `d`, so that the ends of an episode favour no delay.
-    All whole `d` are computed at once, ``J(d) = sum y^2 - 2 sum y_k x_{k-d} + sum x_{k-d}^2``, by FFT and running sums; the least one and its
-    neighbours are interpolated by a parabola, which for a signal sampled `s` times a period misses by about ``0.06 (2 pi / s)^2`` samples at most.
+    Minimises ``J(d) = sum_k (y_k - x_{k-d})^2`` over a window of samples that is the same for all `d`, so that the ends
+    of an episode favour no delay. All whole `d` are computed at once, ``J(d) = sum y^2 - 2 sum y_k x_{k-d} + sum
+    x_{k-d}^2``, by FFT and running sums; the least one and its neighbours are interpolated by a parabola, which for a
+    signal sampled `s` times a period misses by about ``0.06 (2 pi / s)^2`` samples at most.
     """
     from scipy.fft import irfft, next_fast_len, rfft
 

@@ -1,9 +1,10 @@
-"""Names from recordings and files as they stand in what is generated: comments of C, CMake, Markdown and XML, and identifiers of C."""
+"""Names from recordings as they stand in generated text: comments, Markdown, XML, identifiers of C."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 from ..core.errors import ConfigError
 
@@ -18,8 +19,8 @@ _C_WORDS = re.compile(
 def plain(text: object) -> str:
     """Return a text of which nothing is more than text in C, CMake, Markdown and XML.
 
-    Letters, digits, blanks and ``_-.,:;+()[]%/^=@°·²³`` stay, ``*`` becomes ``·``, anything else ``_``: so no comment ends, no line is continued, no
-    trigraph, quote, tag or change of the writing direction is left.
+    Letters, digits, blanks and ``_-.,:;+()[]%/^=@°·²³`` stay, ``*`` becomes ``·``, anything else ``_``: so no comment
+    ends, no line is continued, no trigraph, quote, tag or change of the writing direction is left.
 
     Examples
     --------
@@ -27,8 +28,8 @@ def plain(text: object) -> str:
     >>> plain("N*m"), plain("x */ system(0) /*")
     ('N·m', 'x ·/ system(0) /·')
     """
-    shown = "".join(c if c.isalnum() or c in _ALLOWED else "·" if c == "*" else "_" for c in str(text)[:_LONGEST])
-    return shown or "_"
+    shown = str(text)[:_LONGEST].replace("*", "·")
+    return "".join(c if c.isalnum() or c in _ALLOWED else "_" for c in shown) or "_"
 
 
 def plain_names(names: Iterable[str]) -> list[str]:
@@ -43,7 +44,8 @@ def plain_names(names: Iterable[str]) -> list[str]:
     shown = [plain(name) for name in names]
     if len(set(shown)) < len(names):
         raise ConfigError(
-            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels by letters and digits."
+            f"Export: the names {', '.join(map(repr, names))} cannot be told apart in generated code; rename channels "
+            "by letters and digits."
         )
     return shown
 
@@ -58,6 +60,15 @@ def require_identifier(name: str, what: str = "name") -> str:
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name, flags=re.ASCII) or _C_WORDS.fullmatch(name):
         raise ConfigError(
-            f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that begins with a letter, and no word of C."
+            f"Export to C: the {what} {name!r} should be a C identifier of letters, digits and underscores that "
+            "begins with a letter, and no word of C."
         )
     return name
+
+
+def rendered(package: str, files: Mapping[str, str], context: Mapping[str, Any]) -> dict[str, str]:
+    """Return the text of every file, by its name and that of its template in a package."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(loader=PackageLoader(package), undefined=StrictUndefined, keep_trailing_newline=True)
+    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in files.items()}

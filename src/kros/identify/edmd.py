@@ -35,7 +35,8 @@ class AlphaSearch:
     per_decade: int = 10  # values, from where every model is stable downwards
     decades: int = 14  # below the largest squared singular value of the data, which double precision resolves
     bisections: int = 30  # between the last two values, which leave 1e-10 of the coefficient
-    doublings: int = 12  # of alpha_factor, at most, until the models of the units are alike
+    factor: float = 4.0  # how far alpha is above the smallest coefficient that stabilises every model, at least
+    doublings: int = 12  # of the factor, at most, until the models of the units are alike
     points: int = 60  # frequencies at which the models of the units are compared
 
 

@@ -70,7 +70,7 @@ def identify(
     work : Work, optional
         Where it runs.
     **settings
-        Of `IdentifySettings`: ``alpha``, ``alpha_factor``, ``refine``.
+        Of `IdentifySettings`: ``alpha``, ``refine``.
 
     Returns
     -------
@@ -237,8 +237,8 @@ class _Reduced:
         rows = self.pooled if self.pooled.any() else slice(None)
         triangles = [m.ranges.triangles(factor.R[rows]) for m, factor in zip(sets, factors, strict=True)]
         shared = [(R, m.lifting.n_lifted) for R, m in zip(triangles, sets, strict=True)]
-        edge, times = smallest_stabilising_alpha(shared), settings.alpha_factor
-        times = alpha_factor(shared, edge, times) if self.feeds_synthesis else times
+        edge = smallest_stabilising_alpha(shared)
+        times = alpha_factor(shared, edge) if self.feeds_synthesis else AlphaSearch().factor
         note = (
             "%s: alpha = %.4g for channels divided by their ranges, %g times the smallest that stabilises every model"
         )
@@ -281,17 +281,15 @@ def _with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, factor
     return replace(start, name=name, A=matrices.A, B=matrices.B, residual_covariance=covariance, status=status)
 
 
-def alpha_factor(
-    shared: list[tuple[Array, int]], edge: float, smallest: float, search: AlphaSearch | None = None
-) -> float:
+def alpha_factor(shared: list[tuple[Array, int]], edge: float, search: AlphaSearch | None = None) -> float:
     """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
     search, limit = search or AlphaSearch(), 20 * np.log10(RefineOptions().largest_residual)
     for doubled in range(search.doublings if edge > 0 else 0):
-        factor = smallest * 2.0**doubled
+        factor = search.factor * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
         if not any(peak_residual_db(m.A, m.B, search.points) > limit for m in models):
             return factor
-    return smallest
+    return search.factor
 
 
 def require_stable(models: ModelSet, pooled: npt.NDArray[np.bool_]) -> None:

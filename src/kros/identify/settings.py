@@ -43,7 +43,7 @@ class CalibrationSettings(Settings):
 
 
 class IdentifySettings(Settings):
-    """Regularisation; ``auto`` is `alpha_factor` times the smallest coefficient that stabilises every model.
+    """Regularisation; ``auto`` is a multiple of the smallest coefficient that stabilises every model, see `AlphaSearch`.
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
     population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one
@@ -55,9 +55,6 @@ class IdentifySettings(Settings):
     alpha: float | Literal["auto"] = Field(
         "auto",
         description="regularisation of channels divided by their ranges; a number: of recorded units, as in the paper",
-    )
-    alpha_factor: float = Field(
-        4.0, ge=1, description="how far alpha = auto is above the smallest coefficient that stabilises every model"
     )
     refine: bool = Field(True, description="models refined on their free-run error, beside those of the paper's recipe")
 

@@ -26,7 +26,7 @@ except ImportError as error:
 
 @dataclass(frozen=True, eq=False)
 class UncertaintyForControl:
-    """A nominal and weights as python-control systems: every model is in the set of the form with ``E = left Delta right``, ``||Delta|| <= 1``.
+    """A nominal and weights: models have ``E = left Delta right``, ``||Delta|| <= 1`` in the form.
 
     Parameters
     ----------
@@ -76,10 +76,12 @@ def to_control(
     Parameters
     ----------
     system : StateSpace
-        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its ``dt`` is zero.
+        Of `kros.core`, for example the controller of a `kros.synthesis` result; discrete, or continuous where its
+        ``dt`` is zero.
     name : str, optional
     states, inputs, outputs : sequence of str, optional
-        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes ``0·5*x``.
+        Names of the signals; python-control's own where absent. It allows no dots in names: ``0.5*x`` becomes
+        ``0·5*x``.
 
     Returns
     -------
@@ -95,7 +97,8 @@ def to_control(
     --------
     >>> from kros.core import StateSpace
     >>> from kros.interop import from_control, to_control
-    >>> system = to_control(StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01), states=["position"], inputs=["target"])
+    >>> lag = StateSpace([[0.5]], [[1.0]], [[1.0]], [[0.0]], 0.01)
+    >>> system = to_control(lag, states=["position"], inputs=["target"])
     >>> system.state_labels, system.input_labels, system.dt
     (['position'], ['target'], 0.01)
     >>> from_control(system).A
@@ -116,13 +119,13 @@ def to_control(
                 f"to_control: {counts[kind]} {kind} need as many different names, found {names!r}; correct the list."
             )
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
-    # Copies: python-control changes matrices in place where it is asked to. States that do nothing stay, since they carry names.
+    # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
     return control.StateSpace(*matrices, system.dt, remove_useless_states=False, name=name and _label(name), **labels)
 
 
 def from_control(system: Any) -> StateSpace:
-    """Return a system of python-control as a system of kros, discrete or continuous (``dt`` zero); names of signals are not kept.
+    """Return a system of python-control as one of kros, continuous where ``dt`` is zero.
 
     Parameters
     ----------
@@ -153,7 +156,8 @@ def from_control(system: Any) -> StateSpace:
         )
     if system.dt is None or system.dt is True:
         raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, C, D, 0.001), or 0."
+            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
+            "C, D, 0.001), or 0."
         )
     if isinstance(system, control.TransferFunction):
         return _realised(system)
@@ -224,7 +228,8 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     unknown = [unit for unit in asked if unit not in models.unit_ids]
     if unknown or isinstance(units, str):
         raise DimensionError(
-            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the list."
+            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the "
+            "list."
         )
     systems = models.systems(asked)
     names = models.lifting.names
@@ -235,7 +240,7 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
 
 
 def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
-    """Return the nominal and the weights of an uncertain model as `control.StateSpace`, a nominal response as `control.FRD`.
+    """Return nominal and weights as `control.StateSpace`, a nominal response as `control.FRD`.
 
     Examples
     --------
@@ -279,5 +284,5 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
 
 
 def _label(name: str) -> str:
-    """Return a name without dots, which separate system and signal in python-control: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
+    """Return a name without dots, which separate system and signal: ``sin(0·5*x)`` for ``sin(0.5*x)``."""
     return name.replace(".", "·")

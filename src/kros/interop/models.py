@@ -18,7 +18,7 @@ def quantify_models(
     freqs_hz: npt.ArrayLike | None = None,
     **options: Any,
 ) -> UncertaintyForControl:
-    """Quantify how models of python-control differ from a nominal one: `kros.uncertainty.quantify`, with systems of python-control as result.
+    """Quantify how models of python-control differ from a nominal one.
 
     Parameters
     ----------

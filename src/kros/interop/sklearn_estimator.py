@@ -61,7 +61,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Whether the first column of an array is the episode, a number.
     horizon : int or None
         `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the
-        free run of the whole episode from its first state.
+        simulation of the whole episode from its first state.
 
     Notes
     -----

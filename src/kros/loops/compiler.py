@@ -30,7 +30,7 @@ def find_compiler() -> str | None:
 
 
 def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
-    """Return a C source as a library, compiled once for this user on this machine; None where that cannot be, with one log entry."""
+    """Return a C source as a library, compiled once on this machine; None where that cannot be."""
     compiler = find_compiler()
     if compiler is None:
         _log.info(
@@ -55,7 +55,7 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
 
 
 def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS, cwd: str | None = None) -> str:
-    """Run a compiler, or what it made, in a process group that ends in time; return what it printed, whatever its bytes.
+    """Run a tool in a process group that ends in time; return what it printed, whatever its bytes.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def _digest(source: str, flags: tuple[str, ...], compiler: str) -> str:
 
 
 def _folders() -> Iterator[Path]:
-    """Folders to compile into that belong to this user alone: nobody else may put a library there."""
+    """Folders to compile into that belong to this user alone: no other may put a library there."""
     folders = [Path(tempfile.gettempdir()) / f"kros-{os.getuid()}"]
     with contextlib.suppress(RuntimeError):  # a user without a home
         cache = os.environ.get("XDG_CACHE_HOME")

@@ -72,7 +72,7 @@ class Library:
 
 @cache
 def library() -> Library | None:
-    """Return the compiled loops; None where NumPy takes their place: ``KROS_LOOPS=numpy``, or no compiler that works."""
+    """Return the compiled loops; None with ``KROS_LOOPS=numpy``, or without a compiler that works."""
     choice = os.environ.get(CHOICE, CHOICES[0])
     if choice not in CHOICES:
         raise ConfigError(f"{CHOICE}={choice}: should be one of {', '.join(CHOICES)}.")

@@ -43,7 +43,6 @@ typedef struct {
     whole late;        /* measurements are so many samples old, and so are the inputs of their time */
     whole overwrite;   /* measurements take the place of estimates before these are lifted */
     whole begins;
-    whole width;       /* of the corrections that have limits; 0 where none has */
     const double *map;        /* (observers, n + order, n_lifted + order + n_inputs + q) */
     const double *y;          /* (samples, q, batch); none where nothing is measured */
     const double *u;          /* (samples, m, batch) */
@@ -52,15 +51,8 @@ typedef struct {
     const int32_t *begin;     /* (samples, batch): one more than the row of `begun` that a machine starts from; none */
     const double *begun;      /* (observers, begins, n) */
     const int32_t *pending;   /* (samples, batch): samples between a state and its row; with `before` alone */
-    const double *lower;      /* (n, batch); none where estimates go on without limits */
-    const double *upper;
-    const double *limit;      /* (width): largest corrections */
-    const double *limit_c;    /* (width, order) */
-    const double *limit_d;    /* (width, q) */
-    const double *into;       /* (n, width) */
     const double *low;        /* (observers, n + order): bounds beyond which a machine waits for a start; none */
     const double *high;
-    const double *origin;     /* (n, batch): what states are relative to; none */
     uint8_t *waiting;         /* (observers, batch), moved on */
     uint8_t *restart;         /* (observers, batch): whether a machine ever waited */
     double *column;           /* (observers, columns, batch): x and c in their rows, moved on */
@@ -115,51 +107,6 @@ typedef struct {
     const int32_t *slope;     /* (slopes, 3): lifted function, state, register */
     double *states;           /* (samples, filters, n, batch) */
 } kalman_job;
-
-/* Signals, samples last, through 1 / (q + a1 + a2 / q), at rest before: held[k] = x[k - 1] - a1 held[k - 1] - a2 held[k - 2]. */
-typedef struct {
-    whole signals;
-    whole samples;
-    whole every;
-    const double *poles;      /* (2): a1 and a2 */
-    const double *x;          /* (signals, samples) */
-    const double *rest;       /* (signals): x before */
-    double *now;              /* (signals, samples / every): held at every so many samples */
-    double *before;           /* one sample before them; none */
-} filter_job;
-
-/* Monitors of machines that start together: mean squares of the bands of innovations; see kros.observer.monitor. */
-typedef struct {
-    whole machines;
-    whole samples;
-    whole q;
-    whole bands;
-    const double *nu;         /* (samples, machines, q) */
-    const uint8_t *judged;    /* (samples, machines): the others hold what was */
-    const double *filters;    /* (bands, 3) */
-    const double *size;       /* (q): what innovations are divided by */
-    const double *gains;      /* (2): share that the first sample replaces, and the last one */
-    const double *largest;    /* (1): sizes beyond which more says nothing, and what is not a number counts as */
-    double *squares;          /* (machines, q, bands, samples) */
-} monitor_job;
-
-/* Errors of estimates and their spectra by Welch's method: see kros.evaluate.errors. */
-typedef struct {
-    whole samples;
-    whole estimates;
-    whole states;      /* of estimates: those with a truth, and memories behind them */
-    whole n;
-    whole batch;
-    whole begun;       /* samples that are the start */
-    const double *x;          /* (samples, estimates, states, batch) */
-    const double *truth;      /* (samples, n, batch) */
-    const whole *lengths;     /* (batch): samples that count */
-    const double *window;     /* (SEGMENT) */
-    const double *turns;      /* (SEGMENT, 2): cosines and sines of fractions of a turn */
-    double *largest;          /* (n, batch): absolute values of truths */
-    double *squares;          /* (estimates, n, 2, batch): sums of those of the start, and of all samples */
-    double *powers;           /* (estimates, n, SEGMENT / 2 + 1, batch): means over segments; zero where an episode is shorter than a segment */
-} error_job;
 
 enum { ADD, MULTIPLY, DIVIDE, POWER, SIN, COS, TAN, EXP, LOG, SQRT, TANH, ABS, SIGN, ATAN };
 
@@ -280,31 +227,6 @@ static void shifted(const formulas *f, const vec *reg, vec *next)
 PRODUCT(product, double, 1)
 PRODUCT(product_each, vec, MOST)
 
-/* Corrections within their limits: next += into (clipped - correction). */
-static void limit_corrections(const relift_job *s, whole n, const vec *c, const vec *nu, vec *next, whole w)
-{
-    for (whole i = 0; i < s->width; i++)
-        for (whole v = 0; v < w; v++) {
-            vec y = {0}, more;
-            for (whole j = 0; j < s->order; j++) y += s->limit_c[i * s->order + j] * c[j * MOST + v];
-            for (whole j = 0; j < s->q; j++) y += s->limit_d[i * s->q + j] * nu[j * MOST + v];
-            for (whole b = 0; b < WIDE; b++)
-                more[b] = (y[b] < -s->limit[i] ? -s->limit[i] : y[b] > s->limit[i] ? s->limit[i] : y[b]) - y[b];
-            for (whole j = 0; j < n; j++) next[j * MOST + v] += s->into[j * s->width + i] * more;
-        }
-}
-
-static void limit_states(const relift_job *s, whole n, vec *next, whole first, whole lanes)
-{
-    for (whole i = 0; i < n; i++) {
-        const double *lower = s->lower + i * s->batch + first, *upper = s->upper + i * s->batch + first;
-        for (whole b = 0; b < lanes; b++) {
-            double *x = LANES(next + i * MOST) + b;
-            *x = *x < lower[b] ? lower[b] : *x > upper[b] ? upper[b] : *x;
-        }
-    }
-}
-
 /* Which machines go on: none that stands still or waits, and none that would leave the bounds; how many. */
 static whole guarded(const relift_job *s, whole o, whole n, const vec *next, whole first, whole lanes, const uint8_t *moving, uint8_t *waiting, uint8_t *going)
 {
@@ -314,9 +236,8 @@ static whole guarded(const relift_job *s, whole o, whole n, const vec *next, who
     memset(within, 1, sizeof within);
     for (whole i = 0; s->low && i < rows; i++) {
         const double low = s->low[o * rows + i], high = s->high[o * rows + i];
-        const double *origin = s->origin && i < n ? s->origin + i * s->batch + first : NULL;
         for (whole b = 0; b < lanes; b++) {
-            const double x = LANES(next + i * MOST)[b] + (origin ? origin[b] : 0.0);
+            const double x = LANES(next + i * MOST)[b];
             within[b] &= (uint8_t)(x >= low) & (uint8_t)(x <= high);
         }
     }
@@ -406,8 +327,6 @@ int kros_relift(const formulas *f, const relift_job *s)
                 evaluate(f, reg, lanes);
                 if (s->own) product_each(each, columns, column, next, rows, w);
                 else product(map, used, column, next, rows, w);
-                if (s->width) limit_corrections(s, n, c, nu, next, w);
-                if (s->lower) limit_states(s, n, next, first, lanes);
                 shifted(f, reg, older);
                 if (guarded(s, o, n, next, first, lanes, moving, waiting, on) == lanes) {
                     memcpy(reg, next, (size_t)n * MOST * sizeof(vec));
@@ -620,191 +539,5 @@ int kros_kalman(const formulas *f, const kalman_job *s)
         }
     }
     free(reg), free(P), free(L), free(F), free(FP), free(next), free(older), free(nu), free(drive), free(lifted), free(S);
-    return failed;
-}
-
-#define TILE 64
-
-/* A signal's samples into, and out of, its place in a tile. */
-static void load(double *to, const double *from, whole count)
-{
-    for (whole i = 0; i < count; i++) to[i * WIDE * MOST] = from[i];
-}
-
-static void store(double *to, const double *from, whole count)
-{
-    for (whole i = 0; i < count; i++) to[i] = from[i * WIDE * MOST];
-}
-
-int kros_filter(const filter_job *s)
-{
-    const whole samples = s->samples, kept = (samples + s->every - 1) / s->every;
-    const double a1 = s->poles[0], a2 = s->poles[1], sum = 1.0 + a1 + a2;
-    vec *in = vectors(TILE), *out = vectors(TILE), *earlier = vectors(TILE); /* a tile of samples, so that memory is read and written in rows */
-    const int failed = !in || !out || !earlier;
-    for (whole first = 0; first < s->signals && !failed; first += WIDE * MOST) {
-        const whole lanes = s->signals - first < WIDE * MOST ? s->signals - first : WIDE * MOST, w = (lanes + WIDE - 1) / WIDE;
-        vec rest[MOST] = {{0}}, x[MOST] = {{0}}, y1[MOST] = {{0}}, y2[MOST] = {{0}}; /* differences from what was at rest, which may be far larger */
-        gather(rest, s->rest + first, 1, lanes);
-        for (whole k = 0, done = 0; k < samples; k += TILE) {
-            const whole length = samples - k < TILE ? samples - k : TILE;
-            whole count = 0;
-            for (whole b = 0; b < lanes; b++) load(LANES(in) + b, s->x + (first + b) * samples + k, length);
-            for (whole i = 0; i < length; i++) {
-                const int wanted = (k + i) % s->every == 0;
-                for (whole v = 0; v < w; v++) {
-                    const vec y = x[v] - a2 * y2[v] - a1 * y1[v], held = rest[v] / sum;
-                    if (wanted) out[count * MOST + v] = y + held, earlier[count * MOST + v] = y1[v] + held;
-                    y2[v] = y1[v], y1[v] = y, x[v] = in[i * MOST + v] - rest[v];
-                }
-                count += wanted;
-            }
-            for (whole b = 0; b < lanes; b++) {
-                store(s->now + (first + b) * kept + done, LANES(out) + b, count);
-                if (s->before) store(s->before + (first + b) * kept + done, LANES(earlier) + b, count);
-            }
-            done += count;
-        }
-    }
-    free(in), free(out), free(earlier);
-    return failed;
-}
-
-int kros_monitor(const monitor_job *s)
-{
-    const whole samples = s->samples, signals = s->machines * s->q;
-    vec *out = vectors(TILE);
-    for (whole i = 0; i < signals && out; i++)
-        for (whole first = 0; first < s->bands; first += WIDE) { /* bands side by side */
-            const whole lanes = s->bands - first < WIDE ? s->bands - first : WIDE;
-            vec b = {0}, a1 = {0}, a2 = {0}, one = {0}, two = {0}, p = {0};
-            for (whole l = 0; l < lanes; l++) {
-                const double *filter = s->filters + 3 * (first + l);
-                b[l] = filter[0], a1[l] = filter[1], a2[l] = filter[2];
-            }
-            const uint8_t *judged = s->judged + i / s->q;
-            const double *nu = s->nu + i, size = s->size[i % s->q], most = s->largest[0];
-            double gain = s->gains[0];
-            for (whole k = 0; k < samples; k += TILE) {
-                const whole length = samples - k < TILE ? samples - k : TILE;
-                for (whole j = 0; j < length; j++) {
-                    if (judged[(k + j) * s->machines]) {
-                        const double of = nu[(k + j) * signals] / size;
-                        const vec v = b * (!(of < most) ? most : of < -most ? -most : of), band = v + one;
-                        one = two - a1 * band, two = -v - a2 * band;
-                        p += gain * (band * band - p);
-                        gain /= 1.0 + gain;
-                        gain = gain > s->gains[1] ? gain : s->gains[1];
-                    }
-                    out[j * MOST] = p;
-                }
-                for (whole l = 0; l < lanes; l++) store(s->squares + (i * s->bands + first + l) * samples + k, LANES(out) + l, length);
-            }
-        }
-    const int failed = !out;
-    free(out);
-    return failed;
-}
-
-#define SEGMENT 512
-#define HALF (SEGMENT / 2)
-#define AHEAD 32 /* samples that are on their way from memory */
-
-/* Add the squares of the discrete Fourier transforms of re + i im to `powers`: Stockham's algorithm, four steps by four and one by two. z and other have
-   room for SEGMENT pairs. */
-static void transform(vec *z, vec *other, const double *turns, vec *powers)
-{
-    whole stride = 1;
-    for (whole m = SEGMENT / 4; m > 0; m /= 4, stride *= 4) {
-        for (whole p = 0; p < m; p++) {
-            const double *w1 = turns + 2 * p * stride, *w2 = turns + 4 * p * stride, *w3 = turns + 6 * p * stride;
-            for (whole q = 0; q < stride; q++) {
-                const vec *a = z + 2 * (q + stride * p), *b = a + 2 * stride * m, *c = b + 2 * stride * m, *d = c + 2 * stride * m;
-                const vec sum_r = a[0] + c[0], sum_i = a[1] + c[1], less_r = a[0] - c[0], less_i = a[1] - c[1];
-                const vec and_r = b[0] + d[0], and_i = b[1] + d[1], turn_r = d[1] - b[1], turn_i = b[0] - d[0]; /* i (b - d) */
-                const vec one_r = less_r - turn_r, one_i = less_i - turn_i, three_r = less_r + turn_r, three_i = less_i + turn_i;
-                const vec two_r = sum_r - and_r, two_i = sum_i - and_i;
-                vec *to = other + 2 * (q + stride * 4 * p);
-                to[0] = sum_r + and_r, to[1] = sum_i + and_i;
-                to += 2 * stride, to[0] = w1[0] * one_r + w1[1] * one_i, to[1] = w1[0] * one_i - w1[1] * one_r;
-                to += 2 * stride, to[0] = w2[0] * two_r + w2[1] * two_i, to[1] = w2[0] * two_i - w2[1] * two_r;
-                to += 2 * stride, to[0] = w3[0] * three_r + w3[1] * three_i, to[1] = w3[0] * three_i - w3[1] * three_r;
-            }
-        }
-        vec *swap = z;
-        z = other, other = swap;
-    }
-    for (whole q = 0; q < HALF; q++) {
-        const vec *a = z + 2 * q, *b = a + 2 * HALF, sum_r = a[0] + b[0], sum_i = a[1] + b[1], less_r = a[0] - b[0], less_i = a[1] - b[1];
-        powers[q] += sum_r * sum_r + sum_i * sum_i, powers[q + HALF] += less_r * less_r + less_i * less_i;
-    }
-}
-
-/* Errors of some machines from a sample on, zero beyond the end of an episode; returns their sum, adds their squares, and finds the largest truth. */
-static vec errors(const error_job *s, whole e, whole j, whole first, whole lanes, whole begin, whole count, whole shortest, mask lengths, vec *to, vec *squares, vec *largest)
-{
-    const double *x = s->x + ((begin * s->estimates + e) * s->states + j) * s->batch + first, *truth = s->truth + (begin * s->n + j) * s->batch + first;
-    vec sum = {0};
-    for (whole k = begin; k < begin + count; k++, x += s->estimates * s->states * s->batch, truth += s->n * s->batch, to++) {
-        vec a = {0}, b = {0};
-        __builtin_prefetch(x + AHEAD * s->estimates * s->states * s->batch), __builtin_prefetch(truth + AHEAD * s->n * s->batch);
-        if (k < s->samples && lanes == WIDE) memcpy(&a, x, sizeof a), memcpy(&b, truth, sizeof b);
-        else if (k < s->samples) memcpy(&a, x, (size_t)lanes * sizeof(double)), memcpy(&b, truth, (size_t)lanes * sizeof(double));
-        a -= b;
-        if (k >= shortest) a = either((mask){0} + k < lengths, a, (vec){0}), b = either((mask){0} + k < lengths, b, (vec){0});
-        b = either(b < 0.0, -b, b);
-        *largest = either(b > *largest, b, *largest);
-        sum += a, *squares += a * a, *to = a;
-    }
-    return sum;
-}
-
-int kros_errors(const error_job *s)
-{
-    vec *z = room(2 * SEGMENT * (whole)sizeof(vec)), *other = room(2 * SEGMENT * (whole)sizeof(vec)), *error = room(3 * HALF * (whole)sizeof(vec));
-    vec *powers = room(SEGMENT * (whole)sizeof(vec));
-    const int failed = !z || !other || !error || !powers;
-    for (whole first = 0; first < s->batch && !failed; first += WIDE) {
-        const whole lanes = s->batch - first < WIDE ? s->batch - first : WIDE;
-        mask lengths = {0}, segments = {0};
-        whole shortest = s->samples, most = 0, fewest = s->samples;
-        for (whole b = 0; b < lanes; b++) {
-            lengths[b] = s->lengths[first + b];
-            segments[b] = lengths[b] < SEGMENT ? 0 : (lengths[b] - SEGMENT) / HALF + 1;
-            shortest = lengths[b] < shortest ? lengths[b] : shortest;
-            most = segments[b] > most ? segments[b] : most, fewest = segments[b] < fewest ? segments[b] : fewest;
-        }
-        for (whole each = 0; each < s->estimates * s->n; each++) {
-            const whole e = each / s->n, j = each % s->n;
-            vec squares = {0}, begun = {0}, largest = {0}, sums[3];
-            memset(powers, 0, SEGMENT * sizeof(vec));
-            sums[0] = errors(s, e, j, first, lanes, 0, HALF, shortest, lengths, error, &squares, &largest);
-            for (whole k = 0; k < s->begun; k++) begun += error[k] * error[k];
-            for (whole at = 0, segment = 0; at < s->samples; at += SEGMENT, segment += 2) { /* two segments are one complex signal */
-                for (whole half = 1; half < 3; half++)
-                    sums[half] = errors(s, e, j, first, lanes, at + half * HALF, HALF, shortest, lengths, error + half * HALF, &squares, &largest);
-                if (segment < most) {
-                    const vec one = (sums[0] + sums[1]) / SEGMENT, two = (sums[1] + sums[2]) / SEGMENT;
-                    for (whole k = 0; k < SEGMENT; k++) z[2 * k] = (error[k] - one) * s->window[k], z[2 * k + 1] = (error[HALF + k] - two) * s->window[k];
-                    if (segment + 1 >= fewest)
-                        for (whole k = 0; k < SEGMENT; k++) {
-                            z[2 * k] = either(segments > segment, z[2 * k], (vec){0});
-                            z[2 * k + 1] = either(segments > segment + 1, z[2 * k + 1], (vec){0});
-                        }
-                    transform(z, other, s->turns, powers);
-                }
-                memcpy(error, error + SEGMENT, HALF * sizeof(vec));
-                sums[0] = sums[2];
-            }
-            scatter(s->largest + j * s->batch + first, &largest, 1, lanes);
-            scatter(s->squares + (2 * each) * s->batch + first, &begun, 1, lanes);
-            scatter(s->squares + (2 * each + 1) * s->batch + first, &squares, 1, lanes);
-            for (whole k = 0; k <= HALF; k++) {
-                const vec both = (powers[k] + powers[(SEGMENT - k) % SEGMENT]) / 2;
-                for (whole b = 0; b < lanes; b++) s->powers[(each * (HALF + 1) + k) * s->batch + first + b] = segments[b] ? both[b] / segments[b] : 0.0;
-            }
-        }
-    }
-    free(z), free(other), free(error), free(powers);
     return failed;
 }

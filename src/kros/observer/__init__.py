@@ -1,4 +1,4 @@
-"""The observer as it runs: one-step predictor with retraction and re-lifting, and the baselines it is compared with.
+"""The observer at run time: one-step predictor with retraction and re-lifting, and the baselines it is compared with.
 
 Examples
 --------
@@ -14,28 +14,23 @@ Examples
 from ..core.removed import refusing
 from .baselines.difference import FilteredDifference
 from .baselines.extended_kalman import ExtendedKalman
-from .certificate.certificate import ReliftCertificate, relift_certificate
+from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
-from .certificate.mean_square import DropoutBound, dropout_bound
 from .certificate.signals import SignalBound, signal_bound
-from .certificate.status import ReliftStatus
 from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
 from .filter_bank import FilterBank
-from .guard import Guard
 from .monitor import Monitor
 from .observer import Observer
 from .running import Estimate, RunningObserver
-from .runtime import Runtime, Seen
-from .samples import SampleStatus
-from .screen import sample_status
+from .runtime import Guard, Runtime, Seen
+from .screen import SampleStatus, sample_status
 from .sensor import Sensor
 from .simulate import run_observer, run_observers, run_with_status
 from .tracking import Tracked, track_parameter
 
 __all__ = [
-    "DropoutBound",
     "Estimate",
     "EstimatorSettings",
     "ExtendedKalman",
@@ -55,7 +50,6 @@ __all__ = [
     "Sensor",
     "SignalBound",
     "Tracked",
-    "dropout_bound",
     "identify_estimator",
     "relift_certificate",
     "run_observer",

@@ -7,9 +7,10 @@
            K: x^c+ = A^c x^c + B^c nu  ◄── nu = y - y_hat ──(+)◄── y
               y^c  = C^c x^c + D^c nu
 
-The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer is a
-one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier estimates and inputs too;
-before the start these are taken to equal the first ones. Where it has input functions, u stands for the lifted inputs.
+The correction enters through the state as drawn, or through the input, ``B (u + y^c)``, as in the paper. The observer
+is a one-step predictor: the estimate for k + 1 uses data up to k. Where the lifting has delays, theta reads earlier
+estimates and inputs too; before the start these are taken to equal the first ones. Where it has input functions, u
+stands for the lifted inputs.
 """
 
 from __future__ import annotations
@@ -28,9 +29,8 @@ from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .filter_bank import FilterBank
-from .guard import Guard
 from .monitor import Monitor
-from .runtime import Runtime, Seen
+from .runtime import Guard, Runtime, Seen
 from .sensor import Sensors, require_measured
 
 Array = npt.NDArray[np.float64]
@@ -60,17 +60,20 @@ class ObserverData:
     runtime : Runtime
         Delay of the measurement, limits, and the gain of filtered estimates.
     seen : Seen, optional
-        Largest sizes of measurements and inputs in training, beyond which samples are implausible (see `screen`); none by default.
+        Largest sizes of measurements and inputs in training; larger samples are implausible (see `screen`); none
+        by default.
     sensor : mapping of str to Sensor
-        What it was told of the sensors of measured states, by name. What arrives late is corrected by `runtime`.
+        Declared sensors of measured states, by name. What arrives late is corrected by `runtime`.
     monitor : Monitor, optional
         Watches the innovation for machines that are outside the population's envelope; nothing by default.
     bank : FilterBank, optional
-        Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the correction is zero.
+        Of an observer that is a filter bank: measurements stand in its model in place of their estimates, and the
+        correction is zero.
     guard : Guard, optional
-        Bounds of its states beyond which it starts again; by default it does so where one is not finite.
+        Bounds of its states, outside which it starts again; by default where one is not finite.
     about : mapping of str to JSON values
-        What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes with it.
+        What people should know of it: units of measure, ranges, certificates. It is part of the file; nothing computes
+        with it.
 
     Raises
     ------
@@ -100,36 +103,24 @@ class ObserverData:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "injection", member(Injection, self.injection, f"Observer {self.name}: the injection"))
-        if self.B.shape[1] != len(self.inputs) + len(self.lifting.input_functions):
+        K, n, q, m = self.controller, self.lifting.n_states, len(self.measured), len(self.inputs)
+        rows, columns = self.lifting.n_lifted, m + len(self.lifting.input_functions)
+        width = columns if self.injection is Injection.INPUT else rows
+        self._require("the model A", self.A.shape, (rows, rows))
+        self._require(f"the model B, of {m} inputs and {columns - m} functions of them,", self.B.shape, (rows, columns))
+        if (K.n_inputs, K.n_outputs) != (q, width):
             raise DimensionError(
-                f"Observer {self.name}: {len(self.inputs)} inputs {self.inputs} and {len(self.lifting.input_functions)} functions of them need as many "
-                f"columns of B, found {self.B.shape[1]}."
+                f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
+                f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        width = self.B.shape[1] if self.injection is Injection.INPUT else self.A.shape[0]
-        K, n = self.controller, self.lifting.n_states
-        if (K.n_inputs, K.n_outputs) != (len(self.measured), width):
-            raise DimensionError(
-                f"Observer {self.name}: the controller should map {len(self.measured)} innovations to {width} corrections ({self.injection.value} injection), "
-                f"found {K.n_inputs} to {K.n_outputs}."
-            )
-        self.runtime.require_fit(self.name, n, width, len(self.inputs))
-        if self.seen is not None and (len(self.seen.measured), len(self.seen.inputs)) != (
-            len(self.measured),
-            len(self.inputs),
-        ):
-            raise DimensionError(
-                f"Observer {self.name}: {len(self.measured)} measurements and {len(self.inputs)} inputs need as many sizes seen in training, found "
-                f"{len(self.seen.measured)} and {len(self.seen.inputs)}."
-            )
-        if self.monitor is not None and len(self.monitor.size) != len(self.measured):
-            raise DimensionError(
-                f"Observer {self.name}: a monitor of {len(self.measured)} measurements is needed, found one of {len(self.monitor.size)}."
-            )
+        self.runtime.require_fit(self.name, n)
+        if self.seen is not None:
+            self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
+        if self.monitor is not None:
+            self._require("the monitor", self.monitor.size.shape, (q,))
         require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
         if self.bank is not None:
-            self.bank.require_fit(
-                self.name, len(self.recorded), n, self.A.shape[0] + self.B.shape[1], len(self.measured)
-            )
+            self.bank.require_fit(self.name, len(self.recorded), n, rows + columns, q)
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
@@ -137,12 +128,17 @@ class ObserverData:
         if self.guard is not None:
             self.guard.require_fit(self.name, n, K.n_states)
 
+    def _require(self, what: str, shape: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+        if shape != wanted:
+            raise DimensionError(f"Observer {self.name}: {what} should have shape {wanted}, found {shape}.")
+
     def __repr__(self) -> str:
         """Say what kind of observer it is, in a line."""
         states, own = ", ".join(self.recorded), f" + {self.internal} internal" if self.internal else ""
         functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
         y = ", ".join(self.lifting.states[i] for i in self.measured)
-        return f"<Observer {self.name}: {states}{own}{functions} from {y}; correction of order {self.controller.n_states}, {self.sample_period_s:g} s>"
+        correction = f"correction of order {self.controller.n_states}, {self.sample_period_s:g} s"
+        return f"<Observer {self.name}: {states}{own}{functions} from {y}; {correction}>"
 
     @property
     def internal(self) -> int:
@@ -156,11 +152,12 @@ class ObserverData:
 
     @property
     def filter_gain(self) -> Array:
-        """Gain from the innovation to the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
+        """Gain of the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
 
         It follows from the correction: the direct correction of the next estimate is that of this one, carried
-        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is its filter, exactly;
-        states of the correction and slopes of lifted functions are left out. A filter bank takes the measurement.
+        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is
+        its filter, exactly; states of the correction and slopes of lifted functions are left out. A filter bank takes
+        the measurement.
         """
         n = self.lifting.n_states
         if self.bank is not None:
@@ -184,21 +181,17 @@ class ObserverData:
     def initial(
         self, y: npt.ArrayLike, parameters: Mapping[str, npt.ArrayLike] | None = None, u: npt.ArrayLike | None = None
     ) -> Array:
-        """Return the first estimate: the first measurement, other states zero or as the filter bank starts; shape (..., n)."""
+        """Return the first estimate, (..., n): measurements, and others zero or as a bank starts."""
         first = np.asarray(y, dtype=float)
         y = np.where(np.isfinite(first), first, 0.0)
         x = np.zeros((*y.shape[:-1], self.lifting.n_states))
         x[..., list(self.measured)] = y
-        if self.bank is None:
-            return x
-        values = self.values(parameters)
-        inputs = (
-            np.zeros((*y.shape[:-1], len(self.inputs)))
-            if u is None
-            else np.broadcast_to(u, (*y.shape[:-1], len(self.inputs)))
-        )
-        lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
-        return np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+        if self.bank is not None:
+            inputs = np.broadcast_to(0.0 if u is None else u, (*y.shape[:-1], len(self.inputs)))
+            values = self.values(parameters)
+            lifted = [self.lifting.lift(x, values), self.lifting.lift_inputs(inputs, x, values)]
+            x = np.asarray(np.concatenate(lifted, axis=-1) @ self.bank.start.T)
+        return x
 
     def own(self, parameters: Mapping[str, npt.ArrayLike]) -> dict[str, npt.ArrayLike]:
         """Return those parameters of many that the lifting has."""
@@ -207,7 +200,7 @@ class ObserverData:
     def values(
         self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
     ) -> dict[str, Any]:
-        """Return the lifting's parameters: those that are given, the observer's own for the others; each broadcasts to `shape` where that is given.
+        """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`.
 
         Raises
         ------
@@ -227,8 +220,8 @@ class ObserverData:
         for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
             if names:
                 raise ConfigError(
-                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting has "
-                    f"{', '.join(known) or 'no parameters'}."
+                    f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting "
+                    f"has {', '.join(known) or 'no parameters'}."
                 )
         for name in known if shape is not None else ():
             found = np.shape(values[name])

@@ -7,36 +7,126 @@ warning: everything below is checked either way.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ConfigDict, Field
 
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
 from ..core.files import shortened
 from ..core.lti import StateSpace
+from ..core.settings import Settings
 from ..lifting import Lifting
 from ..synthesis.result import Injection
 from .data import ObserverData
 from .filter_bank import FilterBank
-from .guard import Guard
 from .monitor import Monitor
-from .runtime import Runtime, Seen
+from .runtime import Guard, Runtime, Seen
 from .sensor import Sensor
 
 Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 SCHEMA, KIND = 3, "observer"
+Name = Annotated[str, Field(min_length=1)]
+Row = list[float]
+Matrix = list[Row]
+Limits = list[float | None]  # null is infinite
+
+
+class _Part(Settings):
+    """What a part of the file holds; numbers are finite, and nothing is converted."""
+
+    model_config = ConfigDict(strict=True, extra="forbid", frozen=True, allow_inf_nan=False)
+
+    @classmethod
+    def _explain(cls, error: Any) -> str:
+        text, value = str(error["msg"]).lower(), error.get("input")
+        return text if isinstance(value, dict) else f"{text}, found {shortened(repr(value), 60)}"
+
+
+class _Model(_Part):
+    A: Matrix
+    B: Matrix
+
+
+class _Controller(_Model):
+    C: Matrix
+    D: Matrix
+
+
+class _Runtime(_Part):
+    delay: int = 0
+    lower: Limits | None = None
+    upper: Limits | None = None
+
+
+class _Seen(_Part):
+    measured: Row
+    inputs: Row
+
+
+class _Guard(_Part):
+    lower: Row
+    upper: Row
+    correction: Row
+    settle: int
+
+
+class _Bank(_Part):
+    filters: int
+    start: Matrix
+    forget: Row
+    half: Row
+    recovery: Row
+    reach: Row
+
+
+class _Monitor(_Part):
+    filters: Matrix
+    forget: float
+    settle: int
+    size: Row
+    limits: Matrix
+    weights: Matrix
+    false_alarm_rate: float
+    bounds: dict[str, float] = Field(default_factory=dict)
+    units: int = 0
+    hours: float = 0.0
+    alarms: int = 0
+    first: float = 0.0
+
+
+class _File(_Part):
+    name: Name
+    states: list[Name]
+    lifting: list[Name]
+    lifting_inputs: list[Name] = Field(default_factory=list)
+    input_functions: list[Name] = Field(default_factory=list)
+    sizes: list[Any] = Field(default_factory=list)
+    parameters: dict[str, float | None]  # null stands for one that every unit has of its own
+    inputs: list[Name]
+    measured: list[int]
+    injection: str
+    sample_period_s: float = Field(gt=0)
+    model: _Model
+    controller: _Controller
+    runtime: _Runtime | None = None
+    seen: _Seen | None = None
+    filter_bank: _Bank | None = None
+    guard: _Guard | None = None
+    sensor: dict[str, Any] = Field(default_factory=dict)
+    about: dict[str, Any] = Field(default_factory=dict)
+    monitor: _Monitor | None = None
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
+    parts = {"seen": observer.seen, "filter_bank": observer.bank, "guard": observer.guard, "monitor": observer.monitor}
     content = {
         "schema": SCHEMA,
         "kind": KIND,
@@ -51,26 +141,19 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        **observer.runtime.content(),
-        **(
-            {}
-            if observer.seen is None
-            else {"seen": {"measured": observer.seen.measured, "inputs": observer.seen.inputs}}
-        ),
-        **({} if observer.bank is None else {"filter_bank": observer.bank.content()}),
-        **({} if observer.guard is None else {"guard": observer.guard.content()}),
-        **({"sensor": {name: own.model_dump() for name, own in observer.sensor.items()}} if observer.sensor else {}),
-        **({"about": observer.about} if observer.about else {}),
-        **({} if observer.monitor is None else {"monitor": observer.monitor.content()}),
+        "runtime": observer.runtime.content(),
+        **{key: vars(part) for key, part in parts.items() if part is not None},
+        "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
+        "about": observer.about,
     }
-    found: dict[str, Any] = plain(content)
-    return found
+    written: dict[str, Any] = plain(content)
+    return {key: value for key, value in written.items() if value or key not in ("runtime", "sensor", "about")}
 
 
 def write_observer(observer: ObserverData, path: Path) -> None:
     """Write an observer; one that could not be read again is refused."""
     content = observer_content(observer)
-    observer_from(content, f"Writing observer {observer.name} to {path}")
+    _checked(content, f"Writing observer {observer.name} to {path}")
     write_json(path, with_checksum(content))
 
 
@@ -79,209 +162,67 @@ def read_observer(path: Path) -> ObserverData:
     content = read_json(path)
     if not isinstance(content, dict) or content.get("kind") != KIND or content.get("schema") != SCHEMA:
         raise DataError(
-            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this version of kros."
+            f"Loading an observer from {path}: not an observer file of schema {SCHEMA}; write it again with this "
+            "version of kros."
         )
     if not check_checksum(content, path):
         log.warning("The observer of %s carries no checksum: it was edited.", path)
+    with as_written("Observer", path):
+        return _checked(content, f"Loading an observer from {path}")
+
+
+def _checked(content: Mapping[str, Any], where: str) -> ObserverData:
+    """Return the observer of a file's content."""
     try:
-        with as_written("Observer", path):
-            return observer_from(content, f"Loading an observer from {path}")
-    except DataError:
-        raise
+        rest = {key: value for key, value in content.items() if key not in ("schema", "kind", CHECKSUM)}
+        return _observer(_File.of(rest, "its content").model_dump())
     except KrosError as error:
-        raise DataError(f"Loading an observer from {path}: {error}") from error
+        raise DataError(f"{where}: {error} Correct the file.") from error
 
 
-def observer_from(content: Mapping[str, Any], where: str) -> ObserverData:
-    """Make an observer from the content of a file; messages begin with `where`."""
-    _text(content["name"], f"{where}: name")
-    for key in ("states", "inputs", "lifting", "lifting_inputs", "input_functions"):
-        _names(
-            content.get(key, []) if key.endswith(("lifting_inputs", "functions")) else content[key], f"{where}: {key}"
+def _observer(content: Mapping[str, Any]) -> ObserverData:
+    names = [*content["states"], *content["inputs"], *content["parameters"]]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DataError(
+            f"the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once."
         )
-    parameters = _parameters(content["parameters"], where)
-    _distinct([*content["states"], *content["inputs"], *content["parameters"]], where)
-    lifting = Lifting.from_content(content)
-    n, m = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions)
-    measured = _indices(content["measured"], lifting.n_states, where)
-    injection, q = Injection(content["injection"]), len(measured)
-    period = content["sample_period_s"]
-    _require(
-        _is_finite(period) and period > 0, f"{where}: sample_period_s should be a number of seconds above zero", period
-    )
-    width = m if injection is Injection.INPUT else n
-    controller, order = content["controller"], len(content["controller"]["A"])
+    lifting, measured = Lifting.from_content(content), tuple(content["measured"])
+    if len(set(measured)) < len(measured) or not set(measured) <= set(range(lifting.n_states)):
+        raise DataError(
+            f"measured should list different states by number, 0 to {lifting.n_states - 1}, found {list(measured)}."
+        )
+    n, m, q = lifting.n_lifted, len(content["inputs"]) + len(lifting.input_functions), len(measured)
+    order, width = len(content["controller"]["A"]), m if content["injection"] == Injection.INPUT.value else n
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
-    _known(controller, shapes, f"{where}: controller")
-    _known(content["model"], "AB", f"{where}: model")
-    A, B, C, D = (matrix(controller[key], shapes[key], f"{where}: controller.{key}") for key in "ABCD")
-    observer = ObserverData(
+    A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
+    kinds: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
+    parts = {key: None if content[key] is None else kind(**content[key]) for key, kind in kinds.items()}
+    return ObserverData(
         content["name"],
         lifting,
-        matrix(content["model"]["A"], (n, n), f"{where}: model.A"),
-        matrix(content["model"]["B"], (n, m), f"{where}: model.B"),
+        _matrix(content["model"]["A"], (n, n), "model.A"),
+        _matrix(content["model"]["B"], (n, m), "model.B"),
         measured,
         tuple(content["inputs"]),
-        StateSpace(A, B, C, D, float(period)),
-        injection,
-        float(period),
-        parameters,
-        _runtime(content, where),
-        _seen(content.get("seen"), q, len(content["inputs"]), where),
-        sensor=_sensor(content.get("sensor", {}), where),
-        monitor=_monitor(content.get("monitor"), q, where),
-        guard=_guard(content.get("guard"), lifting.n_states, order, where),
+        StateSpace(A, B, C, D, content["sample_period_s"]),
+        content["injection"],
+        content["sample_period_s"],
+        {name: value for name, value in content["parameters"].items() if value is not None},
+        Runtime.from_content(content["runtime"] or {}),
+        parts["seen"],
+        {name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
+        parts["monitor"],
+        parts["filter_bank"],
+        parts["guard"],
+        content["about"],
     )
-    optional = ("runtime", "sensor", "filter_bank", "lifting_inputs", "input_functions", "about", CHECKSUM)
-    _known(content, [*observer_content(observer), *optional], where)
-    about = content.get("about", {})
-    _require(isinstance(about, dict), f"{where}: about should be an object", about)
-    return replace(observer, bank=_bank(content.get("filter_bank"), lifting.n_states, n + m, q, where), about=about)
 
 
-def matrix(rows: Any, shape: tuple[int, int], where: str) -> Array:
+def _matrix(rows: Matrix, shape: tuple[int, int], where: str) -> Array:
     """Return a matrix from lists of lists."""
-    if not isinstance(rows, list) or len(rows) != shape[0]:
-        found = f"{len(rows)} rows" if isinstance(rows, list) else shortened(repr(rows), 60)
-        raise DataError(f"{where} should have {shape[0]} rows of {shape[1]} numbers, found {found}; correct the file.")
-    for i, row in enumerate(rows):
-        if not isinstance(row, list) or len(row) != shape[1]:
-            found = f"{len(row)} entries" if isinstance(row, list) else shortened(repr(row), 60)
-            raise DataError(f"{where}[{i}] should have {shape[1]} numbers, found {found}; correct the file.")
-        for j, value in enumerate(row):
-            _require(_is_finite(value), f"{where}[{i}][{j}] should be a finite number", value)
-    return np.array(rows, dtype=float).reshape(shape)
-
-
-def _require(holds: bool, wanted: str, found: Any) -> None:
-    if not holds:
-        raise DataError(f"{wanted}, found {shortened(repr(found), 60)}; correct the file.")
-
-
-def _is_finite(value: Any) -> bool:
-    """Whether a value is a finite number that a double can hold."""
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return False
-    return math.isfinite(value) if isinstance(value, float) else value.bit_length() < 1024
-
-
-def _text(value: Any, where: str) -> None:
-    _require(isinstance(value, str) and bool(value.strip()), f"{where} should be text that is not empty", value)
-
-
-def _names(values: Any, where: str) -> None:
-    _require(isinstance(values, list), f"{where} should be a list of names", values)
-    for i, value in enumerate(values):
-        _text(value, f"{where}[{i}]")
-
-
-def _distinct(names: Sequence[str], where: str) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
+    lengths: Sequence[int] = sorted({len(row) for row in rows})
+    if len(rows) != shape[0] or lengths not in ([shape[1]], []):
         raise DataError(
-            f"{where}: the names of states, inputs and parameters should differ, found {', '.join(twice)} more than once; correct the file."
+            f"{where} should have {shape[0]} rows of {shape[1]} numbers, found {len(rows)} rows of {lengths}."
         )
-
-
-def _parameters(values: Any, where: str) -> dict[str, float]:
-    """Return the values that are known; null stands for one that every unit has of its own."""
-    _require(isinstance(values, dict), f"{where}: parameters should name values", values)
-    for name, value in values.items():
-        _require(
-            value is None or _is_finite(value), f"{where}: parameters.{name} should be a finite number or null", value
-        )
-    return {name: float(value) for name, value in values.items() if value is not None}
-
-
-def _indices(values: Any, count: int, where: str) -> tuple[int, ...]:
-    good = (
-        isinstance(values, list)
-        and all(type(i) is int and 0 <= i < count for i in values)
-        and len(set(values)) == len(values)
-    )
-    _require(good, f"{where}: measured should list different states by number, 0 to {count - 1}", values)
-    return tuple(values)
-
-
-def _runtime(content: Mapping[str, Any], where: str) -> Runtime:
-    found = content.get("runtime", {})
-    _known(found, Runtime.__dataclass_fields__, f"{where}: runtime")
-    _require(
-        type(found.get("relift", True)) is bool, f"{where}: runtime.relift should be true or false", found.get("relift")
-    )
-    for key, value in found.items():
-        entries = [] if key == "relift" else [value]
-        while any(isinstance(entry, list) for entry in entries):
-            entries = [e for entry in entries for e in (entry if isinstance(entry, list) else [entry])]
-        for entry in entries:
-            free = entry is None and key != "delay"  # a limit that is null is infinite
-            _require(free or _is_finite(entry), f"{where}: runtime.{key} should hold finite numbers", entry)
-    return Runtime.from_content(content)
-
-
-def _seen(found: Any, measured: int, inputs: int, where: str) -> Seen | None:
-    if found is None:
-        return None
-    counts = {"measured": measured, "inputs": inputs}
-    _known(found, counts, f"{where}: seen")
-    return Seen(*(matrix([found[name]], (1, count), f"{where}: seen.{name}")[0] for name, count in counts.items()))
-
-
-def _bank(found: Any, n: int, columns: int, measured: int, where: str) -> FilterBank | None:
-    if found is None:
-        return None
-    _known(found, FilterBank.__dataclass_fields__, f"{where}: filter_bank")
-    recorded = len(found["forget"]) if isinstance(found["forget"], list) else 0
-    counts = {"forget": recorded, "half": recorded, "recovery": recorded, "reach": measured}
-    rows = {k: matrix([found[k]], (1, count), f"{where}: filter_bank.{k}")[0] for k, count in counts.items()}
-    start = matrix(found["start"], (n, columns), f"{where}: filter_bank.start")
-    _require(type(found["filters"]) is int, f"{where}: filter_bank.filters should be a whole number", found["filters"])
-    return FilterBank(found["filters"], start, **rows)
-
-
-def _guard(found: Any, n: int, order: int, where: str) -> Guard | None:
-    if found is None:
-        return None
-    shapes = {"lower": n, "upper": n, "correction": order}
-    _known(found, [*shapes, "settle"], f"{where}: guard")
-    rows = {name: matrix([found[name]], (1, count), f"{where}: guard.{name}")[0] for name, count in shapes.items()}
-    _require(type(found["settle"]) is int, f"{where}: guard.settle should be a whole number", found["settle"])
-    return Guard.from_content({**rows, "settle": found["settle"]})
-
-
-def _sensor(found: Any, where: str) -> dict[str, Sensor]:
-    _require(isinstance(found, dict), f"{where}: sensor should be an object", found)
-    return {name: Sensor.of(own, f"{where}: sensor.{name}") for name, own in found.items()}
-
-
-def _monitor(found: Any, measured: int, where: str) -> Monitor | None:
-    if found is None:
-        return None
-    _known(found, Monitor.__dataclass_fields__, f"{where}: monitor")
-    rows = {key: len(found[key]) if isinstance(found[key], list) else 0 for key in ("filters",)}
-    shapes = {
-        "filters": (rows["filters"], 3),
-        "limits": (measured, rows["filters"]),
-        "weights": (measured, rows["filters"]),
-        "size": (1, measured),
-    }
-    numbers = {
-        key: matrix([found[key]] if key == "size" else found[key], shape, f"{where}: monitor.{key}")
-        for key, shape in shapes.items()
-    }
-    plain_ones = {key: value for key, value in found.items() if key not in shapes}
-    _require(
-        isinstance(found.get("bounds", {}), dict), f"{where}: monitor.bounds should be an object", found.get("bounds")
-    )
-    for key, value in [*plain_ones.items(), *found.get("bounds", {}).items()]:
-        if key == "bounds":
-            continue
-        _require(_is_finite(value), f"{where}: monitor.{key} should be a finite number", value)
-    return Monitor.from_content(plain_ones | numbers | {"size": numbers["size"][0]})
-
-
-def _known(found: Any, known: Sequence[str] | Mapping[str, Any] | str, where: str) -> None:
-    _require(isinstance(found, dict), f"{where} should be an object", found)
-    unknown = [key for key in found if key not in known]
-    if unknown:
-        raise DataError(f"{where}: unknown key {unknown[0]!r}; known are {', '.join(known)}; correct the file.")
+    return np.array(rows, dtype=float).reshape(shape)

@@ -19,7 +19,6 @@ run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g sa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -107,15 +106,6 @@ class FilterBank:
     def turned(self, turn: Array) -> FilterBank:
         """Return the bank for states ``turn @ x``, shape (n, n), which leaves recorded states and fallback alone."""
         return replace(self, start=turn @ self.start)
-
-    def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it."""
-        return {"filters": self.filters} | {name: getattr(self, name).tolist() for name in _ARRAYS}
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> FilterBank:
-        """Read what `content` returned."""
-        return cls(**content)
 
 
 class Gaps:

@@ -1,34 +1,35 @@
 r"""The monitor: whether a machine still moves as the population does, by the level of the innovation over octaves.
 
-The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and the mean square of each band is
-remembered, :math:`p \leftarrow p + g\,(b^2 - p)`, with a gain :math:`g \leftarrow \max(g / (1 + g), g_\infty)`: it is the mean of all samples so far, and
-an exponential one from :math:`1/g_\infty` samples on. The machine is outside the population's envelope while
+The innovation :math:`\nu = y - C\hat x` of every measured channel goes through band-pass filters an octave apart, and
+the mean square of each band is remembered, :math:`p \leftarrow p + g\,(b^2 - p)`, with a gain :math:`g \leftarrow
+\max(g / (1 + g), g_\infty)`: it is the mean of all samples so far, and an exponential one from :math:`1/g_\infty`
+samples on. The machine is outside the population's envelope while
 
 .. math:: \prod_{c,b} \max(p_{cb} / \ell_{cb},\ 0.01)^{k_{cb}} > 1,
 
-that is while a weighted mean of the bands' levels in decibels exceeds its bound. The weights are whole numbers that sum to `WEIGHT`: those of the mean
-that differs least from good machine to good machine (`design.monitor`). What differs in one band alone averages out: on simulated drives such a mean found
-badly assembled ones four times as often as a threshold for every band. A product needs no logarithm on the machine.
+that is while a weighted mean of the bands' levels in decibels exceeds its bound. The weights are whole numbers that sum
+to `WEIGHT`: those of the mean that differs least from good machine to good machine (`design.monitor`). What differs in
+one band alone averages out: on simulated drives such a mean found badly assembled ones four times as often as a
+threshold for every band. A product needs no logarithm on the machine.
 
-A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or its start: while they go by,
-all that the monitor remembers is held.
+A sample that was missing, invalid or beyond a limit is not judged, nor are those in which the observer forgets it, or
+its start: while they go by, all that the monitor remembers is held.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError
-from ..loops import all_pole, library
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-LARGEST = 1e3  # sizes of the innovation, beyond which more says nothing
+LARGEST = 1e3  # sizes of the innovation that count at most
 RECOVERY = 4  # samples that are not judged after one that is not good
 WEIGHT = 16  # of all bands together
 QUIET = 0.01  # of its limit: a band that is more quiet says no more
@@ -55,7 +56,8 @@ class Monitor:
     false_alarm_rate : float
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
     bounds : mapping of str to float
-        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it may be told in which it is.
+        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it
+        may be told in which it is.
     units : int
         Machines that the bound was found on.
     hours : float
@@ -107,7 +109,8 @@ class Monitor:
             or not bands
         ):
             raise DataError(
-                f"Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit together, found "
+                "Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit "
+                "together, found "
                 f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
             )
         if (
@@ -118,23 +121,16 @@ class Monitor:
             or self.settle < 0
         ):
             raise DataError(
-                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle at least 0."
+                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle "
+                "at least 0."
             )
         if np.any(self.weights != np.round(self.weights)) or np.any(self.weights < 0) or self.weights.sum() != WEIGHT:
             raise DataError(
-                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found {self.weights}."
+                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found "
+                f"{self.weights}."
             )
         if not np.isfinite(list(self.bounds.values())).all():
             raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
-
-    def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it."""
-        return {f.name: getattr(self, f.name) for f in fields(self)}
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any]) -> Self:
-        """Read what `content` returned."""
-        return cls(**content)
 
     def times(self, y: Array) -> Self:
         """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
@@ -152,43 +148,20 @@ class Monitor:
         Returns
         -------
         ndarray, shape (n_samples, batch, q, bands)
-            Perhaps a view with the samples innermost in memory.
         """
-        if (loops := library()) is not None:
-            samples, machines, q = innovation.shape
-            course = np.empty((machines, q, len(self.filters), samples))
-            job = {
-                "machines": machines,
-                "samples": samples,
-                "q": q,
-                "bands": len(self.filters),
-                "nu": innovation,
-                "judged": judged,
-            }
-            job |= {
-                "filters": self.filters,
-                "size": self.size,
-                "gains": (max(self.first, self.forget), self.forget),
-                "largest": (LARGEST,),
-            }
-            loops.call("kros_monitor", ("monitor_job", job | {"squares": course}))
-            return np.moveaxis(course, -1, 0)
+        from scipy.signal import lfilter
+
         scaled = innovation / self.size
         scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
-        found = np.zeros((*innovation.shape, len(self.filters)))
+        squares = np.zeros((*innovation.shape, len(self.filters)))
         for machine in range(innovation.shape[1]):
-            taken = np.flatnonzero(judged[:, machine])
-            if not len(taken):
-                continue
-            own = scaled[taken, machine].T
-            bands = np.stack([b * _apart(all_pole(own, a1, a2)) for b, a1, a2 in self.filters], axis=1)
-            squares = np.moveaxis(self._remembered(bands**2), -1, 0)
-            if len(taken) == len(judged) - taken[0]:
-                found[taken[0] :, machine] = squares
-                continue
-            latest = np.searchsorted(taken, np.arange(len(judged)), side="right")
-            found[:, machine] = np.concatenate([np.zeros((1, *squares.shape[1:])), squares])[latest]
-        return found
+            rows = np.flatnonzero(judged[:, machine])
+            if len(rows):
+                bands = [lfilter([b, 0, -b], [1, a1, a2], scaled[rows, machine], axis=0) for b, a1, a2 in self.filters]
+                means = self._remembered(np.stack(bands, axis=-1) ** 2)
+                latest = np.searchsorted(rows, np.arange(len(judged)), side="right")
+                squares[:, machine] = np.concatenate([np.zeros((1, *means.shape[1:])), means])[latest]
+        return squares
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of every episode, of a machine that has them one after the other.
@@ -206,17 +179,20 @@ class Monitor:
         return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
 
     def _remembered(self, squares: Array) -> Array:
-        """Return the means of squares, shape (..., n_samples), after every sample."""
-        first, count = max(self.first, self.forget), squares.shape[-1]
-        falling = min(count, max(0, int(np.ceil(1 / self.forget - 1 / first))))  # samples until the gain stays as it is
-        begun = np.cumsum(squares[..., :falling], axis=-1) / (1 / first + np.arange(falling))
-        rest = self.forget * squares[..., falling:]
-        if 0 < falling < count:
-            rest[..., 0] += (1 - self.forget) * begun[..., -1]
-        return np.concatenate([begun, all_pole(rest, self.forget - 1.0)], axis=-1)
+        """Return the means of squares, shape (n_samples, q, bands), after every sample."""
+        from scipy.signal import lfilter
+
+        first, keep = max(self.first, self.forget), 1 - self.forget
+        falling = min(len(squares), int(np.ceil(1 / self.forget - 1 / first)))  # until the gain stays as it is
+        begun = np.cumsum(squares[:falling], axis=0) / (1 / first + np.arange(falling))[:, None, None]
+        if falling == len(squares):
+            return begun
+        last = keep * begun[-1:] if falling else np.zeros((1, *squares.shape[1:]))
+        rest, _ = lfilter([self.forget], [1, -keep], squares[falling:], axis=0, zi=last)
+        return np.concatenate([begun, rest])
 
     def level(self, mean_squares: Array, condition: str | None = None) -> Array:
-        """Return the level over the bound in dB, shape (...), of mean squares of shape (..., q, bands), in one condition or any."""
+        """Return the level over the bound in dB, (...), of mean squares (..., q, bands), in a condition or any."""
         return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(
             condition
         )
@@ -239,7 +215,8 @@ class Monitor:
         """
         if condition is not None and condition not in self.bounds:
             raise ConfigError(
-                f"Monitor of an observer: the condition {condition!r} is unknown; known are {', '.join(self.bounds) or 'none'}."
+                f"Monitor of an observer: the condition {condition!r} is unknown; known are "
+                f"{', '.join(self.bounds) or 'none'}."
             )
         return 0.0 if condition is None else float(self.bounds[condition])
 
@@ -248,15 +225,8 @@ class Monitor:
         return float(10 ** (self.bound(condition) * WEIGHT / 10))
 
 
-def _apart(signal: Array) -> Array:
-    """Return every sample minus that two before."""
-    return np.asarray(
-        signal - np.concatenate([np.zeros((*signal.shape[:-1], 2)), signal], axis=-1)[..., : signal.shape[-1]]
-    )
-
-
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
-    """Return band-pass filters of the second order an octave apart, shape (count, 3); the highest is centred at half of the Nyquist frequency."""
+    """Return band-pass filters of order two, (count, 3), an octave apart, from half the Nyquist frequency down."""
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
     alpha = np.sin(w) / (2 * quality)
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
@@ -271,20 +241,13 @@ def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
-    """Return which samples are judged, shape (n_samples, batch), as a running observer does it; status (n_samples, batch)."""
-    judged, bad = np.zeros(status.shape, dtype=bool), status != 0
-    events = bad | starts | ~moving
-    for machine, own in enumerate(judged.T):
-        wait = after = 0  # samples that are not judged yet; the sample behind the latest event
-        for k in [*np.flatnonzero(events[:, machine]).tolist(), len(own)]:
-            own[after + wait : k] = True
-            wait, after = max(wait - (k - after), 0), k + 1
-            if k == len(own):
-                break
-            wait = settle if starts[k, machine] else wait
-            if moving[k, machine]:
-                own[k] = wait == 0 and not bad[k, machine]
-                wait = min(wait + RECOVERY, settle) if bad[k, machine] else max(wait - 1, 0)
+    """Return which samples are judged, as a running observer does it; status and flags (n_samples, batch)."""
+    judged, bad, wait = np.zeros(status.shape, dtype=bool), status != 0, np.zeros(status.shape[1], dtype=int)
+    for k in range(len(status)):
+        wait = np.where(starts[k], settle, wait)  # samples that are not judged yet
+        judged[k] = moving[k] & ~bad[k] & (wait == 0)
+        following = np.where(bad[k], np.minimum(wait + RECOVERY, settle), np.maximum(wait - 1, 0))
+        wait = np.where(moving[k], following, wait)
     return judged
 
 

@@ -60,7 +60,8 @@ class Observer(ObserverData):
     ) -> RunningObserver:
         """Return a running observer that starts at a first measurement, shape (q,).
 
-        The machine's own lifting parameters are given by name, ``start(y, phase=1.2)``, or as a mapping; the nominal unit's stand for others.
+        The machine's own lifting parameters are given by name, ``start(y, phase=1.2)``, or as a mapping; the nominal
+        unit's stand for others.
 
         Raises
         ------
@@ -82,7 +83,7 @@ class Observer(ObserverData):
         Raises
         ------
         DataError
-            The content does not fit its checksum; a key is missing, unknown or of the wrong kind; a matrix has another shape, or an entry that is
-            not a finite number; names repeat; an index or the period is out of range.
+            The content does not fit its checksum; a key is missing, unknown or of the wrong kind; a matrix has another
+            shape, or an entry that is not a finite number; names repeat; an index or the period is out of range.
         """
         return cls(**vars(read_observer(Path(path))))

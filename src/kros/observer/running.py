@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import UserDict, deque
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,9 +14,9 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .data import ObserverData
 from .monitor import Watch
-from .samples import LONGEST, Held, SampleStatus, Screened
-from .screen import Screen
-from .step import Steps
+from .screen import LONGEST, Held, SampleStatus, Screen
+from .simulate import Restarts
+from .step import Steps, forward
 from .tracking import PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
@@ -81,12 +82,9 @@ class RunningObserver:
     def __init__(self, observer: ObserverData, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
         self._screen = Screen.of(observer)
-        self._steps, self._ahead = Steps([observer], 1, {}), Steps([observer], 1, {})
+        self._steps = Steps(observer, 1, {})
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
         self._measured = tuple(observer.lifting.states[i] for i in observer.measured)
-        self._limits = observer.runtime if observer.runtime.binding else None
-        self._filter_gain: Array | None = None
-        self._unknown = np.ones((1, len(observer.measured)), dtype=bool)
         self._loop: PhaseLockedLoop | None = None
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
@@ -99,17 +97,17 @@ class RunningObserver:
 
     @property
     def parameters(self) -> MutableMapping[str, float]:
-        """The machine's lifting parameters; a name that the lifting does not have is refused, and a value that is not finite."""
+        """The machine's lifting parameters; an unknown name, or a value that is not finite, is refused."""
         return self._parameters
 
     @parameters.setter
     def parameters(self, values: Mapping[str, float]) -> None:
         """Change all of them."""
         self._parameters = _Checked(self.observer, values)
-        self._steps.values = self._ahead.values = self._parameters.plain
+        self._steps.values = self._parameters.data
 
     def track(self, name: str, settle_s: float | None = None) -> None:
-        """Let one of the parameters follow the machine from now on; see `PhaseLockedLoop`, and `parameters` for its value.
+        """Let one of the parameters follow the machine from now on (`PhaseLockedLoop`).
 
         Raises
         ------
@@ -125,12 +123,12 @@ class RunningObserver:
 
     @property
     def level_db(self) -> float | None:
-        """Level of the innovation over the bound of the population in dB; above zero the machine is outside, None without a monitor."""
+        """Level of the innovation over its bound in dB, above zero outside; None without a monitor."""
         return None if self._watch is None else self._watch.level_db
 
     @property
     def condition(self) -> str | None:
-        """Recorded condition that the machine is in, whose bound its innovation is held against; None for that of all conditions.
+        """Recorded condition that the machine is in, by whose bound it is judged; None for any.
 
         Raises
         ------
@@ -151,10 +149,9 @@ class RunningObserver:
 
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
-        first = self._judge(self._measurement(y), np.zeros(len(self.observer.inputs)))
+        first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(self.observer.inputs))))
         self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
-        self._known: Array | None = None
-        self._settling = 0
+        self._restarts = Restarts(self.observer.guard, 1)
         self._fresh = bool(np.isfinite(first.y).any())
         if self._watch is not None:
             self._watch.reset()
@@ -168,20 +165,23 @@ class RunningObserver:
             self._watch.begin()
         self._inputs: deque[Array] = deque()
 
+    @cached_property
+    def _filter_gain(self) -> Array:
+        return self.observer.filter_gain
+
     @property
     def estimate(self) -> Estimate:
         """One-step prediction: the state at k from what arrived up to k - 1."""
-        return self._forward(self._steps.x[0, 0])
+        return self._forward(self._steps.x)
 
     def filter(self, y: npt.ArrayLike) -> Estimate:
-        """Return the estimate of the state at k from what arrived up to k, y of shape (q,), NaN where a measurement is missing; nothing moves on."""
+        """Return the estimate for k from what arrived up to k, y (q,), NaN where missing; nothing moves on."""
         o = self.observer
         if len(self._inputs) < o.runtime.delay:
             return self.estimate
-        nu = self._steps.innovation(self._judge(self._measurement(y), np.zeros(len(o.inputs))).y[0])[0, 0]
-        if self._filter_gain is None:
-            self._filter_gain = o.filter_gain
-        return self._forward(o.runtime.relifted(self._steps.x[0, 0] + self._filter_gain @ nu))
+        given = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(o.inputs)))).y[0]
+        nu = np.where(np.isfinite(given), self._steps.innovation(given), 0.0)
+        return self._forward(self._steps.x + nu @ self._filter_gain.T)
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -191,7 +191,8 @@ class RunningObserver:
         y : array_like, shape (q,)
             NaN, or infinite, where a measurement is missing or too old: it corrects nothing at this step.
         u : array_like, shape (m,)
-            Not finite where it is not known: the last good value stands for it, zero before the first. What is implausible: see `screen`.
+            Not finite where it is not known: the last good value stands for it, zero before the first. What is
+            implausible: see `screen`.
 
         Returns
         -------
@@ -203,61 +204,39 @@ class RunningObserver:
         DimensionError
             When there are not as many measurements or inputs as the observer has.
         """
-        measurement, known = self._take(self._measurement(y), self._input(u))
-        self._inputs.append(known)
+        sample = self._screen.take(self._measurement(y)[None, None], self._input(u)[None, None], self._held)
+        self._status, self._held = SampleStatus(int(sample.status[0, 0])), sample.held
+        begins = bool(sample.starts[0, 0])
+        if self._fresh and not (sample.held.since > LONGEST).any():  # it was started at this sample
+            self._held = replace(sample.held, stale=np.zeros(1, dtype=bool))
+            begins = begins and self.observer.bank is not None
+        self._fresh = False
+        if begins:
+            self._begin(sample.y[0], sample.u[0])
+        self._inputs.append(sample.u[0])
         if len(self._inputs) > self.observer.runtime.delay:
-            taken = self._inputs.popleft()
-            if not self._steps.waiting[0, 0]:
-                self._advance(measurement, taken)
-        if self._steps.waiting[0, 0] or self._settling:
+            self._advance(sample.y[0], self._inputs.popleft())
+        if self._restarts.after(self._steps.waiting)[0]:
             self._status |= SampleStatus.RESTARTED
-            self._settling = max(self._settling - 1, 0)
-        if self._steps.waiting[0, 0]:
-            held = self._held if self._known is None else Held.good(self._known[None])
-            self._held, self._known = replace(held, stale=np.ones(1, dtype=bool)), None
-            self._settling = 0 if self.observer.guard is None else self.observer.guard.settle
+        if self._steps.waiting[0]:
+            self._held = replace(self._held, stale=np.ones(1, dtype=bool))
         if self._watch is not None and self._watch.outside:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
 
-    def _advance(self, measurement: Array, taken: Array) -> None:
+    def _advance(self, y: Array, u: Array) -> None:
         """Take the step of a sample, with the input of its time."""
-        steps, absent = self._steps, None
-        if self._status and not (there := np.isfinite(measurement)).all():
-            absent = ~there
+        steps = self._steps
+        if steps.waiting[0]:
+            return
         if self._watch is not None:
-            self._watch.take(steps.apart(measurement)[0, 0].tolist(), not self._status)
+            self._watch.take(steps.innovation(y)[0].tolist(), not self._status)
         if self._loop is None:
-            steps.step(measurement, taken, absent)
+            steps.step(y, u)
         else:
-            self.parameters[self._loop.name] = float(self._loop.step(steps, measurement, taken, absent)[0])
-        if self._limits is not None and not steps.waiting[0, 0] and self._limits.binds(steps.x[0, 0], steps.correction):
+            self.parameters[self._loop.name] = float(self._loop.step(steps, y, u)[0])
+        if not steps.waiting[0] and self.observer.runtime.binds(steps.x[0]):
             self._status |= SampleStatus.LIMIT
-
-    def _judge(self, y: Array, u: Array, held: Held | None = None) -> Screened:
-        return self._screen.take(y[None, None], u[None, None], held)
-
-    def _take(self, y: Array, u: Array) -> tuple[Array, Array]:
-        """Judge a sample, and start again where that is due; the first sample is the one that the observer started at."""
-        before, self._known = self._known, None
-        if before is not None:
-            status = self._screen.at_once(y.tolist(), u.tolist())
-            if status is not None:
-                self._known, self._status = u, status
-                return y[None], u[None]
-            self._held = Held.good(before[None])
-        samples = self._judge(y, u, self._held)
-        self._status, self._held = SampleStatus(int(samples.status[0, 0])), samples.held
-        first, self._fresh = self._fresh, False
-        if first and not (samples.held.since > LONGEST).any():
-            self._held = replace(samples.held, stale=np.zeros(1, dtype=bool))
-            if self.observer.bank is not None and samples.starts[0, 0]:
-                self._begin(samples.y[0], samples.u[0])
-        elif samples.starts[0, 0]:
-            self._begin(samples.y[0], samples.u[0])
-        if not (self._held.stale[0] or self._held.since.any()):
-            self._known = samples.u[0, 0]
-        return samples.y[0], samples.u[0]
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
         return self._shaped(y, "measurements", self._measured)
@@ -269,45 +248,30 @@ class RunningObserver:
         array = np.array(values, dtype=float, ndmin=1)  # a copy: the caller may use its memory again
         if array.shape != (len(names),):
             raise DimensionError(
-                f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape ({len(names)},), "
-                f"found shape {array.shape}."
+                f"Running observer {self.observer.name}: expected the {len(names)} {what} {', '.join(names)}, shape "
+                f"({len(names)},), found shape {array.shape}."
             )
         return array
 
     def _forward(self, x: Array) -> Estimate:
-        """Predict through the model over the inputs that no measurement has met yet."""
-        if not self._inputs:
-            return self._given(x)
-        ahead = self._ahead
-        ahead.place(x[None], self._steps.earlier(self._inputs[0])[0])
-        for u in self._inputs:
-            ahead.step(np.zeros(self._unknown.shape), u, self._unknown)
-        return self._given(ahead.x[0, 0])
-
-    def _given(self, x: Array) -> Estimate:
-        return Estimate(self._places, x.copy() if self._limits is None else self._limits.clip_estimate(x.copy()))
+        """Predict states, shape (1, n), through the model over the inputs that no measurement has met yet."""
+        if self._inputs:
+            earlier, ahead = self._steps.earlier(self._inputs[0]), np.array(self._inputs)
+            x = forward(self.observer, self._steps.values, np.array([len(ahead)]), x, earlier, ahead)
+        return Estimate(self._places, self.observer.runtime.clip_estimate(x[0].copy()))
 
 
-class _Checked(MutableMapping[str, float]):
-    """Parameters of one machine; what the lifting does not know, or cannot use, does not get in. `plain` holds what did."""
+class _Checked(UserDict[str, float]):
+    """Parameters of one machine; what the lifting does not know, or cannot use, does not get in."""
 
     def __init__(self, observer: ObserverData, values: Mapping[str, float]) -> None:
-        self._observer = observer
-        self.plain = observer.values(values, ())
-
-    def __getitem__(self, name: str) -> float:
-        return float(self.plain[name])
+        super().__init__()
+        self._observer, self.data = observer, observer.values(values, ())
 
     def __setitem__(self, name: str, value: float) -> None:
-        self.plain.update(self._observer.values({**self.plain, name: value}, ()))
+        self.data.update(self._observer.values({**self.data, name: value}, ()))
 
     def __delitem__(self, name: str) -> None:
         raise ConfigError(
             f"Running observer {self._observer.name}: the parameter {name!r} cannot be taken away; change its value."
         )
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self.plain)
-
-    def __len__(self) -> int:
-        return len(self.plain)

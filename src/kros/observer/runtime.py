@@ -1,9 +1,9 @@
-"""Delay of measurements, limits, and the largest sizes seen in training: data of the machine that an observer runs on."""
+"""Delay, limits, guard and ranges: data of the machine that an observer runs on."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,7 +51,7 @@ class Seen:
                 )
 
     def times(self, measured: Array, inputs: Array) -> Seen:
-        """Return the sizes in other units of measure, by the factors of measurements, shape (q,), and inputs, shape (m,)."""
+        """Return the sizes in other units of measure, by the factors of measurements, (q,), and inputs, (m,)."""
         return Seen(self.measured * measured, self.inputs * inputs)
 
 
@@ -62,17 +62,11 @@ class Runtime:
     Parameters
     ----------
     delay : int
-        Samples by which measurements are delayed: what arrives at k was measured at ``k - delay``. The estimate is corrected as of then and
-        predicted forward through the model.
+        Samples by which measurements are delayed: what arrives at k was measured at ``k - delay``. The estimate is
+        corrected as of then and predicted forward through the model.
     lower, upper : ndarray, shape (n,), optional
-        Limits of the estimate, state by state.
-    relift : bool
-        Whether the observer goes on from its estimate within the limits; otherwise these only cut off what it gives out. A model of a machine under
-        control need not be stable with a state that is stuck: what is cut off is safe for every observer, the other for one that was made for it.
-    correction : ndarray, shape (width,), optional
-        Largest size of every correction.
-    input_lower, input_upper : ndarray, shape (m,), optional
-        Limits of the recorded inputs. What is beyond them is taken at the limit, as measurements are beyond the limits of their states.
+        Limits of the estimates that are given out, state by state. The observer goes on from its estimate without
+        them: a model of a machine under control need not be stable with a state that is stuck.
 
     Raises
     ------
@@ -91,147 +85,138 @@ class Runtime:
     delay: int = 0
     lower: Array | None = None
     upper: Array | None = None
-    correction: Array | None = None
-    input_lower: Array | None = None
-    input_upper: Array | None = None
-    relift: bool = True
 
     def __post_init__(self) -> None:
+        what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
-            raise DataError(
-                f"Runtime of an observer: the delay of {self.delay} should be a whole number of samples, at least 0."
-            )
-        for name in _ARRAYS:
-            value = getattr(self, name)
-            if value is not None:
-                object.__setattr__(self, name, np.asarray(value, dtype=float))
-                if np.isnan(getattr(self, name)).any():
-                    raise DataError(
-                        f"Runtime of an observer: {name} contains what is not a number; leave limits out, or make them infinite."
-                    )
-        for lower, upper in ((self.lower, self.upper), (self.input_lower, self.input_upper)):
-            if lower is not None and upper is not None and np.any(lower > upper):
-                raise DataError(
-                    f"Runtime of an observer: lower limits {lower} should not exceed the upper ones {upper}."
-                )
-        if self.correction is not None and np.any(self.correction < 0):
-            raise DataError(f"Runtime of an observer: the largest corrections {self.correction} should be positive.")
+            raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
+        for name, value in self.limits().items():
+            object.__setattr__(self, name, np.asarray(value, dtype=float))
+            if np.isnan(getattr(self, name)).any():
+                raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
+        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
+            raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
-    @property
-    def limited(self) -> bool:
-        """Whether a step meets limits."""
-        return self.correction is not None or (
-            self.relift and any(side is not None for side in (self.lower, self.upper))
-        )
-
-    @property
-    def binding(self) -> bool:
-        """Whether there is any limit that an estimate or a correction may meet."""
-        return any(limit is not None for limit in (self.correction, self.lower, self.upper))
+    def limits(self) -> dict[str, Array]:
+        """Return the limits that there are, by name."""
+        return {name: side for name, side in (("lower", self.lower), ("upper", self.upper)) if side is not None}
 
     def limited_states(self, n: int) -> list[int]:
         """Return which of n states have limits."""
-        sides = [np.isfinite(side) for side in (self.lower, self.upper) if side is not None]
+        sides = [np.isfinite(side) for side in self.limits().values()]
         return [int(i) for i in np.flatnonzero(np.any(sides, axis=0))] if sides else []
 
-    def clipped_states(self, n: int) -> list[int]:
-        """Return which of n states an observer goes on from within their limits."""
-        return self.limited_states(n) if self.relift else []
-
-    def limited_corrections(self, into: Array) -> list[int]:
-        """Return which corrections have a limit and reach a state; `into`, shape (n, width), is where they enter."""
-        return (
-            []
-            if self.correction is None
-            else [int(i) for i in np.flatnonzero(np.isfinite(self.correction) & np.any(into, axis=0))]
-        )
-
-    def binds(self, x: Array, y_c: Array | None) -> bool:
-        """Whether an estimate, shape (n,), meets a limit, or a correction, shape (width,), exceeds one; None where corrections have none."""
-        at = [
-            limit is not None and np.any(meets(limit))
-            for limit, meets in ((self.lower, x.__le__), (self.upper, x.__ge__))
-        ]
-        return bool(any(at)) or (
-            self.correction is not None and y_c is not None and bool(np.any(np.abs(y_c) > self.correction))
-        )
+    def binds(self, x: Array) -> bool:
+        """Whether an estimate, (n,), meets a limit."""
+        low = self.lower is not None and bool(np.any(x <= self.lower))
+        return low or (self.upper is not None and bool(np.any(x >= self.upper)))
 
     def clips_alike(self, other: Runtime) -> bool:
-        """Whether two observers' estimates have the same limits, and their corrections none."""
-        pairs = ((self.lower, other.lower), (self.upper, other.upper))
-        same = all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
-        return same and self.relift == other.relift and self.correction is None and other.correction is None
+        """Whether two observers have the same delay, and their estimates the same limits."""
+        ours, theirs = self.limits(), other.limits()
+        same = ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
+        return same and self.delay == other.delay
 
     def clip_estimate(self, x: Array) -> Array:
-        """Return estimates within their limits, shape (..., n)."""
-        if self.lower is None and self.upper is None:
-            return x
-        return np.asarray(np.clip(x, self.lower, self.upper))
+        """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
+        low, high = (side if side is None else side[: x.shape[-1]] for side in (self.lower, self.upper))
+        return x if low is None and high is None else np.asarray(np.clip(x, low, high))
 
-    def clip_estimates(self, x: Array) -> None:
-        """Bring estimates, shape (..., n), within their limits where they are."""
-        for i in self.limited_states(x.shape[-1]):
-            low, high = (
-                none if side is None else side[i] for side, none in ((self.lower, -np.inf), (self.upper, np.inf))
-            )
-            np.clip(x[..., i], low, high, out=x[..., i])
+    def times(self, x: Array) -> Runtime:
+        """Return the same in other units of measure, by the factors of the states."""
+        changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
+        return replace(self, **changes)
 
-    def within(self, states: Array) -> Array:
-        """Return recorded states, shape (..., n_recorded), within the limits that they have."""
-        low, high = (side if side is None else side[: states.shape[-1]] for side in (self.lower, self.upper))
-        return states if low is None and high is None else np.asarray(np.clip(states, low, high))
-
-    def relifted(self, x: Array) -> Array:
-        """Return the estimates that an observer goes on from, shape (..., n)."""
-        return self.clip_estimate(x) if self.relift else x
-
-    def clip_correction(self, y_c: Array) -> Array:
-        """Return corrections within their limits, shape (..., width)."""
-        return y_c if self.correction is None else np.asarray(np.clip(y_c, -self.correction, self.correction))
-
-    def clip_inputs(self, u: Array) -> Array:
-        """Return inputs within their limits, shape (..., m)."""
-        return (
-            u
-            if self.input_lower is None and self.input_upper is None
-            else np.asarray(np.clip(u, self.input_lower, self.input_upper))
-        )
-
-    def require_fit(self, name: str, n: int, width: int, m: int) -> None:
+    def require_fit(self, name: str, n: int) -> None:
         """Refuse limits of another size than the observer's."""
-        wanted = {"lower": (n,), "upper": (n,), "correction": (width,), "input_lower": (m,), "input_upper": (m,)}
-        for key, shape in wanted.items():
-            value = getattr(self, key)
-            if value is not None and value.shape != shape:
-                raise DimensionError(f"Observer {name}: runtime.{key} should have shape {shape}, found {value.shape}.")
+        for key, limit in self.limits().items():
+            if limit.shape != (n,):
+                raise DimensionError(f"Observer {name}: runtime.{key} should have shape ({n},), found {limit.shape}.")
 
     def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it: nothing where everything is as by default."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS if getattr(self, name) is not None}
-        found: dict[str, Any] = ({"delay": int(self.delay)} if self.delay else {}) | (
-            {} if self.relift else {"relift": False}
-        )
-        found |= {k: _finite(v) for k, v in arrays.items()}
-        return {"runtime": found} if found else {}
+        """Return what an observer's file holds of it: nothing that is as by default."""
+        return ({"delay": int(self.delay)} if self.delay else {}) | self.limits()
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
-        """Read what `content` returned; a limit that is null is infinite."""
-        found = dict(content.get("runtime", {}))
-        for name in _ARRAYS:
-            if name in found:
-                values = np.array(found[name], dtype=object)
-                values[values == None] = -np.inf if name.endswith("lower") else np.inf  # noqa: E711
-                found[name] = values.astype(float)
-        return cls(**found)
+        """Read what `content` returned; null stands for what is infinite."""
+        values = dict(content)
+        for name, none in (("lower", -np.inf), ("upper", np.inf)):
+            if values.get(name) is not None:
+                values[name] = np.array([none if limit is None else limit for limit in values[name]], dtype=float)
+        return cls(**values)
 
 
-_ARRAYS = ("lower", "upper", "correction", "input_lower", "input_upper")
+@dataclass(frozen=True, eq=False)
+class Guard:
+    """Bounds of the states of an observer, and how long a start takes.
+
+    An observer is stable with the measurements that it was made for. Without some of them it runs on its own
+    predictions, which may grow. The step that would leave the bounds is not taken, the estimate stands still, and at
+    the next sample with a measurement and all inputs the observer starts as it did at first. `SampleStatus.RESTARTED`
+    is set from there on until the start has settled.
+
+    Parameters
+    ----------
+    lower, upper : ndarray, shape (n,)
+        Of the estimate, internal states included.
+    correction : ndarray, shape (n_c,)
+        Largest size of every state of the correction.
+    settle : int
+        Samples after a start until the estimate is as good as before.
+
+    Raises
+    ------
+    DataError
+        When a bound is not a number, a lower one is not below its partner, or `settle` is negative.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.observer import Guard
+    >>> Guard(np.array([-2.0]), np.array([2.0]), np.zeros(0), settle=50).upper.tolist()
+    [2.0]
+    """
+
+    lower: Array
+    upper: Array
+    correction: Array
+    settle: int
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper", "correction"):
+            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
+        if not (np.all(self.lower < self.upper) and np.all(self.correction > 0) and self.settle >= 0):
+            raise DataError(
+                f"Guard of an observer: lower bounds {self.lower} should be below the upper ones {self.upper}, sizes "
+                f"{self.correction} of the correction above zero, and {self.settle} samples to settle at least 0."
+            )
+
+    def times(self, x: Array) -> Guard:
+        """Return the guard of states multiplied by factors, shape (n,); states of the correction stay."""
+        return replace(self, lower=self.lower * x, upper=self.upper * x)
+
+    def turned(self, turn: Array) -> Guard:
+        """Return the smallest box around the states ``turn @ x``, shape (n, n)."""
+        middle, half = turn @ (self.lower + self.upper) / 2, np.abs(turn) @ (self.upper - self.lower) / 2
+        return replace(self, lower=middle - half, upper=middle + half)
+
+    def require_fit(self, name: str, n: int, order: int) -> None:
+        """Refuse bounds of another size than the observer's."""
+        shapes = (self.lower.shape, self.upper.shape, self.correction.shape)
+        if shapes != ((n,), (n,), (order,)):
+            raise DimensionError(
+                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes "
+                f"{shapes}."
+            )
 
 
-def _finite(value: Array) -> list[Any]:
-    """JSON has no infinity: null stands for it."""
-    plain = value.astype(object)
-    plain[~np.isfinite(value)] = None
-    nested: list[Any] = plain.tolist()
-    return nested
+def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:
+    """Return the bounds of [x; x^c], those of a padded correction too: products of what is within are finite."""
+    most = float(np.sqrt(np.finfo(float).max))
+    low, high = np.full(n + order, -most), np.full(n + order, most)
+    if guard is not None:
+        size = n + len(guard.correction)
+        high[:size] = np.minimum(np.append(guard.upper, guard.correction), most)
+        low[:size] = np.maximum(np.append(guard.lower, -guard.correction), -most)
+    return low, high

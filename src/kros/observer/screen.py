@@ -9,32 +9,122 @@ A sample is judged by itself, before the observer sees it:
 | a sample beyond a declared limit | the limit | `LIMIT` |
 | a sample beyond 1.5 times its range | as if it were missing, or not finite | `LIMIT` |
 
-The range is the largest size seen in training, or that of the declared limits; without either a sample has none. An input with declared limits has
-none either: however large a command is, the machine gets the limit. So nothing that is far from anything possible enters a state, linear or
-lifted, and what is left of a fault is what the model misses while it lasts.
+The range is the largest size seen in training, or that of the declared limits; without either a sample has none. So
+nothing that is far from anything possible enters a state, linear or lifted, and what is left of a fault is what the
+model misses while it lasts.
 
-Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest, and the observer starts
-again at the first sample at which there are both. It does so, too, after an input was held for more than a few samples: what a held reference
-does to an observer that watches tracking errors grows with every sample, and a start costs no more than a start. Parameters stay.
+Observers start at a measurement. Where none has arrived yet, or no value of some input, the estimate is that from rest,
+and the observer starts again at the first sample at which there are both. It does so, too, after an input was held for
+more than a few samples: what a held reference does to an observer that watches tracking errors grows with every sample,
+and a start costs no more than a start. Parameters stay.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
-from math import isfinite
+from enum import IntFlag
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import DimensionError
 from .data import ObserverData
-from .runtime import Seen
-from .samples import LONGEST, Bits, Flags, Held, SampleStatus, Screened, require_samples
+from .runtime import Runtime, Seen
 
 Array = npt.NDArray[np.float64]
+Bits = npt.NDArray[np.uint8]
+Whole = npt.NDArray[np.intp]
+Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _ANY = np.finfo(float).max
+
+
+LONGEST = 5  # samples for which an input may be held without a new start
+
+
+class SampleStatus(IntFlag):
+    """What was wrong with a sample; bits add up.
+
+    GOOD
+        Nothing.
+    MISSING
+        A measurement is missing or not finite. It corrected nothing.
+    INVALID_INPUT
+        An input is not finite. The last good value stood for it.
+    LIMIT
+        A sample is beyond its limit or 1.5 times its range, or the estimate or the correction met a limit that is
+        declared.
+    UNCERTIFIED
+        Outside what the observer is certified for: the innovation is beyond the envelope of the population (see
+        `monitor`).
+    RESTARTED
+        The estimate left its bounds, as it may while samples are lost: the observer waits for a good sample to start
+        at, or that start has not settled yet.
+
+    Examples
+    --------
+    >>> from kros.observer import SampleStatus
+    >>> status = SampleStatus.MISSING | SampleStatus.LIMIT
+    >>> SampleStatus.MISSING in status, SampleStatus.UNCERTIFIED in status
+    (True, False)
+    """
+
+    GOOD = 0
+    MISSING = 1
+    INVALID_INPUT = 2
+    LIMIT = 4
+    UNCERTIFIED = 8
+    RESTARTED = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """Inputs held from sample to sample."""
+
+    inputs: Array  # (batch, m)
+    since: Whole  # (batch, m)
+    stale: Flags  # (batch,)
+
+    @classmethod
+    def nothing(cls, batch: int, m: int) -> Held:
+        """Return what is known before the first sample."""
+        return cls(np.zeros((batch, m)), np.full((batch, m), LONGEST + 1), np.ones(batch, dtype=bool))
+
+
+@dataclass(frozen=True, eq=False)
+class Screened:
+    """Samples as an observer takes them."""
+
+    y: Array  # (n_samples, batch, q)
+    u: Array  # (n_samples, batch, m)
+    status: Bits  # (n_samples, batch)
+    starts: Flags  # (n_samples, batch)
+    complete: Flags  # (n_samples, batch); An observer may start at them
+    held: Held
+
+    def of(self, members: Sequence[int] | Whole) -> Screened:
+        """Return the samples of some members of the batch."""
+        held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
+        y, u, at = self.y[:, members], self.u[:, members], (slice(None), members)
+        return Screened(y, u, self.status[at], self.starts[at], self.complete[at], held)
+
+
+def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
+    """Refuse measurements and inputs that do not fit together, or to an observer."""
+    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2] or not len(y):
+        raise DimensionError(
+            f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a "
+            "last axis for their channels and at least one sample."
+        )
+    if u.shape[2] != len(inputs):
+        raise DimensionError(
+            f"Running {who}: expected inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}."
+        )
+    if y.shape[2] != measured:
+        raise DimensionError(
+            f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,62 +137,20 @@ class Bounds:
     most: Array
 
     @classmethod
-    def of_measurements(
-        cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None
-    ) -> Bounds:
-        """Return the bounds that follow from declared limits of the states and sizes seen in training, where there are any."""
-        low, high, size = _declared(count, lower, upper, seen)
-        far = BEYOND * np.maximum(
-            np.where(np.isfinite(low), np.abs(low), size), np.where(np.isfinite(high), np.abs(high), size)
-        )
-        return cls(low, high, -np.minimum(far, _ANY), np.minimum(far, _ANY))
-
-    @classmethod
-    def of_inputs(
-        cls, count: int, lower: Array | None = None, upper: Array | None = None, seen: Array | None = None
-    ) -> Bounds:
-        """Return those of inputs, which are plausible beyond a declared limit: the machine gets the limit."""
-        low, high, size = _declared(count, lower, upper, seen)
-        far = np.minimum(BEYOND * size, _ANY)
-        return cls(low, high, np.where(np.isfinite(low), -_ANY, -far), np.where(np.isfinite(high), _ANY, far))
-
-    def pass_all(self, values: Array) -> bool:
-        """Whether all samples, shape (..., channels), are good as they are."""
-        channels = ((values[..., i], *sides) for i, sides in enumerate(self.good))
-        return all(
-            bool(least <= own.min(initial=least) and own.max(initial=most) <= most) for own, least, most in channels
-        )
-
-    @cached_property
-    def good(self) -> list[tuple[float, float]]:
-        """Between which values a sample of every channel is good as it is."""
-        return list(
-            zip(np.maximum(self.lower, self.least).tolist(), np.minimum(self.upper, self.most).tolist(), strict=True)
-        )
-
-    def pass_one(self, values: Sequence[float]) -> bool:
-        """Whether one sample is good as it is, as `pass_all` for many: a comparison with what is not a number is false."""
-        return all(least <= value <= most for value, (least, most) in zip(values, self.good, strict=True))
-
-    def pass_where_there(self, values: Sequence[float]) -> bool:
-        """Whether one sample is good but for channels that are missing."""
-        return all(
-            least <= value <= most or not isfinite(value)
-            for value, (least, most) in zip(values, self.good, strict=True)
-        )
+    def of(cls, count: int, seen: Array | None, lower: Array | None = None, upper: Array | None = None) -> Bounds:
+        """Return the bounds from sizes seen in training and declared limits, where there are any."""
+        low = np.full(count, -np.inf) if lower is None else lower
+        high = np.full(count, np.inf) if upper is None else upper
+        size = np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
+        sides = [np.where(np.isfinite(side), np.abs(side), size) for side in (low, high)]
+        far = np.minimum(BEYOND * np.maximum(*sides), _ANY)
+        return cls(low, high, -far, far)
 
     def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
-        """Return samples within their limits, which of them are plausible, and which are beyond a limit or their range."""
+        """Return samples within limits, which are plausible, and which were beyond a limit or their range."""
         plausible = (values >= self.least) & (values <= self.most)
-        kept = np.clip(values, self.lower, self.upper)
-        return kept, plausible, np.isfinite(values) & (~plausible | (kept != values))
-
-
-def _declared(count: int, lower: Array | None, upper: Array | None, seen: Array | None) -> tuple[Array, Array, Array]:
-    low, high = (
-        np.full(count, side) if given is None else given for side, given in ((-np.inf, lower), (np.inf, upper))
-    )
-    return low, high, np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
+        within = np.clip(values, self.lower, self.upper)
+        return within, plausible, np.isfinite(values) & (~plausible | (within != values))
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,32 +168,20 @@ class Screen:
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
-        at, limits, seen = list(observer.measured), observer.runtime, observer.seen
-        lower, upper = (None if side is None else side[at] for side in (limits.lower, limits.upper))
-        sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
-        measured = Bounds.of_measurements(len(at), lower, upper, sizes[0])
-        return cls(measured, Bounds.of_inputs(len(observer.inputs), limits.input_lower, limits.input_upper, sizes[1]))
+        at, limits = list(observer.measured), observer.runtime
+        return cls.sized(observer.seen, len(at), len(observer.inputs), limits, at)
 
     @classmethod
-    def sized(cls, seen: Seen | None, q: int, m: int) -> Screen:
-        """Return the screen of an estimator that declares no limits."""
-        sizes = (None, None) if seen is None else (seen.measured, seen.inputs)
-        return cls(Bounds.of_measurements(q, seen=sizes[0]), Bounds.of_inputs(m, seen=sizes[1]))
-
-    def at_once(self, y: Sequence[float], u: Sequence[float]) -> SampleStatus | None:
-        """Return the status of one sample that is taken as it is, good or without some measurements; None for one that `take` has to judge."""
-        if not self.inputs.pass_one(u):
-            return None
-        if self.measured.pass_one(y):
-            return SampleStatus.GOOD
-        return SampleStatus.MISSING if self.measured.pass_where_there(y) else None
+    def sized(cls, seen: Seen | None, q: int, m: int, limits: Runtime | None = None, at: Sequence[int] = ()) -> Screen:
+        """Return the screen for sizes seen in training, and limits where these are declared."""
+        limits, sizes = limits or Runtime(), (None, None) if seen is None else (seen.measured, seen.inputs)
+        lower, upper = (None if side is None else side[list(at)] for side in (limits.lower, limits.upper))
+        return cls(Bounds.of(q, sizes[0], lower, upper), Bounds.of(m, sizes[1]))
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
-        """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m) in the order in which they arrive; `held` is known before the first."""
+        """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
         before = Held.nothing(*u.shape[1:]) if held is None else held
-        if self.measured.pass_all(y) and self.inputs.pass_all(u):
-            return _as_they_are(y, u, before)
-        kept, plausible, beyond = self.measured.judge(y)
+        measured, plausible, beyond = self.measured.judge(y)
         limited, good, far = self.inputs.judge(u)
         status = _bit(~np.isfinite(y), SampleStatus.MISSING) | _bit(~np.isfinite(u), SampleStatus.INVALID_INPUT)
         status |= _bit(beyond, SampleStatus.LIMIT) | _bit(far, SampleStatus.LIMIT)
@@ -153,18 +189,15 @@ class Screen:
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
         inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
-        lost, complete = (
-            np.asarray((since > LONGEST).any(axis=-1)),
-            np.asarray(good.all(axis=-1) & plausible.any(axis=-1)),
-        )
+        lost = np.asarray((since > LONGEST).any(axis=-1))
+        complete = np.asarray(good.all(axis=-1) & plausible.any(axis=-1))
         starts, stale = _starts(lost, complete, before.stale)
-        return Screened(
-            np.where(plausible, kept, np.nan), inputs, status, starts, complete, Held(inputs[-1], since[-1], stale)
-        )
+        y = np.where(plausible, measured, np.nan)
+        return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
 
 
 def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch); `run_with_status` adds those of the observer.
+    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch).
 
     Examples
     --------
@@ -190,14 +223,8 @@ def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
     return np.where(wrong.any(axis=-1), np.uint8(bit), np.uint8(0))
 
 
-def _as_they_are(y: Array, u: Array, before: Held) -> Screened:
-    starts = np.zeros(y.shape[:2], dtype=bool)
-    starts[0] = before.stale
-    return Screened(y, u, np.zeros(y.shape[:2], np.uint8), starts, np.ones(y.shape[:2], dtype=bool), Held.good(u[-1]))
-
-
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:
-    """Return the complete samples, shape (n_samples, batch), that are the first ones after some input was lost, and whether one is due at the end."""
+    """Return the first complete samples after some input was lost, and whether one is due at the end."""
     count = np.arange(1, len(lost) + 1)[:, None]
     lost_at = np.maximum.accumulate(np.where(lost, count, np.where(stale, 0, -1)), axis=0)
     complete_at = np.maximum.accumulate(np.where(complete, count, -1), axis=0)

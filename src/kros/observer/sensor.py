@@ -1,21 +1,29 @@
-r"""What the sensor of a machine is like: declared, so that design, certificates, baselines and evaluation are told the same.
+r"""What is declared of a machine: its sensors and the limits of its states.
 
 What arrives at sample k of a measured channel y is
 
 .. math:: y_k = Q\bigl(y(t_k - (d + j\,\xi_k)\,\Delta t) + b + \sigma\,\eta_k\bigr),
 
-or nothing with probability p: ``noise`` :math:`\sigma`, ``bias`` b, ``delay_samples`` d, ``jitter_samples`` j, ``dropout`` p, Q rounding to multiples of
-``resolution``, :math:`\xi` and :math:`\eta` white and Gaussian of variance one. It is beside what the recordings already hold.
+or nothing with probability p: ``noise`` :math:`\sigma`, ``bias`` b, ``delay_samples`` d, ``jitter_samples`` j,
+``dropout`` p, Q rounding to multiples of ``resolution``, :math:`\xi` and :math:`\eta` white and Gaussian of variance
+one. It is beside what the recordings already hold. Limits of states, such as the current's, are declared or found in
+the recordings.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
-from pydantic import Field
+import numpy as np
+import numpy.typing as npt
+from pydantic import Field, model_validator
 
 from ..core.errors import ConfigError
 from ..core.settings import Settings
+from ..data.flat_tops import FoundLimit
+
+Array = npt.NDArray[np.float64]
 
 
 class Sensor(Settings):
@@ -39,7 +47,7 @@ class Sensor(Settings):
     dropout: float = Field(0.0, ge=0, lt=1, description="probability that a sample is lost, independently of others")
 
     def variance(self, step: float = 0.0) -> float:
-        """Return the variance of what disturbs a sample at random: noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
+        """Return the variance of noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
         return self.noise**2 + (self.resolution or 0.0) ** 2 / 12 + (self.jitter_samples * step) ** 2
 
     def in_unit(self, size: float) -> Sensor:
@@ -60,7 +68,8 @@ def require_measured(sensor: Sensors, measured: Sequence[str]) -> None:
     delays = {name: sensor.get(name, Sensor()).delay_samples for name in measured}
     if len(set(delays.values())) > 1:
         raise ConfigError(
-            f"sensor: delay_samples should be the same for all measured states, found {delays}; hold back those that arrive early, and declare that."
+            f"sensor: delay_samples should be the same for all measured states, found {delays}; hold back those that "
+            "arrive early, and declare that."
         )
 
 
@@ -72,3 +81,52 @@ def delay_of(sensor: Sensors) -> int:
 def in_units(sensor: Sensors, sizes: Mapping[str, float]) -> dict[str, Sensor]:
     """Return sensors of channels that are divided by sizes, by name; one that is not named stays as it is."""
     return {name: own.in_unit(sizes.get(name, 1.0)) for name, own in sensor.items()}
+
+
+class Limit(Settings):
+    """Limits of one state: ``0.35`` for both sides, ``[-0.2, 0.35]``, ``{upper = 0.35}``, or false for none."""
+
+    lower: float | None = Field(None, description="least value in the state's unit of measure")
+    upper: float | None = Field(None, description="largest value")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _written(cls, raw: Any) -> Any:
+        if raw is False:
+            return {}
+        if isinstance(raw, int | float) and not isinstance(raw, bool):
+            return {"lower": -raw, "upper": raw}
+        if isinstance(raw, list | tuple) and len(raw) == 2:
+            return {"lower": raw[0], "upper": raw[1]}
+        return raw
+
+    @model_validator(mode="after")
+    def _apart(self) -> Limit:
+        if self.lower is not None and self.upper is not None and not self.lower < self.upper:
+            raise ValueError(f"the lower limit {self.lower:g} should be below the upper one, {self.upper:g}")
+        return self
+
+    def in_unit(self, size: float) -> Limit:
+        """Return the same for a channel that is divided by a size."""
+        return Limit(
+            lower=None if self.lower is None else self.lower / size,
+            upper=None if self.upper is None else self.upper / size,
+        )
+
+
+Limits = Mapping[str, Limit]
+
+
+def limits_of(declared: Limits, found: Mapping[str, FoundLimit], states: Sequence[str]) -> dict[str, Limit]:
+    """Return limits by state: what is declared, else what was found."""
+    if unknown := sorted(set(declared) - set(states)):
+        raise ConfigError(f"limits: {', '.join(unknown)} should be among the recorded states, {', '.join(states)}.")
+    of = {name: Limit(lower=own.lower, upper=own.upper) for name, own in found.items()} | dict(declared)
+    return {name: of[name] for name in states if name in of and of[name] != Limit()}
+
+
+def sides(limits: Limits, states: Sequence[str]) -> tuple[Array, Array]:
+    """Return lower and upper limits of some states, infinite where there is none."""
+    own = [limits.get(name, Limit()) for name in states]
+    lower = [-np.inf if one.lower is None else one.lower for one in own]
+    return np.array(lower), np.array([np.inf if one.upper is None else one.upper for one in own])

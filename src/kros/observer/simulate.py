@@ -1,21 +1,21 @@
-"""Observers over many episodes at once."""
+"""Observers over many episodes at once: in the compiled time loop, or step by step in NumPy."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DimensionError
-from ..loops import library
+from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
-from .guard import Restarts
 from .monitor import judged_samples
-from .samples import Bits, Flags, SampleStatus, Screened, Whole
-from .screen import Screen, screened
-from .step import Parameters, Steps
+from .runtime import Guard, bounds
+from .screen import Bits, Flags, SampleStatus, Screen, Screened, Whole, screened
+from .step import Parameters, Steps, forward
 
 Array = npt.NDArray[np.float64]
 _ROWS = 512  # samples predicted forward at a time
@@ -35,7 +35,8 @@ def run_observer(
     y : ndarray, shape (n_samples, batch, q)
         Row k is what arrives at k; NaN or infinite where a measurement is missing, which then corrects nothing.
     u : ndarray, shape (n_samples, batch, m)
-        Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run starts: see `screen`.
+        Not finite where an input is not known: the last good value stands for it. What is implausible, and where a run
+        starts: see `screen`.
     parameters : mapping of str to array_like, shape (batch,)
         Lifting parameters of the machine behind each episode; the observer's own where absent.
 
@@ -58,18 +59,19 @@ def run_observer(
     >>> from kros.lifting import Lifting
     >>> from kros.observer import Observer, run_observer
     >>> from kros.synthesis import Injection
-    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> model = np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",)
+    >>> observer = Observer("x", Lifting(("x",)), *model, gain([[0.5]], 0.01), Injection.STATE, 0.01)
     >>> y = np.array([4.0, 8.0, np.nan, 0.0]).reshape(4, 1, 1)  # sample, episode, measurement; one is missing
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], screened(observer, y, u), parameters)[0]
+    return _run([observer], screened(observer, y, u), parameters).estimates[0]
 
 
 def run_with_status(
     observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
 ) -> tuple[Array, Bits]:
-    """Run an observer as `run_observer` does, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
+    """Run an observer, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
 
     Bits that samples have by themselves, and `RESTARTED`.
 
@@ -88,9 +90,9 @@ def run_with_status(
     >>> estimate.ravel().tolist(), status.ravel().tolist()  # 16 would be too large: it waits for the next measurement
     ([1.0, 2.0, 4.0, 8.0, 8.0, 2.0], [0, 1, 1, 17, 16, 0])
     """
-    samples, status = screened(observer, y, u), np.zeros(np.shape(y)[:2], np.uint8)
-    found = _run([observer], samples, parameters, status)[0]
-    return found, samples.status | status
+    samples = screened(observer, y, u)
+    run = _run([observer], samples, parameters)
+    return run.estimates[0], samples.status | run.status
 
 
 def run_observers(
@@ -119,171 +121,169 @@ def run_observers(
     >>> from kros.synthesis import Injection
     >>> plant = Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",)
     >>> observers = [Observer(f"gain {L}", *plant, gain([[L]], 0.01), Injection.STATE, 0.01) for L in (0.0, 0.5)]
-    >>> run_observers(observers, np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1), np.zeros((3, 1, 1))).reshape(2, 3).tolist()
+    >>> y = np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1)
+    >>> run_observers(observers, y, np.zeros((3, 1, 1))).reshape(2, 3).tolist()
     [[4.0, 2.0, 1.0], [4.0, 2.0, 4.0]]
     """
-    (found,) = run_some_at_a_time(observers, y, u, parameters, len(observers))
-    return found
-
-
-def run_some_at_a_time(
-    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None, count: int
-) -> Iterator[Array]:
-    """Yield what `run_observers` returns, so many observers at a time: estimates of all of them may fill a memory."""
     first = observers[0]
     if any((o.lifting, o.measured, o.inputs) != (first.lifting, first.measured, first.inputs) for o in observers[1:]):
         raise DimensionError(
-            f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run them one by one."
+            f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run "
+            "them one by one."
         )
-    late = first.runtime.delay
-    alone = any(
-        o.bank is not None
-        or o.runtime.delay != late
-        or not o.runtime.clips_alike(first.runtime)
-        or not Screen.of(o).same_as(Screen.of(first))
-        for o in observers
+    screen, late = Screen.of(first), first.runtime.delay and first.lifting.history
+    alike = (
+        o.bank is None and o.runtime.clips_alike(first.runtime) and Screen.of(o).same_as(screen) for o in observers
     )
-    alone |= bool(late and first.lifting.history)
-    samples = None if alone else screened(first, y, u)
-    for start in range(0, len(observers), count):
-        some = observers[start : start + count]
-        if samples is None:
-            each = [_run([o], screened(o, y, u), parameters)[0] for o in some]
-            yield np.stack(each) if len(each) > 1 else each[0][None]
-        else:
-            yield _run(some, samples, parameters)
-
-
-def _run(
-    observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, status: Bits | None = None
-) -> Array:
-    """Run observers on screened samples, shape (observer, n_samples, batch, n); bits of those that start again go into `status`."""
-    if len(observers) > 1 and library() is None:
-        return np.concatenate([_run([o], samples, parameters) for o in observers])
-    if observers[0].bank is not None and (gaps := _with_gaps(samples)) is not None:
-        return _run_apart(observers, samples, parameters, status, gaps)
-    observer, d = observers[0], observers[0].runtime.delay
-    (n_samples, batch), values = samples.starts.shape, observer.values(parameters, samples.starts.shape[1:])
-    steps, pending = Steps(observers, batch, values), _pending(samples.starts, d) if d else None
-    moving = None if pending is None else (pending == d) & ~samples.starts
-    estimates = np.empty((n_samples, len(observers), observer.lifting.n_states, batch))
-    before = None if pending is None else (np.empty((n_samples, batch, len(observer.lifting.window.earlier))), pending)
-    steps.begin(samples.y[0])
-    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
-    steps.through(samples.y, samples.u, d, moving, samples.starts, estimates, before=before)
-    found = estimates.transpose(1, 0, 3, 2)
-    with np.errstate(over="ignore", invalid="ignore"):
-        if before is not None:
-            for own, of_one in zip(observers, found, strict=True):
-                _predict(own, of_one, *before, samples, values)
-        for i, machines in enumerate(np.flatnonzero(own) for own in steps.restart):
-            if len(machines):
-                again = _restarting(
-                    observers[i], samples.of(machines), observers[i].values(_values_of(values, machines))
-                )
-                found[i][:, machines] = again.estimates
-                if status is not None:
-                    status[:, machines] = again.status
-        if observer.runtime.binding:
-            observer.runtime.clip_estimates(found)
-    return found
-
-
-def _with_gaps(samples: Screened) -> Whole | None:
-    """Return the machines of which a measurement is missing, where there are others too; None where the compiled loop takes all or none."""
-    gaps = ~np.isfinite(samples.y).all(axis=(0, 2))
-    return np.flatnonzero(gaps) if gaps.any() and not gaps.all() else None
-
-
-def _run_apart(
-    observers: Sequence[ObserverData],
-    samples: Screened,
-    parameters: Parameters | None,
-    status: Bits | None,
-    gaps: Whole,
-) -> Array:
-    """Run machines with gaps and those without one after the other."""
-    values, batch = observers[0].values(parameters, samples.starts.shape[1:]), samples.starts.shape[1]
-    found = np.empty((len(observers), *samples.y.shape[:2], observers[0].lifting.n_states))
-    for machines in (gaps, np.setdiff1d(np.arange(batch), gaps)):
-        own = None if status is None else status[:, machines].copy()
-        found[:, :, machines] = _run(observers, samples.of(machines), _values_of(values, machines), own)
-        if status is not None and own is not None:
-            status[:, machines] = own
-    return found
-
-
-def _values_of(values: Parameters, machines: Whole) -> dict[str, npt.ArrayLike]:
-    """Return the parameters of some machines."""
-    return {name: value if np.size(value) == 1 else np.asarray(value)[machines] for name, value in values.items()}
-
-
-@dataclass(frozen=True, eq=False)
-class _Restarting:
-    """What an observer does on machines on which its guard starts it again."""
-
-    estimates: Array  # (n_samples, batch, n)
-    innovation: Array  # (n_samples, batch, q)
-    status: Bits  # (n_samples, batch)
-    starts: Flags  # (n_samples, batch)
-    moving: Flags  # (n_samples, batch)
-
-
-def _restarting(observer: ObserverData, samples: Screened, values: Parameters) -> _Restarting:
-    """Step an observer, which starts again at the first complete sample after it left its bounds."""
-    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
-    steps, restarts = Steps([observer], batch, values), Restarts(observer.guard, batch)
-    x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
-    earlier, pending = (
-        np.empty((n_samples, batch, len(observer.lifting.window.earlier))),
-        np.zeros((n_samples, batch), dtype=np.intp),
-    )
-    starts, moving, status = (
-        samples.starts.copy(),
-        np.zeros((n_samples, batch), dtype=bool),
-        np.zeros((n_samples, batch), np.uint8),
-    )
-    since, missing = np.zeros(batch, dtype=np.intp), ~np.isfinite(samples.y)
-    steps.begin(samples.y[0])
-    steps.begin(samples.y[0], starts[0], samples.u[0])
-    for k in range(n_samples):
-        if k:
-            starts[k] |= steps.waiting[0] & samples.complete[k]
-            pending[k] = np.minimum(since + 1, d)
-            since = np.where(starts[k], 0, pending[k])
-        x[k], earlier[k] = steps.x[0], steps.earlier(samples.u[k - pending[k], np.arange(batch)])[0]
-        if k and starts[k].any():
-            steps.begin(samples.y[k], starts[k], samples.u[k])
-        nu[k] = steps.innovation(samples.y[k])[0]
-        moving[k] = (since == d) & ~steps.waiting[0]
-        steps.step(samples.y[k], samples.u[max(k - d, 0)], missing[k], moving[k])
-        status[k][restarts.after(steps.waiting[0])] = SampleStatus.RESTARTED
-    if d:
-        _predict(observer, x, earlier, pending, samples, values)
-    return _Restarting(x, nu, status, starts, moving)
+    if len(observers) > 1 and (late or not all(alike)):
+        return np.stack([run_observer(o, y, u, parameters) for o in observers])
+    return _run(observers, screened(first, y, u), parameters).estimates
 
 
 def run_innovations(
     observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None, settle: int = 0
 ) -> tuple[Array, Flags]:
-    """Return innovations as an observer meets them, and which samples a monitor judges."""
-    samples, values = screened(observer, y, u), observer.values(parameters, np.shape(y)[1:2])
+    """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
+    samples = screened(observer, y, u)
+    run = _run([observer], samples, parameters, innovations=True)
+    run.starts[0] = True
+    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
+
+
+@dataclass(frozen=True, eq=False)
+class _Run:
+    """What observers did; all but the estimates of the first one."""
+
+    estimates: Array  # (observer, n_samples, batch, n)
+    innovation: Array  # (n_samples, batch, q); zero where none was wanted
+    status: Bits  # (n_samples, batch): RESTARTED, or nothing
+    starts: Flags  # (n_samples, batch)
+    moving: Flags  # (n_samples, batch)
+
+    def take(self, number: int, machines: Whole, run: Stepped) -> None:
+        """Take what an observer did on some machines."""
+        self.estimates[number][:, machines] = run.estimates
+        for name in ("innovation", "status", "starts", "moving"):
+            getattr(self, name)[:, machines] = getattr(run, name)
+
+
+def _run(
+    observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, innovations: bool = False
+) -> _Run:
+    """Run observers on screened samples, compiled where that is possible."""
+    (n_samples, batch), observer, loops = samples.starts.shape, observers[0], library()
+    n, delay = observer.lifting.n_states, observer.runtime.delay
+    values, left = observer.values(parameters, (batch,)), _one_by_one(observer, samples)
+    restarted, machines = np.tile(left, (len(observers), 1)), np.flatnonzero(~left)
+    estimates: Array = np.empty(0)
+    innovation = np.zeros(samples.y.shape)
+    if loops is not None and len(machines):
+        some = samples if len(machines) == batch else samples.of(machines)
+        run = _compiled(loops, observers, some, _of_machines(values, machines), innovations)
+        estimates, restarted[:, machines] = run.estimates, run.restarted
+        if run.innovation is not None:
+            innovation[:, machines] = run.innovation
+    if len(machines) < batch:
+        estimates, part = np.empty((n_samples, len(observers), n, batch)).transpose(1, 0, 3, 2), estimates
+        if len(machines):
+            estimates[:, :, machines] = part
+    moving = (_pending(samples.starts, delay) == delay) & (~samples.starts | (delay == 0))
+    status, starts = np.zeros((n_samples, batch), np.uint8), samples.starts.copy()
+    result = _Run(estimates, innovation, status, starts, moving)
+    for i, each in enumerate(observers):
+        machines = np.flatnonzero(restarted[i])
+        if len(machines):
+            result.take(i, machines, stepped(each, samples.of(machines), _of_machines(values, machines)))
+    for i in observer.runtime.limited_states(n):
+        low, high = (side if side is None else side[i] for side in (observer.runtime.lower, observer.runtime.upper))
+        np.clip(estimates[..., i], low, high, out=estimates[..., i])
+    return result
+
+
+def _one_by_one(observer: ObserverData, samples: Screened) -> Flags:
+    """Return which machines NumPy steps, (batch,): without a compiler all, else banks with gaps."""
+    if library() is None:
+        return np.ones(samples.starts.shape[1], dtype=bool)
+    return np.asarray((observer.bank is not None) & ~np.isfinite(samples.y).all(axis=(0, 2)))
+
+
+def _of_machines(values: Parameters, machines: Whole) -> dict[str, npt.ArrayLike]:
+    """Return the parameters of some machines."""
+    return {name: value if np.size(value) == 1 else np.asarray(value)[machines] for name, value in values.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Stepped:
+    """What an observer did, step by step."""
+
+    estimates: Array  # (n_samples, batch, n)
+    innovation: Array  # (n_samples, batch, q)
+    status: Bits  # (n_samples, batch): RESTARTED, or nothing
+    starts: Flags  # (n_samples, batch)
+    moving: Flags  # (n_samples, batch)
+    followed: Array  # (n_samples, batch): the parameter that a loop follows
+
+
+class Loop(Protocol):
+    """What changes a parameter of the lifting from sample to sample (`tracking`)."""
+
+    name: str
+
+    def begin(self, machines: Flags) -> None:
+        """Start some machines again."""
+
+    def step(self, steps: Steps, y: Array, u: Array) -> Array:
+        """Move the observer on by a sample, and return the parameter for the next one, shape (batch,)."""
+
+
+class Restarts:
+    """Counts down, over a batch of machines, until their starts have settled."""
+
+    def __init__(self, guard: Guard | None, batch: int) -> None:
+        self._settle, self._left = 0 if guard is None else guard.settle, np.zeros(batch, dtype=int)
+
+    def after(self, waiting: Flags) -> Flags:
+        """Return which machines wait for a start after a step, or have not settled since."""
+        restarted = waiting | (self._left > 0)
+        self._left = np.where(waiting, self._settle, np.maximum(self._left - 1, 0))
+        return restarted
+
+
+@np.errstate(over="ignore", invalid="ignore", divide="ignore")
+def stepped(observer: ObserverData, samples: Screened, values: dict[str, Any], loop: Loop | None = None) -> Stepped:
+    """Step an observer, which starts again at the first complete sample after it left its bounds."""
     (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
-    steps, innovation = Steps([observer], batch, values), np.zeros(samples.y.shape)
-    moving = (_pending(samples.starts, d) == d) & ~samples.starts if d else np.ones((n_samples, batch), dtype=bool)
+    steps, restarts = Steps(observer, batch, values), Restarts(observer.guard, batch)
+    x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
+    earlier = np.empty((n_samples, batch, len(observer.lifting.window.earlier)))
+    starts, moving, status = samples.starts.copy(), np.zeros(nu.shape[:2], dtype=bool), np.zeros(nu.shape[:2], np.uint8)
+    since, pending = np.zeros(batch, dtype=np.intp), np.zeros((n_samples, batch), dtype=np.intp)
+    followed = np.empty(nu.shape[:2])
     steps.begin(samples.y[0])
-    steps.begin(samples.y[0], samples.starts[0], samples.u[0])
-    steps.through(samples.y, samples.u, d, moving if d else None, samples.starts, innovation=innovation)
-    starts, status = samples.starts.copy(), samples.status
-    machines = np.flatnonzero(steps.restart[0])
-    if len(machines):
-        with np.errstate(over="ignore", invalid="ignore"):
-            again = _restarting(observer, samples.of(machines), observer.values(_values_of(values, machines)))
-        moving, status = moving.copy(), status.copy()
-        innovation[:, machines], starts[:, machines], moving[:, machines] = again.innovation, again.starts, again.moving
-        status[:, machines] |= again.status
-    starts[0] = True
-    return innovation, judged_samples(settle, status, starts, moving)
+    steps.begin(samples.y[0], starts[0], samples.u[0])
+    for k, (y, u) in enumerate(zip(samples.y, samples.u, strict=True)):
+        if k:
+            starts[k] |= steps.waiting & samples.complete[k]
+            pending[k] = np.minimum(since + 1, d)
+            since = np.where(starts[k], 0, pending[k])
+        x[k] = steps.x
+        if d:
+            earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])
+        if k and starts[k].any():
+            steps.begin(y, starts[k], u)
+            if loop is not None:
+                loop.begin(starts[k])
+        nu[k] = np.where(np.isfinite(y), steps.innovation(y), 0.0)
+        moving[k] = (since == d) & ~steps.waiting
+        if loop is None:
+            steps.step(y, samples.u[max(k - d, 0)], moving[k])
+        else:
+            followed[k] = values[loop.name]
+            values[loop.name] = loop.step(steps, y, u)
+        status[k][restarts.after(steps.waiting)] = SampleStatus.RESTARTED
+    if d:
+        _predict(observer, x, earlier, pending, samples, values)
+    return Stepped(x, nu, status, starts, moving, followed)
 
 
 def _pending(starts: Flags, delay: int) -> Whole:
@@ -297,19 +297,88 @@ def _pending(starts: Flags, delay: int) -> Whole:
 def _predict(
     observer: ObserverData, x: Array, earlier: Array, pending: Whole, samples: Screened, values: Parameters
 ) -> None:
-    """Take states, shape (n_samples, batch, n), over the samples that lie between them and their rows, without correction."""
-    batch, machines = x.shape[1], np.arange(x.shape[1])
+    """Predict states (n_samples, batch, n) to their rows, without correction."""
+    batch = x.shape[1]
     for start in range(0, len(x), _ROWS):
-        rows = slice(start, min(start + _ROWS, len(x)))
-        count, ahead = pending[rows], x[rows]
-        own = {
-            name: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(count))
-            for name, v in values.items()
-        }
-        steps = Steps([observer], count.size, own)
-        steps.place(ahead.reshape(count.size, -1), earlier[rows].reshape(count.size, -1))
-        j = np.arange(observer.runtime.delay)[:, None, None]
-        at = np.minimum(np.arange(rows.start, rows.stop)[:, None] - count + j, len(samples.u) - 1)
-        u = samples.u[at, machines]
-        steps.through(None, u.reshape(len(j), count.size, u.shape[-1]), moving=(j < count).reshape(len(j), -1))
-        x[rows] = steps.x[0].reshape(ahead.shape)
+        rows = np.arange(start, min(start + _ROWS, len(x)))
+        count, size = pending[rows], len(rows) * batch
+        each = {p: np.tile(np.broadcast_to(np.asarray(v, dtype=float), (batch,)), len(rows)) for p, v in values.items()}
+        at = rows[:, None] - count + np.arange(observer.runtime.delay)[:, None, None]
+        u = samples.u[np.minimum(at, len(samples.u) - 1), np.arange(batch)]
+        signals = (part.reshape(*part.shape[:-3], size, part.shape[-1]) for part in (x[rows], earlier[rows], u))
+        x[rows] = forward(observer, each, count.ravel(), *signals).reshape(len(rows), batch, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class Compiled:
+    """What the compiled loop leaves."""
+
+    estimates: Array  # (observer, n_samples, batch, n)
+    innovation: Array | None  # (n_samples, batch, q) of the first observer
+    restarted: Flags  # (observer, batch): whether a machine left its bounds, from where on it stands still
+
+
+def _compiled(
+    loops: Library, observers: Sequence[ObserverData], samples: Screened, values: Parameters, innovations: bool = False
+) -> Compiled:
+    """Run observers of one model in the compiled loop."""
+    observer, delay = observers[0], observers[0].runtime.delay
+    (n_samples, batch), n, m = samples.starts.shape, observer.lifting.n_states, samples.u.shape[2]
+    order, earlier = max(o.controller.n_states for o in observers), len(observer.lifting.window.earlier)
+    states, innovation = np.empty((n_samples, len(observers), n, batch)), None
+    waiting, restarted = np.zeros((2, len(observers), batch), np.uint8)
+    job: dict[str, Any] = {
+        "observers": len(observers),
+        "samples": n_samples,
+        "batch": batch,
+        "order": order,
+        "q": len(observer.measured),
+        "late": delay,
+        "overwrite": int(observer.bank is not None),
+        "map": np.stack([_padded(o, order) for o in observers]),
+        "y": samples.y.swapaxes(1, 2),
+        "u": samples.u.swapaxes(1, 2),
+        "measured": observer.measured,
+        "past": np.zeros((len(observers), batch, earlier)),
+        "fresh": np.ones(batch, np.uint8),
+        "waiting": waiting,
+        "restart": restarted,
+        "states": states,
+    }
+    job["column"] = np.zeros((len(observers), job["map"].shape[2], batch))
+    known = np.where(samples.starts[0][:, None], samples.u[0], 0.0)
+    job["column"][:, :n] = [o.initial(samples.y[0], values, known).T for o in observers]
+    job["low"], job["high"] = np.swapaxes([bounds(o.guard, n, order) for o in observers], 0, 1)
+    job |= _begins(observers, samples, values)
+    if innovations:
+        innovation = job["innovation"] = np.empty(samples.y.shape)
+    if delay:
+        pending, before = _pending(samples.starts, delay), np.empty((n_samples, batch, earlier))
+        job |= {"moving": (pending == delay) & ~samples.starts, "before": before, "pending": pending}
+    tape = formulas(observer.lifting, tape_of(observer.lifting, m), values, m, batch)
+    loops.call("kros_relift", tape, ("relift_job", job))
+    estimates = states.transpose(1, 0, 3, 2)
+    if delay:
+        with np.errstate(over="ignore", invalid="ignore"):
+            for o, x in zip(observers, estimates, strict=True):
+                _predict(o, x, before, pending, samples, values)
+    return Compiled(estimates, innovation, restarted.view(bool))
+
+
+def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:
+    """Return the estimates of machines that start after the first sample, and which they are."""
+    rows, machines = np.nonzero(samples.starts[1:])
+    if not len(rows):
+        return {}
+    number = np.zeros(samples.starts.shape, dtype=np.int32)
+    number[rows + 1, machines] = 1 + np.arange(len(rows))
+    each = {p: np.broadcast_to(np.asarray(v, dtype=float), number.shape[1:])[machines] for p, v in values.items()}
+    first = [o.initial(samples.y[rows + 1, machines], each, samples.u[rows + 1, machines]) for o in observers]
+    return {"begin": number, "begun": np.stack(first), "begins": len(rows)}
+
+
+def _padded(observer: ObserverData, order: int) -> Array:
+    """Return the one-step map with silent controller states up to an order."""
+    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    step = np.insert(observer.one_step, [nl + own] * (order - own), 0.0, axis=1)
+    return np.ascontiguousarray(np.insert(step, [n + own] * (order - own), 0.0, axis=0))

@@ -1,15 +1,18 @@
-r"""A phase-locked loop: a lifting parameter, such as the phase of a gearbox, follows the machine while the observer runs.
+r"""A phase-locked loop: a lifting parameter, such as a gearbox's phase, follows the machine.
 
-With the parameter p of the running observer, the sensitivity ``s = d x_hat / d p`` obeys the linearised observer itself,
+With the parameter p of the running observer, the sensitivity ``s = d x_hat / d p`` obeys the linearised observer
+itself,
 
     s+ = (A_s + a sigma_x) s + a sigma_p - (into D^c C)_s s + (into C^c)_s s_c,      s_c+ = A^c s_c - B^c C s,
 
-and ``psi = C s`` says how the predicted measurement moves with p, delays of the machine included: for ``sin(100 position + phase)`` it is the cosine of the
-gearbox angle, filtered as the machine filters it, whichever way it turns. The innovation times psi is integrated with a small gain,
+and ``psi = C s`` says how the predicted measurement moves with p, delays of the machine included: for ``sin(100
+position + phase)`` it is the cosine of the gearbox angle, filtered as the machine filters it, whichever way it turns.
+The innovation times psi is integrated with a small gain,
 
     p+ = p + (dt / tau) psi nu / r,      r the mean of psi^2 over about tau,
 
-so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements count in units of their sizes in training.
+so that an error of p decays in the time tau while psi is excited, the integrand kept within 1. Several measurements
+count in units of their sizes in training.
 
 References
 ----------
@@ -26,9 +29,8 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .data import ObserverData
-from .guard import Restarts
 from .screen import screened
-from .simulate import run_observer
+from .simulate import run_observer, stepped
 from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
@@ -72,12 +74,14 @@ class PhaseLockedLoop:
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter {name!r} and measurements without delay, "
-                f"found parameters {lifting.parameters}, a history of {lifting.history} and a delay of {observer.runtime.delay}."
+                f"Phase-locked loop of observer {observer.name}: needs a lifting of present states with the parameter "
+                f"{name!r} and measurements without delay, found parameters {lifting.parameters}, a history of "
+                f"{lifting.history} and a delay of {observer.runtime.delay}."
             )
         if not settle_s > 0:
             raise ConfigError(
-                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found {settle_s:g} s."
+                f"Phase-locked loop of observer {observer.name}: the time to settle should be positive, found "
+                f"{settle_s:g} s."
             )
         n = lifting.n_states
         self.observer, self.name, self.forget = observer, name, min(observer.sample_period_s / settle_s, 1.0)
@@ -91,15 +95,16 @@ class PhaseLockedLoop:
         for array in (self._s, self._s_c, self._power, self._weight):
             array[slice(None) if machines is None else machines] = 0.0
 
-    def step(self, steps: Steps, y: Array, u: Array, missing: Flags | None = None) -> Array:
-        """Move the observer on by a sample, as `Steps.step` does, and return the parameter for the next one, shape (batch,)."""
+    def step(self, steps: Steps, y: Array, u: Array) -> Array:
+        """Move the observer on by a sample, and return the parameter for the next one, shape (batch,)."""
         K, n, values = self.observer.controller, self._model.shape[0], steps.values
-        x, nu, psi = steps.near[0].copy(), steps.innovation(y)[0], self._s[:, self._C].copy()
+        x, psi = steps.x.copy(), self._s[:, self._C].copy()
+        nu = np.where(np.isfinite(y), steps.innovation(y), 0.0)
         slopes, by_value = (
             steps.lifting.slopes(x, values)[..., :n],
             steps.lifting.parameter_slopes(x, values, self.name),
         )
-        steps.step(y, u, missing)
+        steps.step(y, u)
         if self.observer.bank is not None:  # measurements take the place of estimates
             self._s[:, self._C] = 0.0
         lifted = np.concatenate([self._s, (slopes @ self._s[..., None])[..., 0] + by_value], axis=-1)
@@ -108,7 +113,7 @@ class PhaseLockedLoop:
         self._power += self.forget * (np.sum((psi / self._sizes) ** 2, axis=-1) - self._power)
         self._weight += self.forget * (1.0 - self._weight)  # over the mean of psi^2 so far
         pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
-        usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting[0]
+        usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting
         seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=usable)
         return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
 
@@ -119,8 +124,8 @@ def measurement_sizes(observer: ObserverData) -> Array:
         return np.ones(1)
     if observer.seen is None:
         raise ConfigError(
-            f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of their sizes, which it "
-            "does not know; give it Observer(..., seen=Seen(measured, inputs))."
+            f"Phase-locked loop of observer {observer.name}: {len(observer.measured)} measurements count in units of "
+            "their sizes, which it does not know; give it Observer(..., seen=Seen(measured, inputs))."
         )
     return np.where(observer.seen.measured > 0, observer.seen.measured, 1.0)
 
@@ -166,7 +171,8 @@ def track_parameter(
     >>> from kros.synthesis import Injection
     >>> lifting = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
     >>> A, K = np.array([[1.0, 0.002], [0.0, 0.0]]), gain([[0.2], [0.0]], 0.001)
-    >>> observer = Observer("x", lifting, A, np.array([[0.001], [0.0]]), (0,), ("u",), K, Injection.STATE, 0.001, {"phase": 0.0})
+    >>> model = A, np.array([[0.001], [0.0]]), (0,), ("u",)
+    >>> observer = Observer("x", lifting, *model, K, Injection.STATE, 0.001, {"phase": 0.0})
     >>> x = np.zeros((8000, 1, 1))
     >>> for k in range(7999):
     ...     x[k + 1] = x[k] + 0.001 + 0.002 * np.sin(10 * x[k] + 0.5)
@@ -177,23 +183,9 @@ def track_parameter(
     batch = np.shape(y)[1]
     loop = PhaseLockedLoop(observer, name, batch, settle_s)
     samples, values = screened(observer, y, u), observer.values(parameters, (batch,))
-    y, u, starts = samples.y, samples.u, samples.starts
     values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
-    steps, missing = Steps([observer], batch, values), ~np.isfinite(y)
-    estimates, followed = np.empty((*y.shape[:2], observer.lifting.n_states)), np.empty(y.shape[:2])
-    restarts, restarted = Restarts(observer.guard, batch), np.zeros(y.shape[:2], dtype=bool)
-    steps.begin(y[0])
-    steps.begin(y[0], starts[0], u[0])
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        for k in range(len(y)):
-            estimates[k], followed[k] = observer.runtime.clip_estimate(steps.x[0]), values[name]
-            anew = starts[k] | (steps.waiting[0] & samples.complete[k])
-            if k and anew.any():  # the parameter stays
-                steps.begin(y[k], anew, u[k])
-                loop.begin(anew)
-            values[name] = loop.step(steps, y[k], u[k], missing[k] if missing[k].any() else None)
-            restarted[k] = restarts.after(steps.waiting[0])
-    return Tracked(estimates, followed, restarted)
+    run = stepped(observer, samples, values, loop)
+    return Tracked(observer.runtime.clip_estimate(run.estimates), run.followed, run.status > 0)
 
 
 def least_innovation(

@@ -1,18 +1,25 @@
-"""An observer in other units of measure: the same estimates from the same machine, every signal divided by another size."""
+"""Units of measure: an observer for signals divided by other sizes, and the units of the recordings.
+
+An observer works in the channels' units, and its file says by which factor every channel was multiplied when the files
+were read: generated code and `kros estimate` use the units of the files that a study read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
-from typing import TypeVar
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import DataError
+from ..core.files import shortened
 from ..core.lti import StateSpace
+from ..data.discovery.roles import unit_of_factor
 from ..synthesis.result import Injection
 from .data import ObserverData
-from .runtime import Runtime
 from .sensor import in_units
 
 Array = npt.NDArray[np.float64]
@@ -31,7 +38,7 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
         A=observer.A * x[:, None] / x,
         B=observer.B * x[:, None] / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
-        runtime=_runtime(observer.runtime, x[: lifting.n_states], y, into, u),
+        runtime=observer.runtime.times(x[: lifting.n_states]),
         seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
         monitor=None if observer.monitor is None else observer.monitor.times(y),
         guard=None if observer.guard is None else observer.guard.times(x[: lifting.n_states]),
@@ -51,13 +58,46 @@ def factors(observer: ObserverData, sizes: Mapping[str, float]) -> tuple[Array, 
     return x, u
 
 
-def _runtime(runtime: Runtime, x: Array, y: Array, into: Array, u: Array) -> Runtime:
-    by = {"lower": x, "upper": x, "correction": into}
-    by |= {
-        name: u[: len(limit)]
-        for name in ("input_lower", "input_upper")
-        if (limit := getattr(runtime, name)) is not None
-    }
-    return replace(
-        runtime, **{name: getattr(runtime, name) * by[name] for name in by if getattr(runtime, name) is not None}
+@dataclass(frozen=True)
+class RecordedChannel:
+    """A channel as it stands in the recordings: one of its `unit` is `factor` of the channel's own unit."""
+
+    factor: float = 1.0
+    unit: str = ""
+    note: str = ""  # what else was done to it on reading
+
+
+def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
+    """Return how a channel stands in the recordings; one that the file does not name is as it is."""
+    units, columns = (observer.about.get(key, {}) for key in ("units_of_measure", "columns"))
+    own = columns.get(name, {}) if isinstance(columns, dict) else columns
+    unit = units.get(name, "") if isinstance(units, dict) else units
+    if not isinstance(own, dict) or not isinstance(unit, str):
+        raise DataError(
+            f"Observer {observer.name}: about.columns and about.units_of_measure should be objects; correct the file."
+        )
+    factor, converted = (_factor(observer, name, own.get(key, 1.0)) for key in ("factor", "converted"))
+    lag, offset = own.get("lag_samples", 0), own.get("offset", "")
+    note = ", ".join(
+        [*([f"the column comes {lag} samples late"] if lag else []), *([f"added: {offset}"] if offset else [])]
     )
+    factor = factor if converted == 1.0 else factor / converted
+    if math.isclose(factor, 1.0, rel_tol=1e-12):
+        return RecordedChannel(1.0, unit, note)
+    return RecordedChannel(factor, unit_of_factor(factor, unit) or f"{factor:.6g} {unit or 'of the study'}", note)
+
+
+def recorded_factors(observer: ObserverData, names: Sequence[str]) -> npt.NDArray[np.float64]:
+    """Return the factor of every channel: its value is the factor times the recorded one."""
+    return np.array([recorded_channel(observer, name).factor for name in names])
+
+
+def _factor(observer: ObserverData, name: str, value: Any) -> float:
+    """Return a factor that a number of the file can be."""
+    number = isinstance(value, (int, float)) and not isinstance(value, bool)
+    if not number or not abs(value) < 1e300 or not abs(value) > 1e-300:
+        raise DataError(
+            f"Observer {observer.name}: the factor of {name!r} should be a finite number other than zero, found "
+            f"{shortened(repr(value), 60)}; correct about.columns of its file."
+        )
+    return float(value)

@@ -8,11 +8,10 @@ Only this package imports matplotlib and Jinja2, when something is drawn; pyplot
 
 Examples
 --------
->>> from kros.core.lti import gain
->>> from kros.report import plot
->>> from kros.synthesis import Status, Synthesis
->>> plot(Synthesis("h2", gain([[0.5]], 0.01), Status.OPTIMAL, h2_norm=1.2)).axes[0].get_xscale()
-'log'
+>>> import kros
+>>> motors = kros.plants.DcMotorPopulation(n_units=1, n_episodes=1, seconds=1.0).simulate().population
+>>> kros.report.plot(motors).axes[0].get_xscale()
+'linear'
 """
 
 from __future__ import annotations

@@ -70,7 +70,8 @@ def model_label(name: str) -> str:
     """Return what a model is called, for example ``Koopman (EDMD)``."""
     family, _, kind = name.partition("_")
     label = {"koopman": "Koopman"}.get(family, family)
-    return f"{label} ({'EDMD' if kind == 'edmd' else words(kind)})" if kind else label
+    about = "EDMD" if kind == "edmd" else words(kind)
+    return f"{label} ({about})" if kind else label
 
 
 def method_label(name: str) -> str:

@@ -18,12 +18,7 @@ PLOTS = {
     "UncertainModels": "uncertainty:sets_figure",
     "Design": "synthesis:design_figure",
     "RunResult": ":run_figure",
-    "PhaseCalibration": "recordings:phase_figure",
-    "ModelSet": "models:bode_figure",
     "UncertainModel": "uncertainty:uncertain_figure",
-    "OutlierModel": "outliers:scores_figure",
-    "Synthesis": "synthesis:synthesis_figure",
-    "Observer": "synthesis:observer_figure",
 }
 """Name of a result's class -> module and function that draws it; further parameters are the options of `plot`."""
 
@@ -35,11 +30,11 @@ def plot(result: Any, **options: Any) -> Figure:
     ----------
     result : one of the classes in `PLOTS`
         A population: its first episode. Models: Bode plots. Uncertain models: forms, weights, every unit relative to
-        the weights. A design, a synthesis, an observer: the correction filter. A run: the estimates.
+        the weights. A design: the correction filter. A run: the estimates.
     **options
         ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for an uncertain model entry
         by entry; ``models`` of a design or an `UncertainModel`, the models behind it; ``name`` of a run, any of its
-        figures; ``nominal`` of a `ModelSet`, a unit that stands out.
+        figures.
 
     Returns
     -------
@@ -53,12 +48,10 @@ def plot(result: Any, **options: Any) -> Figure:
 
     Examples
     --------
-    >>> from kros.core.lti import gain
-    >>> from kros.report import plot
-    >>> from kros.synthesis import Status, Synthesis
-    >>> figure = plot(Synthesis("h2", gain([[0.5]], 0.01), Status.OPTIMAL, h2_norm=1.2))
-    >>> len(figure.axes)
-    3
+    >>> import kros
+    >>> motors = kros.plants.DcMotorPopulation(n_units=1, n_episodes=1, seconds=1.0).simulate().population
+    >>> len(kros.report.plot(motors).axes)  # position, velocity, current and voltage
+    4
     """
     name = next(
         (t.__name__ for t in type(result).__mro__ if t.__name__ in PLOTS and t.__module__.startswith("kros.")), None

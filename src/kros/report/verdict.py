@@ -118,7 +118,9 @@ def _numbers(facts: Facts) -> list[Number]:
 
 def _lag(lag_s: float | None) -> str:
     """Return how late a signal is, for a sentence."""
-    return "" if lag_s is None else f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
+    if lag_s is None:
+        return ""
+    return f", {number(abs(1e3 * lag_s), 2)} ms {'late' if lag_s > 0 else 'early'}"
 
 
 def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
@@ -279,7 +281,7 @@ def voids(facts: Facts) -> list[str]:
     """Return when the certificates of the deployed observer do not hold, the most frequent mistake first."""
     texts = ["A controller uses the estimate: the recordings did not depend on it."]
     if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
-        texts += ["Signals have more power at some frequency than the recorded ones, or leave the range of training."]
+        texts += ["Signals have more power at some frequency than those recorded, or leave the range of training."]
         texts += ["The unit is worn, badly assembled, or of another batch."]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]

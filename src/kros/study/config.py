@@ -16,7 +16,6 @@ from ..core.settings import Settings
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
 from ..observer import EstimatorSettings
-from ..observer.limits import Limit
 from ..observer.sensor import Sensor
 from ..uncertainty.settings import UncertaintySettings
 
@@ -93,27 +92,15 @@ class EvaluateConfig(Settings):
 
 
 class LoadConfig(Settings):
-    """Load torque ``moment sin(angle) + inertia angle''``, over the torque constant, of a mounted mass."""
+    """Load torque ``moment sin(position) + inertia position''``, over the torque constant, of a mounted mass."""
 
     moment: float | None = Field(
         None, description="of the mounted mass, in units of current; without it nothing is done about load"
     )
     inertia: float = Field(0.0, ge=0, description="of the mounted mass, in the same units")
-    condition: str = Field("load", description="in which the load is mounted")
     units: tuple[str, ...] = Field(
-        (), description="on which the load is known; by default the first two recorded in the condition"
+        (), description="on which the load is known; by default the first two recorded in the condition load"
     )
-    angle: str = Field("position", description="state that is the angle")
-    current: str = Field("current", description="state that is the current")
-    limit: float | None = Field(None, gt=0, description="of the current, in its unit of measure")
-    level_s: float = Field(10.0, gt=0, description="time constant of the leak against drift of the load's level")
-
-
-class RequireConfig(Settings):
-    """Requirements whose violation ends the run with exit code 3."""
-
-    robust: bool = Field(False, description="the deployed observer has a certificate")
-    no_outliers: bool = Field(False, description="no unit is flagged")
 
 
 class StudyConfig(Settings):
@@ -138,11 +125,9 @@ class StudyConfig(Settings):
     synthesis: SynthesisSettings = SynthesisSettings()
     estimator: EstimatorSettings = EstimatorSettings()
     sensor: dict[str, Sensor] = Field(default_factory=dict)
-    limits: dict[str, Limit] = Field(default_factory=dict)
     observer: ObserverSettings = ObserverSettings()
     evaluate: EvaluateConfig = EvaluateConfig()
     load: LoadConfig = LoadConfig()
-    require: RequireConfig = RequireConfig()
 
     def dump(self) -> dict[str, Any]:
         """Return the resolved study in JSON's types."""

@@ -11,16 +11,14 @@ from typing import Any
 import numpy as np
 
 from ..core.artifacts import load_artifact, plain, read_json
-from ..data.flat_tops import FoundLimit
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
-from ..observer.limits import Limit, limits_of
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel, VariationAndNoise
 from .config import Stage
 from .engine.context import Context
 from .engine.store import Store
-from .stages import calibrate, left_out
+from .stages import left_out
 from .stages.load import load_metrics
 
 
@@ -37,45 +35,33 @@ def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
 
 
 def _study(context: Context, done: list[Stage]) -> dict[str, Any]:
-    facts = context.facts
+    facts, population, sensor = context.facts, context.population, context.config.sensor
+    parts = {"train": facts.train, "held_out": facts.test}
     study: dict[str, Any] = {
         "units": len(facts.pooled),
-        "conditions": context.population.conditions,
+        "conditions": population.conditions,
         "identify_on": facts.identify_on,
-        "sample_period_s": context.population.sample_period_s,
-        "channels": {c.name: c.unit for c in context.population.channels},
-        "measured": [c.name for c in context.population.channels if c.measured],
-        "inputs": list(context.population.inputs),
-        "episodes": _episodes(context),
+        "sample_period_s": population.sample_period_s,
+        "channels": {c.name: c.unit for c in population.channels},
+        "measured": [c.name for c in population.channels if c.measured],
+        "inputs": list(population.inputs),
+        "episodes": {
+            condition: {part: sum(key.condition == condition for key in keys) for part, keys in parts.items()}
+            for condition in population.conditions
+        },
         "resolution": facts.resolution,
         "dropped": facts.dropped,
     }
-    if context.config.sensor:
-        study["sensor"] = {name: sensor.model_dump(exclude_none=True) for name, sensor in context.config.sensor.items()}
-    if limits := limits_of(context.config.limits, facts.limits, context.population.states):
-        study["limits"] = {
-            name: _limit(limit, facts.limits.get(name), name in context.config.limits) for name, limit in limits.items()
-        }
-    if facts.alerts:
-        study["alerts"] = facts.alerts
+    limits = {s: facts.limits[s] for s in population.states if s in facts.limits}
+    optional = {
+        "sensor": {name: one.model_dump(exclude_none=True) for name, one in sensor.items()},
+        "limits": {s: {"lower": one.lower, "upper": one.upper, "seen": asdict(one)} for s, one in limits.items()},
+        "alerts": facts.alerts,
+    }
+    study |= {name: value for name, value in optional.items() if value}
     if Stage.IDENTIFY in done:
         study["alpha"] = context.identified.models(context.identified.edmd_kinds[0]).alpha
-    if Stage.SYNTHESIZE in done:
-        study["deployed"] = context.observers_record["deployed"]
-    return study
-
-
-def _episodes(context: Context) -> dict[str, dict[str, int]]:
-    """Count episodes by condition, those for training and those held out."""
-    parts = {"train": context.facts.train, "held_out": context.facts.test}
-    conditions = context.population.conditions
-    return {c: {part: sum(key.condition == c for key in keys) for part, keys in parts.items()} for c in conditions}
-
-
-def _limit(limit: Limit, seen: FoundLimit | None, declared: bool) -> dict[str, Any]:
-    """Return a limit that counts, and where recordings were seen at one."""
-    entry: dict[str, Any] = limit.model_dump() | {"declared": declared}
-    return entry if seen is None else entry | {"seen": asdict(seen)}
+    return study | ({"deployed": context.observers_record["deployed"]} if Stage.SYNTHESIZE in done else {})
 
 
 def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
@@ -85,36 +71,28 @@ def _timing(context: Context, done: list[Stage]) -> dict[str, float]:
 
 
 def _units(context: Context, done: list[Stage]) -> list[dict[str, Any]]:
-    facts = context.facts
-    calibration = calibrate.load(context) if Stage.CALIBRATE in done else None
+    facts, rows = context.facts, list[dict[str, Any]]()
+    calibration = context.calibration if Stage.CALIBRATE in done else None
     models = context.identified.models() if Stage.IDENTIFY in done else None
-    rows = []
     for unit, group in facts.groups.items():
         keys = [*facts.keys("train", unit), *facts.keys("test", unit)]
-        row: dict[str, Any] = {
-            "unit": unit,
-            "group": group,
-            "conditions": list(dict.fromkeys(k.condition for k in keys)),
-        }
-        status = "ok"
+        row: dict[str, Any] = {"unit": unit, "group": group}
+        row |= {"conditions": list(dict.fromkeys(k.condition for k in keys)), "status": "ok"}
         if calibration is not None:
             phase = calibration.units.get(unit)
-            row |= {
-                "phase_rad": phase.phase_rad if phase else None,
-                "concentration": phase.concentration if phase else None,
-            }
-            status = status if phase else "not calibrated"
+            row |= {name: getattr(phase, name, None) for name in ("phase_rad", "concentration")}
+            row |= {} if phase else {"status": "not calibrated"}
         if models is not None and unit in models.unit_ids:
-            status = models.status[models.index(unit)]
-        elif models is not None and status == "ok":
-            status = f"not identified, no recordings in {facts.identify_on}"
-        rows.append(row | {"status": status})
+            row["status"] = models.status[models.index(unit)]
+        elif models is not None and row["status"] == "ok":
+            row["status"] = f"not identified, no recordings in {facts.identify_on}"
+        rows.append(row)
     return rows
 
 
 def _calibration(context: Context) -> dict[str, Any]:
     """What the phase of every unit belongs to; empty for a study without one."""
-    calibration = calibrate.load(context)
+    calibration = context.calibration
     if calibration is None:
         return {}
     spec = calibration.spec
@@ -154,7 +132,6 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
         "peak_db": model.peak_db,
         "misfit_max": model.misfit_max,
         "weight": {
-            "structure": model.weight.structure,
             "orders": [model.weight.left_orders, model.weight.right_orders],
             "cover_max": model.cover_max,
             "overbound_db_max": model.overbound_db_max,
@@ -164,36 +141,22 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
         noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
         place = int(noise.residual.max(axis=0).argmax())
         share = noise.noise_share
-        entry["noise_share"] = {
-            "median": np.median(share),
-            "at_peak": share[place],
-            "peak_hz": noise.freqs_hz[place],
-        }
+        entry["noise_share"] = {"median": np.median(share), "at_peak": share[place], "peak_hz": noise.freqs_hz[place]}
     return entry
 
 
 def _observers(context: Context) -> dict[str, Any]:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
     entries: dict[str, Any] = {}
-    written, certified = context.store.files(), _certified(context)
+    written = context.store.files()
     for name, facts in context.observers_record["facts"].items():
-        entry = dict(facts)
+        entries[name] = dict(facts)
         if f"synthesis/{name}/synthesis.json" in written:
             synthesis = Synthesis.load(context.store.path("synthesis", name))
             bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
-            entry |= {key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)}
-        entries[name] = entry | certified.get(name, {})
+            names = ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)
+            entries[name] |= {key: getattr(synthesis, key) for key in names}
     return {"observers": entries} | _deployment(context)
-
-
-def _certified(context: Context) -> dict[str, dict[str, Any]]:
-    """Return assumptions of certificates, and bounds for recorded signals in the channels' units of measure."""
-    if not context.store.holds("observers", "relift.json"):
-        return {}
-    record = load_artifact(context.store.path("observers"), "relift")[0]
-    signals, proofs = record.get("signals", {}), record.get("certificates", {})
-    bounds = {n: {"set_bound": dict(zip(s["states"], s["cover"], strict=True))} for n, s in signals.items()}
-    return {n: {"assumptions": proof.get("assumptions", [])} | bounds.get(n, {}) for n, proof in proofs.items()}
 
 
 def _deployment(context: Context) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from ..core.settings import member
 from ..core.work import Executor, Progress, Work
 from ..data import Population
 from ..data.readers.opening import detect_reader
-from ..design.task import is_robust
 from ..observer import Observer
 from .config import Stage, StudyConfig, load_config, validate_config
 from .engine.context import Context
@@ -29,7 +28,7 @@ STEPS = (
     *LEARNING,
     StageStep(Stage.EVALUATE, evaluate.run, ("evaluate", "sensor", "load")),
     StageStep(Stage.LEFT_OUT, left_out.run, ("evaluate", "sensor"), left_out.wanted),
-    StageStep(Stage.REPORT, report.run, ("name", "require")),
+    StageStep(Stage.REPORT, report.run, ("name",)),
 )
 
 
@@ -44,13 +43,12 @@ class RunResult:
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> with TemporaryDirectory() as folder:
     ...     result = kros.run(motors, f"{folder}/run", until="identify", identify={"refine": False})
-    >>> result.folder.name, result.violations
-    ('run', ())
+    >>> result.folder.name, result.metrics["study"]["units"]
+    ('run', 2)
     """
 
     folder: Path
     metrics: dict[str, Any]
-    violations: tuple[str, ...]
 
     def __repr__(self) -> str:
         study = self.metrics["study"]
@@ -173,19 +171,4 @@ def run_in(
     metrics = collect_metrics(context, until)
     store.keep("metrics.json", metrics)
     store.sweep()
-    return RunResult(store.folder, metrics, violations(config, metrics))
-
-
-def violations(config: StudyConfig, metrics: dict[str, Any]) -> tuple[str, ...]:
-    """Return the requirements of the study that its result does not meet."""
-    unmet = []
-    deployed = metrics.get("observers", {}).get(metrics["study"].get("deployed") or "", {})
-    if config.require.robust and (deployed.get("status") == "failed" or not is_robust(deployed)):
-        reason = deployed.get("reason", "none was computed")
-        unmet.append(
-            f"require.robust: the deployed observer {metrics['study'].get('deployed')} has no certificate ({reason})"
-        )
-    flagged = [f"{row['unit']} ({row['condition']})" for row in metrics.get("outliers", []) if row["outlier"]]
-    if config.require.no_outliers and flagged:
-        unmet.append(f"require.no_outliers: flagged are {', '.join(flagged)}")
-    return tuple(unmet)
+    return RunResult(store.folder, metrics)

@@ -20,7 +20,6 @@ from .nominal import NominalChoice, choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
-from .settings import FitSettings
 from .variation import VariationAndNoise, variation_and_noise
 from .weights.cover import Cover
 from .weights.magnitude import FittedMagnitude, fit_magnitude
@@ -28,7 +27,6 @@ from .weights.weight import Weight
 
 __all__ = [
     "Cover",
-    "FitSettings",
     "FittedMagnitude",
     "Form",
     "NominalChoice",

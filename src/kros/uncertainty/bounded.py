@@ -20,13 +20,12 @@ from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
-from .inputs import check_candidate, check_ids, check_response, check_scale, find_nominal, read_systems
+from .inputs import check_candidate, check_ids, check_response, check_scales, find_nominal, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import choose_nominals
 from .settings import FitSettings
 from .weights.bilinear import BilinearAxis, beyond, continuous_grid
-from .weights.cover import Structure, as_structure
-from .weights.fit import Target, fit_entries, fit_weight
+from .weights.fit import Target, fit_weight
 from .weights.residuals import Residuals
 
 Array = npt.NDArray[Any]
@@ -46,7 +45,6 @@ class Options:
     output_scale: npt.ArrayLike | None = None
     input_scale: npt.ArrayLike | None = None
     nominal: Any = None
-    structure: Structure | str = Structure.DIAGONAL
     max_order: int = 4
     tolerance_db: float = 1.0
     sample_period_s: float = 0.0
@@ -54,7 +52,7 @@ class Options:
 
     @classmethod
     def of(cls, options: dict[str, Any]) -> Options:
-        """Check options by name, order, tolerance and structure."""
+        """Check options by name, order and tolerance."""
         unknown = sorted(set(options) - set(cls.__dataclass_fields__))
         if unknown:
             raise ConfigError(
@@ -66,7 +64,7 @@ class Options:
                 f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
                 f"{read.tolerance_db} not negative."
             )
-        return replace(read, structure=as_structure(read.structure))
+        return read
 
 
 def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, options: Options) -> UncertainModel:
@@ -76,7 +74,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
     units = scale_system(system, *scales)
     choices = choose_nominals(units.frequency_response(freqs))
     if isinstance(options.nominal, StateSpace):
-        check_candidate(options.nominal, system, "the nominal")
+        check_candidate(options.nominal, system)
         index, chosen = -1, options.nominal
     else:
         index = find_nominal(options.nominal, ids, choices[form].index)
@@ -107,10 +105,7 @@ def bound_responses(
     given = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
     for name, value in zip((*ids, "the nominal"), [*G, np.asarray(nominal)] if given else G, strict=False):
         check_response(name, value, G.shape[1:], freqs)
-    scales = (
-        check_scale("output", options.output_scale, G.shape[2]),
-        check_scale("input", options.input_scale, G.shape[3]),
-    )
+    scales = check_scales(options.output_scale, options.input_scale, G.shape[2:])
     units = G / scales[0][:, None] * scales[1]
     choices = choose_nominals(units)
     index = -1 if given else find_nominal(nominal, ids, choices[form].index)
@@ -183,21 +178,14 @@ def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, op
 def _bound_discrete(residuals: Residuals, freqs_hz: Array, dt: float, options: Options) -> dict[str, Any]:
     """Return bound, cover, weight, misfit, and cover and weight of the remainder where the form leaves one."""
     target = Target(dt, options.max_order, options.tolerance_db, options.fit)
-    fit = fit_entries if options.structure is Structure.ENTRYWISE else fit_weight
-    weight, cover = fit(residuals, freqs_hz, target)
+    weight, cover = fit_weight(residuals, freqs_hz, target)
     G, ratios, largest = residuals.nominal(freqs_hz), [], []
     for rows in residuals.blocks(options.fit.block):
-        E = residuals.at(freqs_hz)[rows] if len(rows) == len(residuals) else residuals.of(rows).at(freqs_hz)
+        E = residuals.of(rows).at(freqs_hz)
         ratios.append(misfit(residuals.form, G, residuals.units(freqs_hz, rows), E))
         largest.append(sigma_max(E).max(axis=0))
-    ratio = np.concatenate(ratios)
-    bound = {
-        "bound": np.max(largest, axis=0),
-        "cover": cover,
-        "weight": weight,
-        "misfit": ratio,
-        "form": residuals.form,
-    }
+    ratio, form = np.concatenate(ratios), residuals.form
+    bound = {"bound": np.max(largest, axis=0), "cover": cover, "weight": weight, "misfit": ratio, "form": form}
     if not _leaves_out(residuals.form, ratio):
         return bound
     remainder, remainder_cover = fit_weight(replace(residuals, remainder=True), freqs_hz, target)
@@ -210,8 +198,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     if unknown:
         _LOG.warning(
             "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the "
-            "misfit is "
-            "unknown there.",
+            "misfit is unknown there.",
             form.value,
             unknown,
             ratio.size,
@@ -222,8 +209,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     _LOG.log(
         logging.WARNING if largest > _WARNED else logging.INFO,
         "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an "
-        "additive "
-        "term. The additive form needs none.",
+        "additive term. The additive form needs none.",
         form.value,
         largest,
     )

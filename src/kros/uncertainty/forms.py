@@ -109,9 +109,8 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     other = (first if form.inverse else second) if paper else difference
     product = multiply(inverse, other) if left else multiply(other, inverse)
     if paper:
-        product = (product - np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))) * (
-            -1 if form.inverse else 1
-        )
+        one = np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))
+        product = one - product if form.inverse else product - one
     return entries_last(product)
 
 

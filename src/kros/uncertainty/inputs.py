@@ -26,11 +26,7 @@ def read_systems(
     system = stack_systems(models)
     ids = check_ids(unit_ids, system.batch_shape[0])
     _check_stable(system, tuple(f"unit {name}" for name in ids))
-    return (
-        system,
-        ids,
-        (check_scale("output", output_scale, system.n_outputs), check_scale("input", input_scale, system.n_inputs)),
-    )
+    return system, ids, check_scales(output_scale, input_scale, system.D.shape[-2:])
 
 
 def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
@@ -44,7 +40,7 @@ def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
     if count < 2:
         raise DataError(
             f"Quantify: uncertainty of a population needs at least two units, found {count} ({', '.join(ids)}); "
-            f"record more units."
+            "record more units."
         )
     return ids
 
@@ -58,12 +54,11 @@ def stack_systems(models: Any) -> StateSpace:
                 "systems, an array of responses, or the result of kros.identify."
             )
         systems = [StateSpace.of(system) for system in models]
-        found = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
-        if len(found) != 1:
+        kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
+        if len(kinds) != 1:
             raise DimensionError(
-                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(found)}; identify them alike."
-                if systems
-                else "Quantify: found no models; give at least two."
+                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}; identify them alike, "
+                "and give at least two."
             )
         n_states = max(s.n_states for s in systems)
         systems = [_padded(s, n_states) for s in systems]
@@ -72,13 +67,13 @@ def stack_systems(models: Any) -> StateSpace:
     if len(models.batch_shape) != 1:
         raise DimensionError(
             f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; "
-            f"stack the units."
+            "stack the units."
         )
     return models
 
 
 def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
-    """Row of the nominal among the units: the one asked for by name or row, otherwise the best."""
+    """Row of the nominal among the units: by name or row, otherwise the best."""
     if isinstance(nominal, str):
         if nominal not in names:
             raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
@@ -101,56 +96,54 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     return scale
 
 
-def check_candidate(candidate: StateSpace, system: StateSpace, name: str) -> None:
-    """Raise a `DimensionError` or `DataError` when a candidate is not one stable system like the units."""
-    if candidate.batch_shape or (candidate.n_outputs, candidate.n_inputs, candidate.dt) != (
-        system.n_outputs,
-        system.n_inputs,
-        system.dt,
-    ):
+def check_scales(
+    output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None, shape: tuple[int, ...]
+) -> tuple[Array, Array]:
+    """Return the ranges of outputs and inputs."""
+    return check_scale("output", output_scale, shape[0]), check_scale("input", input_scale, shape[1])
+
+
+def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
+    """Raise an error when a nominal that is no unit is not one stable system like the units."""
+    kinds = [(s.n_outputs, s.n_inputs, s.dt) for s in (candidate, system)]
+    if candidate.batch_shape or kinds[0] != kinds[1]:
         raise DimensionError(
-            f"Quantify: the nominal should be one system with {system.n_outputs} outputs, {system.n_inputs} "
-            f"inputs at {system.dt} s, found "
-            f"{candidate.n_outputs}, {candidate.n_inputs} at {candidate.dt} s in a batch of {candidate.batch_shape}."
+            f"Quantify: the nominal should be one system with (outputs, inputs, sampling period) {kinds[1]}, found "
+            f"{kinds[0]} in a batch of {candidate.batch_shape}."
         )
-    _check_stable(candidate[None], (name,))
+    _check_stable(candidate[None], ("the nominal",))
 
 
 def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     count = (len(names),)
-    finite = np.ones(count, bool)
-    for name in "ABCD":
-        finite &= np.broadcast_to(np.isfinite(getattr(system, name)).all(axis=(-2, -1)), count)
+    matrices = (system.A, system.B, system.C, system.D)
+    finite = np.all([np.broadcast_to(np.isfinite(M).all(axis=(-2, -1)), count) for M in matrices], axis=0)
     if not finite.all():
         raise DataError(
-            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or "
-            f"identify it again."
+            f"Quantify: the model of {names[int(np.argmin(finite))]} has NaN or infinity; leave it out or identify it "
+            "again."
         )
     stable = np.broadcast_to(system.is_stable(), count)
-    if not stable.all():
-        first = int(np.argmin(stable))
-        poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
-        worst = (
-            f"spectral radius {np.abs(poles).max():.6f}"
-            if system.dt > 0
-            else f"largest real part of a pole {poles.real.max():.6g}"
-        )
-        raise DataError(
-            f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
-            "identify with more regularisation or leave it out."
-        )
+    if stable.all():
+        return
+    first = int(np.argmin(stable))
+    poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
+    worst = f"largest real part of a pole {poles.real.max():.6g}"
+    if system.dt > 0:
+        worst = f"spectral radius {np.abs(poles).max():.6f}"
+    raise DataError(
+        f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
+        "identify with more regularisation or leave it out."
+    )
 
 
 def _padded(system: StateSpace, n_states: int) -> StateSpace:
     """Add states without input and output, at rest after a sample or as slow as the slowest."""
     more = n_states - system.n_states
-    if not more:
-        return system
-    slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
-    A = np.zeros((n_states, n_states))
-    A[: system.n_states, : system.n_states] = system.A
-    if system.dt == 0:
+    A = np.pad(system.A, (0, more))
+    if system.dt == 0 and more:
+        slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
         A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
     return StateSpace(A, B, C, system.D, system.dt)
@@ -175,8 +168,9 @@ def read_response_data(
 ) -> tuple[Array, Array]:
     """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first, nominal = data[0], options.get("nominal")
-    beside = [("the nominal", nominal)] if nominal is not None and hasattr(nominal, "frdata") else []
-    for name, other in [*((f"response {k}", one) for k, one in enumerate(data)), *beside]:
+    beside = [nominal] if hasattr(nominal, "frdata") else []
+    for k, other in enumerate([*data, *beside]):
+        name = f"response {k}" if k < len(data) else "the nominal"
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
             raise DimensionError(
                 f"Quantify: {name} has other frequencies than the first response; interpolate or measure on one grid."
@@ -193,7 +187,7 @@ def read_response_data(
             "Quantify: the sampling period of the responses is not known (dt = True); give it in seconds."
         )
     options["sample_period_s"] = float(first.dt or 0.0)
+    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in [*data, *beside]])
     if beside:
-        options["nominal"] = np.moveaxis(np.asarray(beside[0][1].frdata), -1, 0)
-    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in data])
-    return responses, np.asarray(first.omega, float) / (2 * np.pi)
+        options["nominal"] = responses[-1]
+    return responses[: len(data)], np.asarray(first.omega, float) / (2 * np.pi)

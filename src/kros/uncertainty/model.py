@@ -19,8 +19,8 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.certificate import Method
-from .weights.cover import Cover, Structure, as_structure
-from .weights.weight import EntrywiseWeight, Weight
+from .weights.cover import Cover
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
@@ -165,15 +165,12 @@ class UncertainModel(Uncertainty):
         content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
-            "peak_db": {form.value: peak for form, peak in self.peak_db.items()},
-            "misfit_max": self.misfit_max,
-            "misfit_unknown": int(np.isnan(self.misfit).sum()),
-            "weight": _facts(self.weight),
+            "weight": {name: getattr(self.weight, name) for name in _OF_WEIGHT},
             "remainder": None,
         }
         if self.remainder is not None and self.remainder_cover is not None:
             arrays |= _pack_weight("remainder", self.remainder, self.remainder_cover)
-            content["remainder"] = _facts(self.remainder)
+            content["remainder"] = {name: getattr(self.remainder, name) for name in _OF_WEIGHT}
         save_artifact(Path(folder), "uncertain_model", content, arrays)
 
     @classmethod
@@ -185,26 +182,26 @@ class UncertainModel(Uncertainty):
         check_shapes(arrays, axes, {}, Path(folder))
         dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
         weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
-        remainder: tuple[Weight | None, Cover | None] = (None, None)
-        if content["remainder"] is not None:
-            remainder = _unpack_weight("remainder", content["remainder"], arrays, dt)
         facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
+        if content["remainder"] is not None:
+            facts["remainder"], facts["remainder_cover"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
         return cls(
             nominal_system=_unpack_system("nominal", arrays, dt),
             bounds={form: arrays[f"bound_{form.value}"] for form in nominals},
             nominals=nominals,
             cover=cover,
             weight=weight,
-            remainder=remainder[0],
-            remainder_cover=remainder[1],
             **facts,
         )
 
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = ("structure", "cover_max", "overbound_db_max", "within_tolerance", "method", "remaining_margin")
+_OF_WEIGHT = (
+    *("left_orders", "right_orders", "cover_max", "overbound_db_max"),
+    *("within_tolerance", "method"),
+)
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
@@ -214,16 +211,6 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
         A, B = system.A * output_scale * rows, system.B * rows * input_scale
         return StateSpace(A, B, system.C, system.D * rows * input_scale, system.dt)
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
-
-
-def _facts(weight: Weight) -> dict[str, Any]:
-    excess = {"unstructured_excess": weight.unstructured_excess} if isinstance(weight, EntrywiseWeight) else {}
-    orders = {"orders": [weight.left_orders, weight.right_orders]}
-    return excess | orders | {name: getattr(weight, name) for name in _OF_WEIGHT}
-
-
-def _number(value: float | None) -> float:
-    return float("nan") if value is None else value
 
 
 def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
@@ -241,16 +228,7 @@ def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
-    fields: dict[str, Any] = {key: facts[key] for key in _OF_WEIGHT} | {
-        "left": _unpack_system(f"{name}_left", arrays, dt),
-        "right": _unpack_system(f"{name}_right", arrays, dt),
-        "left_orders": tuple(facts["orders"][0]),
-        "right_orders": tuple(facts["orders"][1]),
-        "structure": as_structure(facts["structure"]),
-        "method": Method(facts["method"]),
-        "remaining_margin": _number(facts["remaining_margin"]),
-    }
-    cover = Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
-    if fields["structure"] is Structure.ENTRYWISE:
-        return EntrywiseWeight(**fields, unstructured_excess=_number(facts["unstructured_excess"])), cover
-    return Weight(**fields), cover
+    orders = {side: tuple(facts[side]) for side in ("left_orders", "right_orders")}
+    left, right = (_unpack_system(f"{name}_{side}", arrays, dt) for side in ("left", "right"))
+    weight = Weight(left, right, **facts | orders | {"method": Method(facts["method"])})
+    return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])

@@ -30,12 +30,12 @@ from .model import ResponseUncertainty, UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
-from .settings import UncertaintySettings
+from .settings import QuantifySettings
 
 Array = npt.NDArray[Any]
 
-_KIND, _BEST = "choice", "unit"
-_FACTS = ("nominal", "worst_off_nominal", "dropped", "max_order", "pooled")
+_KIND = "choice"
+_FACTS = ("nominal", "worst_off_nominal", "max_order", "pooled")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -48,8 +48,6 @@ class UncertainModels:
         Where it comes from, with the recordings.
     nominal, worst_off_nominal : str
         Units: the one that all others are compared with, and the one farthest from it.
-    dropped : tuple of str
-        Units that were left out as outliers.
     sets : mapping of str to UncertainModel
         By kind of model.
     scores : tuple of dict
@@ -73,7 +71,6 @@ class UncertainModels:
     models: IdentifiedModels
     nominal: str
     worst_off_nominal: str
-    dropped: tuple[str, ...]
     sets: Mapping[str, UncertainModel]
     scores: tuple[dict[str, Any], ...] = ()
     outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
@@ -115,7 +112,7 @@ class UncertainModels:
         content, _ = load_artifact(folder / "uncertainty", _KIND)
         sets = Stored(UncertainModel.load, {kind: folder / "uncertainty" / kind for kind in content["kinds"]})
         outliers = Stored(OutlierModel.load, {place: folder / "outliers" / place for place in content["outliers"]})
-        facts = {name: content[name] for name in _FACTS} | {"dropped": tuple(content["dropped"])}
+        facts = {name: content[name] for name in _FACTS}
         scores = tuple(read_json(folder / "outliers" / "scores.json")["rows"])
         return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
 
@@ -159,12 +156,11 @@ def quantify(
     work : Work, optional
         Where models of `kros.identify` are quantified.
     **options
-        Of models of `kros.identify`: those of `UncertaintySettings`. Of all others: ``unit_ids`` (names),
+        Of models of `kros.identify`: those of `QuantifySettings`. Of all others: ``unit_ids`` (names),
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
-        row or name, or a model that is none; by default the unit with the lowest peak), ``structure`` ("diagonal", or
-        "entrywise" for the paper's bounds of entries, unsound for a full perturbation), ``max_order`` (of an entry),
+        row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
         ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of arrays of
-        responses; zero for continuous time), ``fit`` (`FitSettings`).
+        responses; zero for continuous time).
 
     Returns
     -------
@@ -181,7 +177,7 @@ def quantify(
     DataError
         Fewer than two units, unstable models, NaN.
     ConfigError
-        Unknown form, structure, nominal or option, frequencies above Nyquist, an order or tolerance out of range.
+        Unknown form, nominal or option, frequencies above Nyquist, an order or tolerance out of range.
 
     Examples
     --------
@@ -196,7 +192,7 @@ def quantify(
     """
     if isinstance(models, IdentifiedModels):
         given = {} if freqs_hz is None else {"freqs_hz": freqs_hz}
-        settings = UncertaintySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
+        settings = QuantifySettings.of({"form": getattr(form, "value", form)} | given | options, "Quantify")
         return _quantify_population(models, settings, work)
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
@@ -208,17 +204,15 @@ def quantify(
     return bound_systems(models, as_form(form), freqs_hz, read)
 
 
-def _quantify_population(models: IdentifiedModels, settings: UncertaintySettings, work: Work | None) -> UncertainModels:
+def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
     """Score outliers, choose the nominal of the first kind of models, and bound every kind around it."""
     outliers, scores = score_population(models, settings, work)
-    dropped = {row["unit"] for row in scores if row["outlier"]} if settings.drop_outliers else set()
     first = models.models()
-    modelled = set(first.unit_ids) - dropped
-    units = [u for u in models.facts.pooled if u in modelled]
+    units = [u for u in models.facts.pooled if u in first.unit_ids]
     if len(units) < 2:
         raise IdentificationError(
-            f"Uncertainty: {len(units)} units are left of {len(models.facts.pooled)}, at least two are needed; dropped "
-            f"are {sorted(dropped)}. Record more units in the condition that feeds synthesis, or keep outliers."
+            f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed; "
+            "record more units in the condition that feeds synthesis."
         )
     nominal = choose_unit(first, units, settings)
     tasks = [partial(quantify_kind, models.models(kind), units, settings, nominal) for kind in models.kinds]
@@ -227,7 +221,6 @@ def _quantify_population(models: IdentifiedModels, settings: UncertaintySettings
         models=models,
         nominal=nominal,
         worst_off_nominal=worst_off_nominal(first, sets[models.kinds[0]]),
-        dropped=tuple(sorted(dropped)),
         sets=sets,
         scores=tuple(scores),
         outliers=outliers,
@@ -236,19 +229,19 @@ def _quantify_population(models: IdentifiedModels, settings: UncertaintySettings
     )
 
 
-def choose_unit(models: ModelSet, units: list[str], settings: UncertaintySettings) -> str:
+def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) -> str:
     """Return the nominal unit, by default the best of the first kind of models, shared by all as in the paper."""
-    if settings.nominal is None or (settings.nominal == _BEST and _BEST not in units):
+    if settings.nominal is None:
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
         return units[choose_nominal(responses, settings.form).index]
     if settings.nominal not in units:
         raise IdentificationError(
-            f"uncertainty.nominal = {settings.nominal!r}: is not among the units {', '.join(units)}; name one of them."
+            f"Quantify: nominal {settings.nominal!r} is not among the units {', '.join(units)}; name one of them."
         )
     return settings.nominal
 
 
-def quantify_kind(models: ModelSet, units: list[str], settings: UncertaintySettings, nominal: str) -> UncertainModel:
+def quantify_kind(models: ModelSet, units: list[str], settings: QuantifySettings, nominal: str) -> UncertainModel:
     """Quantify one kind of model over the pooled units."""
     options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
     return bound_systems(models, Form(settings.form), models.frequencies(settings.n_freqs), options)

@@ -9,7 +9,7 @@ were not made for exceeds one where it sticks out.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,12 +21,13 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
 from .weights.cover import Cover, cover_ratio
-from .weights.magnitude import fit_magnitude
-from .weights.weight import EntrywiseWeight, Weight, unstructured_excess
+from .weights.entries import fit_entries
+from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
 MOST_UNITS = 200  # that are kept for a picture
+_ENTRY_ORDER = 3  # of fits to single entries, which are looked at and decide nothing
 _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
 
 
@@ -81,59 +82,37 @@ class UnitResiduals:
 
 def unit_residuals(
     form: Form,
-    nominal: Array,
-    responses: Array,
+    nominal: tuple[str, Array],
+    responses: Mapping[str, Array],
     weights: Weight | Cover,
     freqs_hz: Array,
     sample_period_s: float,
-    *,
-    unit_ids: Sequence[str],
-    nominal_id: str,
     outside: Collection[str] = (),
-    max_order: int = 4,
-    tolerance_db: float = 1.0,
 ) -> UnitResiduals:
-    """Return residuals of units against a nominal, of shape (unit, frequency, p, m), beside weights or a cover."""
-    inside = np.array([u not in outside for u in unit_ids], dtype=bool)
-    if len(unit_ids) != len(responses) or not inside.any():
+    """Return residuals of units, whose responses have the shape (frequency, p, m), beside weights or a cover."""
+    unit_ids, inside = tuple(responses), np.array([unit not in outside for unit in responses])
+    if not inside.any():
         raise DimensionError(
-            f"Residuals of units: need a name for each of {len(responses)} responses and at least one unit that "
-            f"is covered, "
-            f"found {len(unit_ids)} names, {int(inside.sum())} of them covered."
+            f"Residuals of units: needs at least one unit that is covered, found {', '.join(unit_ids)}."
         )
-    E = residual(form, nominal, responses)
-    sizes, ratio = np.abs(E), weight_ratio(weights, E, freqs_hz)
-    largest = sizes[inside].max(axis=0)
-    fitted, orders = np.empty_like(largest, dtype=complex), np.zeros(largest.shape[1:], dtype=int)
-    for i, j in np.ndindex(*largest.shape[1:]):
-        found = fit_magnitude(
-            freqs_hz, largest[:, i, j], sample_period_s, max_order=max_order, tolerance_db=tolerance_db
-        )
-        fitted[:, i, j] = found.system.frequency_response(freqs_hz)[:, 0, 0]
-        orders[i, j] = found.order
-    kept = shown_rows(inside)
+    E = residual(form, nominal[1], np.stack(list(responses.values())))
+    cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
+    sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
+    fitted = fit_entries(E[inside], freqs_hz, sample_period_s, _ENTRY_ORDER)
+    shown = shown_rows(inside)
     return UnitResiduals(
         form=form,
-        nominal_id=nominal_id,
-        unit_ids=tuple(unit_ids[k] for k in kept),
-        outside=tuple(u for u in unit_ids if u in outside),
+        nominal_id=nominal[0],
+        unit_ids=tuple(unit_ids[k] for k in shown),
+        outside=tuple(unit for unit in unit_ids if unit in outside),
         freqs_hz=freqs_hz,
-        entries=sizes[kept],
-        ratio=ratio[kept],
-        largest=largest,
-        entry_weights=np.abs(fitted),
-        entry_orders=orders,
-        entry_excess=unstructured_excess(fitted, E[inside]),
+        entries=sizes[shown],
+        ratio=ratio[shown],
+        largest=sizes[inside].max(axis=0),
+        entry_weights=np.abs(fitted.system.frequency_response(freqs_hz)),
+        entry_orders=fitted.orders,
+        entry_excess=fitted.excess,
     )
-
-
-def weight_ratio(weights: Weight | Cover, E: Array, freqs_hz: Array) -> Array:
-    """Return ``sigma_max(W_L^-1 E W_R^-1)``, shape (unit, frequency)."""
-    if isinstance(weights, EntrywiseWeight):
-        size = np.abs(weights.matrix().frequency_response(freqs_hz))
-        return np.asarray(np.divide(np.abs(E), size, out=np.zeros(E.shape), where=size > 0).max(axis=(-2, -1)))
-    cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
-    return cover_ratio(E, cover.left, cover.right)
 
 
 def shown_rows(inside: npt.NDArray[np.bool_]) -> Array:

@@ -16,7 +16,6 @@ between units.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -166,14 +165,16 @@ def variation_and_noise(
     >>> bool((found.noise < found.total).all())  # these units differ by more than recordings of this length explain
     True
     """
+    _require(models, nominal)
     form, freqs = as_form(form), check_grid(freqs_hz, sample_period_s)
-    units, draws, n, m = _require(models, nominal)
+    (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
     scale = check_scale("output", output_scale, n)[:, None] / check_scale("input", input_scale, m)
     # Responses of the estimates, scaled: (unit, frequency, n, m).
     G = models.estimate.responses(freqs, sample_period_s) / scale
     noise, band = np.zeros(len(freqs)), np.empty((units, len(freqs)))
+    step = max(1, _AT_ONCE // (draws * n * max(n, m)))
     for row in range(units):
-        for part in _parts(len(freqs), draws * n * max(n, m)):
+        for part in (slice(start, start + step) for start in range(0, len(freqs), step)):
             other = models.responses(row, freqs[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, other, np.roll(other, 1, axis=0))) / units
             band[row, part] = np.quantile(sigma_max(residual(form, G[row, part], other)), _LEVEL, axis=0)
@@ -190,42 +191,31 @@ def variation_and_noise(
     )
 
 
-def _between(form: Form, G: Array) -> Array:
-    """Mean squared residual over ordered pairs of units, with at most 64 of them as nominals."""
-    units = len(G)
-    chosen = np.unique(np.linspace(0, units - 1, min(units, _MOST_NOMINALS)).round().astype(int))
-    total = np.zeros(G.shape[1])
-    for k in chosen:
-        total += _mean_square(residual(form, G[k], G)) * units / (units - 1)  # a unit against itself adds nothing
-    return total / len(chosen)
-
-
 def _mean_square(E: Array) -> Array:
     """Mean over the first axis of squared Frobenius norms, shape (frequency,)."""
     return np.asarray(squared(E).sum(axis=(-2, -1)).mean(axis=0))
 
 
-def _require(models: ModelSamples, nominal: int) -> tuple[int, int, int, int]:
-    units, draws, n, m = *models.samples.A.shape[:2], models.samples.A.shape[-1], models.samples.B.shape[-1]
+def _between(form: Form, G: Array) -> Array:
+    """Mean squared residual over ordered pairs of units, with at most 64 of them as nominals."""
+    units = len(G)
+    chosen = np.unique(np.linspace(0, units - 1, min(units, _MOST_NOMINALS)).round().astype(int))
+    return np.mean([_mean_square(residual(form, G[k], G)) for k in chosen], axis=0) * units / (units - 1)
+
+
+def _require(models: ModelSamples, nominal: int) -> None:
+    """Raise an error for too few units or draws, models that are not finite, or a nominal that is no unit."""
+    units, draws = models.samples.A.shape[:2]
     if units < 2 or draws < 2:
         raise DataError(
             f"Variation and noise: needs at least two units and two draws of each, found {units} and {draws}."
         )
-    for unit, parts in zip(models.unit_ids, zip(*_matrices(models), strict=True), strict=True):
-        if not all(np.isfinite(p).all() for p in parts):
-            raise DataError(
-                f"Variation and noise: unit {unit} has a model or a draw that is not finite; leave the unit out, "
-                f"or raise alpha."
-            )
+    parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
+    finite = np.all([np.isfinite(part).reshape(units, -1).all(axis=1) for part in parts], axis=0)
+    if not finite.all():
+        raise DataError(
+            f"Variation and noise: unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not "
+            "finite; leave the unit out, or raise alpha."
+        )
     if not 0 <= nominal < units:
         raise ConfigError(f"Variation and noise: the nominal should be a row of {units} units, found {nominal}.")
-    return units, draws, n, m
-
-
-def _matrices(models: ModelSamples) -> tuple[Array, ...]:
-    return models.estimate.A, models.estimate.B, models.samples.A, models.samples.B
-
-
-def _parts(count: int, size: int) -> Iterator[slice]:
-    step = max(1, _AT_ONCE // size)
-    return (slice(start, start + step) for start in range(0, count, step))

@@ -82,7 +82,7 @@ def read(
         raise ConfigError(f"data.reader should be one of {', '.join(READERS)}, found {reader!r}; correct it.")
     chosen = _fitting(reader, Path(source), mapping is not None)
     if chosen == "csv" and mapping is None:
-        advice = "give mapping=, --mapping FILE or the table [data.csv] (kros init writes one)"
+        advice = "give mapping= or the table [data.csv] (kros init writes one)"
         raise ConfigError(f"Reading {source} as csv needs a mapping of columns; {advice}.")
     if chosen != "csv" and mapping is not None:
         problem = "a CSV mapping is given, which only the reader 'csv' uses"

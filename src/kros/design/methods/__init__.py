@@ -1,1 +1,49 @@
-"""The methods of observer design, one file each, and the table of them all."""
+"""The methods of observer design, from the plainest to the one that is preferred where others are as accurate."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Collection, Iterable
+
+from ...observer import EstimatorSettings
+from ..task import Method, split_name
+from .estimator import Estimator
+from .gains import KalmanTuned, OpenLoop
+from .residual import ResidualH2
+from .robust import Mixed, Published, WorstCaseH2
+
+log = logging.getLogger(__name__)
+METHODS: tuple[Method, ...] = (
+    OpenLoop(),
+    KalmanTuned(),
+    Published(),
+    Mixed(),
+    ResidualH2(),
+    WorstCaseH2(),
+    Estimator(),
+)
+
+
+def methods_of(names: Iterable[str], estimator: EstimatorSettings | None = None) -> list[Method]:
+    """Return methods by their names, in the order of all; names of what is no method are left out."""
+    wanted = set(names)
+    methods = [method for method in METHODS if method.name in wanted]
+    return [Estimator(estimator) if estimator and isinstance(m, Estimator) else m for m in methods]
+
+
+def suitable(methods: Iterable[Method], kind: str, kinds: Collection[str]) -> list[Method]:
+    """Return the methods that are for one of the kinds of models; reasons of others are logged."""
+    suited = []
+    for method in methods:
+        if refusal := method.refusal(kind, kinds):
+            log.info("%s/%s is not designed: %s.", kind, method.name, refusal)
+        else:
+            suited.append(method)
+    return suited
+
+
+def preferred(observers: Iterable[str]) -> str | None:
+    """Return the observer ``<kind of model>/<method>`` whose method is preferred; None where there is none."""
+    order = {method.name: -place for place, method in enumerate(METHODS)}
+    ranks = {name: order[method] for name in observers if (method := split_name(name)[1]) in order}
+    return min(ranks, key=lambda name: ranks[name], default=None)

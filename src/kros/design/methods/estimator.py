@@ -3,42 +3,51 @@
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
-from ...observer import Recordings, identify_estimator
-from ...observer.limits import sides
+from ...identify.model_set import kind_of
+from ...observer import EstimatorSettings, Recordings, identify_estimator
+from ...observer.sensor import sides
 from ...synthesis import Status, Synthesis
-from ..task import DesignResult, DesignTask
+from ..task import Design, DesignTask, Method
 
 
-def design_estimator(task: DesignTask) -> DesignResult:
-    """Identify the estimator; what the sensors are declared to be is in its training episodes."""
-    began, models = time.perf_counter(), task.models
-    training = task.recordings or task.training
-    recordings = Recordings.of(training.keys, training.read_one)
-    nominal = {name: float(values[models.index(task.unit)]) for name, values in models.parameters.items()}
-    found = identify_estimator(
-        task.name,
-        models.lifting,
-        models.measured,
-        models.recorded_inputs,
-        recordings,
-        models.sample_period_s,
-        nominal,
-        task.estimator,
-    )
-    bounds = found.observer.runtime
-    lower, upper = sides(task.limits, found.observer.lifting.states)
-    if bounds.lower is not None and bounds.upper is not None:
-        lower, upper = np.maximum(lower, bounds.lower), np.minimum(upper, bounds.upper)
-    observer = replace(
-        found.observer,
-        runtime=replace(bounds, lower=lower, upper=upper),
-        seen=training.seen,
-        sensor=task.sensor,
-    )
-    seconds = time.perf_counter() - began
-    synthesis = Synthesis("estimator", observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
-    return DesignResult(task.name, observer, synthesis, found.facts, task.problem)
+@dataclass(frozen=True)
+class Estimator(Method):
+    """Regression on filtered measurements and inputs; what sensors are declared to be is in its training episodes."""
+
+    name: ClassVar[str] = "estimator"
+    settings: EstimatorSettings = field(default_factory=EstimatorSettings)
+
+    def refusal(self, kind: str, kinds: Collection[str]) -> str:
+        """Refuse to fit the same recordings twice, for refined models and for those of EDMD."""
+        again = not kind_of(kind).refined and kind.removesuffix("_edmd") in kinds
+        return "it is fitted to recordings, not to models, and is designed for refined models" if again else ""
+
+    def design(self, task: DesignTask) -> Design:
+        """Identify the estimator."""
+        began, models, training = time.perf_counter(), task.models, task.recordings
+        nominal = {name: float(values[models.index(task.unit)]) for name, values in models.parameters.items()}
+        identified = identify_estimator(
+            task.name,
+            models.lifting,
+            models.measured,
+            models.recorded_inputs,
+            Recordings.of(training.keys, training.read_one),
+            models.sample_period_s,
+            nominal,
+            self.settings,
+        )
+        runtime = identified.observer.runtime
+        lower, upper = sides(task.limits, identified.observer.lifting.states)
+        if runtime.lower is not None and runtime.upper is not None:
+            lower, upper = np.maximum(lower, runtime.lower), np.minimum(upper, runtime.upper)
+        runtime = replace(runtime, lower=lower, upper=upper)
+        observer = replace(identified.observer, runtime=runtime, seen=training.seen, sensor=task.sensor)
+        seconds = time.perf_counter() - began
+        synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
+        return Design(task.name, observer, synthesis, identified.facts)

@@ -1,4 +1,4 @@
-"""What generated code loses: its estimates beside Python's on held-out recordings, compiled where there is a compiler."""
+"""What generated code loses: its estimates beside Python's on held-out recordings."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer, run_observer, track_parameter
-from ...observer.recorded import recorded_factors
+from ...observer.units import recorded_factors
 from .compiled import CompiledObserver
 
 Array = npt.NDArray[np.float64]
@@ -34,7 +34,7 @@ class HeldOut:
     --------
     >>> import numpy as np
     >>> from kros.export import HeldOut
-    >>> recordings = HeldOut(np.zeros((100, 2, 1)), np.zeros((100, 2, 1)), np.zeros((100, 2, 3)))  # for export_c(..., held_out=recordings)
+    >>> recordings = HeldOut(np.zeros((100, 2, 1)), np.zeros((100, 2, 1)), np.zeros((100, 2, 3)))
     >>> recordings.y.shape
     (100, 2, 1)
     """

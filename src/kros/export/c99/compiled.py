@@ -1,4 +1,4 @@
-"""Generated code, compiled and run from Python: the same estimates without Python's time, and how tests compare both."""
+"""Generated code, compiled and run from Python."""
 
 from __future__ import annotations
 
@@ -128,7 +128,8 @@ class CompiledObserver:
         y, u = np.ascontiguousarray(y, dtype=float), np.ascontiguousarray(u, dtype=float)
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
             raise DimensionError(
-                f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and {u.shape}."
+                f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m}), found {y.shape} and "
+                f"{u.shape}."
             )
         machine = self.start(y[0], parameters, condition) if machine is None else machine
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
@@ -150,7 +151,8 @@ class CompiledObserver:
         if condition is not None:
             if condition not in self.conditions:
                 raise ConfigError(
-                    f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are {self.conditions}."
+                    f"Compiled observer {self.name}: the condition {condition!r} is unknown; known are "
+                    f"{self.conditions}."
                 )
             self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
         return machine

@@ -31,7 +31,7 @@ class Golden:
 
     @classmethod
     def of(cls, observer: Observer, track: str | None = None, count: int = SAMPLES, tolerance: float = 0.0) -> Golden:
-        """Run an observer on smooth signals of the size seen in training, with a missing measurement, a lost input and a spike."""
+        """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
         y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)

@@ -13,18 +13,16 @@ from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.guard import bounds
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
-from ...observer.origin import FAR, OriginShift
-from ...observer.recorded import recorded_channel, recorded_factors
-from ...observer.samples import LONGEST
-from ...observer.screen import Bounds, Screen
+from ...observer.runtime import bounds
+from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
+from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
+from .origin import FAR, OriginShift, find_shift
 from .realise import Realised
 
 Array = npt.NDArray[np.float64]
-FAR_SINGLE = 8  # periods from the origin, as far as single precision goes
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,8 @@ class Source:
         realised = Realised.of(observer)
         observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)
-        return cls(realised, name, Precision(precision), realised.shift, loop, load)
+        shift = find_shift(realised.observer) if precision == "float" else None
+        return cls(realised, name, Precision(precision), shift, loop, load)
 
     @property
     def observer(self) -> Observer:
@@ -82,13 +81,25 @@ class Source:
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
-        o, lifting, run = self.observer, self.observer.lifting, self.observer.runtime
-        n, q, m, K = lifting.n_states, len(o.measured), len(o.inputs), o.controller
-        functions, widened = lifting.n_lifted - n, o.B.shape[1]
-        screen = Screen.of(o)
-        limited = run.limited
-        x_names, y_names = (*o.recorded,), [lifting.states[i] for i in o.measured]
-        factors = self.factors()
+        parts = (self.names(), self.sizes(), self.linear(), self.limits(), self.origin())
+        context = {key: value for part in parts for key, value in part.items()}
+        formulas, write = self.observer.lifting.formulas, Precision().literal
+        return context | {
+            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
+            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas],
+            "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
+            "monitor": self.monitor(),
+            "guard": self.guard(),
+            "bank": self.bank(),
+            "tracked": self.tracked(),
+            "load": self.load_torque(),
+            "sample_period_s": write(self.observer.sample_period_s),
+        }
+
+    def names(self) -> dict[str, Any]:
+        """Return names and units of measure."""
+        o, factors = self.observer, self.factors()
+        measured = [o.lifting.states[i] for i in o.measured]
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -98,70 +109,101 @@ class Source:
             "zero": self.precision.literal(0.0),
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
-            "measured": plain_names(lifting.states[i] for i in o.measured),
+            "measured": plain_names(measured),
             "inputs": plain_names(o.inputs),
-            "parameters": lifting.parameters,
+            "parameters": o.lifting.parameters,
             "signals": self.signals(),
-            "x_factor": self.literals([1 / factors[s] for s in x_names]),
-            "y_factor": self.literals([factors[s] for s in y_names]),
+            "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
+            "y_factor": self.literals([factors[s] for s in measured]),
             "u_factor": self.literals([factors[s] for s in o.inputs]),
-            "at": o.measured,
-            "n": n,
-            "recorded": len(o.recorded),
-            "q": q,
-            "m": m,
-            "functions": functions,
-            "widened": widened,
-            "order": K.n_states,
-            "delay": run.delay,
-            "longest": LONGEST,
-            "limited": limited,
-            "clips_estimate": run.lower is not None or run.upper is not None,
-            "relifts": run.relift,
-            "clips_correction": run.correction is not None,
-            "width": o.into.shape[1],
-            "history": len(lifting.window.earlier),
-            "window_shift": [int(i) for i in lifting.window.shift] if lifting.history else [],
-            "window_present": [int(i) for i in lifting.window.present] if lifting.history else [],
-            "model": self.sums(self.realised.model),
-            "less": [
-                (j, i, None if factor == 1 else self.precision.literal(factor)) for j, i, factor in self.realised.less
-            ],
-            "correction": self.sums(np.hstack([K.C, K.D]) if limited else o.into[:n] @ np.hstack([K.C, K.D])),
-            "into": self.sums(o.into[:n]) if limited else [],
-            "controller": self.sums(np.hstack([K.A, K.B])),
-            "filter_gain": self.sums(o.filter_gain),
-            "monitor": self.monitor(),
-            "guard": self.guard(),
-            "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
-            "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
-            "largest": self.numbers(_filled(run.correction, o.into.shape[1], np.inf)),
-            "y_bounds": self.bounds(screen.measured),
-            "u_bounds": self.bounds(screen.inputs),
-            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in lifting.parameters])),
-            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.formulas],
-            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in lifting.input_formulas],
-            "bank": self.bank(),
-            "tracked": self.tracked(),
-            "load": self.load_torque(),
-            "shift": self.shift,
-            "shift_states": None if self.shift is None else self.wide(self.shift.states),
-            "shift_whole": None if self.shift is None else self.wide(self.shift.whole),
-            "shift_rest": None if self.shift is None else self.wide(self.shift.rest),
-            "relative_inputs": self.relative_inputs(),
-            "shift_others": []
-            if self.shift is None
-            else [i for i in range(len(o.recorded)) if i != o.measured[0] and self.shift.states[i] != 0],
-            "far": None
-            if self.shift is None
-            else self.precision.literal((FAR_SINGLE if self.precision.type == "float" else FAR) * self.shift.period),
-            "period": None if self.shift is None else Precision().literal(self.shift.period),
-            "recorded_period": None if self.shift is None else abs(self.shift.period / factors[y_names[0]]),
-            "sample_period_s": Precision().literal(o.sample_period_s),
         }
 
+    def sizes(self) -> dict[str, Any]:
+        """Return numbers of states, channels and samples."""
+        o, lifting, window = self.observer, self.observer.lifting, self.observer.lifting.window
+        return {
+            "at": o.measured,
+            "n": lifting.n_states,
+            "recorded": len(o.recorded),
+            "q": len(o.measured),
+            "m": len(o.inputs),
+            "functions": lifting.n_lifted - lifting.n_states,
+            "widened": o.B.shape[1],
+            "order": o.controller.n_states,
+            "delay": o.runtime.delay,
+            "longest": LONGEST,
+            "history": len(window.earlier),
+            "window_shift": [int(i) for i in window.shift] if lifting.history else [],
+            "window_present": [int(i) for i in window.present] if lifting.history else [],
+        }
+
+    def linear(self) -> dict[str, Any]:
+        """Return the model and the correction, zeros left out."""
+        o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
+        write = self.precision.literal
+        found = {
+            "model": self.sums(self.realised.model),
+            "correction": self.sums(o.into[:n] @ np.hstack([K.C, K.D])),
+            "controller": self.sums(np.hstack([K.A, K.B])),
+        }
+        return found | {
+            "operations": sum(len(row) for rows in found.values() for row in rows),
+            "less": [(j, i, None if factor == 1 else write(factor)) for j, i, factor in self.realised.less],
+            "filter_gain": self.sums(o.filter_gain),
+        }
+
+    def limits(self) -> dict[str, Any]:
+        """Return limits and default parameters."""
+        o, run, n, screen = (
+            self.observer,
+            self.observer.runtime,
+            self.observer.lifting.n_states,
+            Screen.of(self.observer),
+        )
+        largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
+        return {
+            "clips_estimate": run.lower is not None or run.upper is not None,
+            "lower": self.numbers(_filled(run.lower, n, -np.inf), wide=True),
+            "upper": self.numbers(_filled(run.upper, n, np.inf), wide=True),
+            "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
+            "y_bounds": self.bounds(screen.measured),
+            "u_bounds": self.bounds(screen.inputs),
+            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
+        }
+
+    @property
+    def measured(self) -> list[str]:
+        """Names of the measured states."""
+        return [self.observer.lifting.states[i] for i in self.observer.measured]
+
+    def origin(self) -> dict[str, Any]:
+        """Return how the origin moves; nothing where it cannot."""
+        keys = ("shift_states", "shift_whole", "shift_rest", "far", "period", "recorded_period")
+        shift, o, write = self.shift, self.observer, Precision().literal
+        if shift is None:
+            return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
+        return {
+            "shift": shift,
+            "shift_states": self.wide(shift.states),
+            "shift_whole": self.wide(shift.whole),
+            "shift_rest": self.wide(shift.rest),
+            "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
+            "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
+            "far": self.precision.literal(FAR * shift.period),
+            "period": write(shift.period),
+            "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
+        }
+
+    def relative_input(self, j: int) -> str:
+        """Return an input relative to the origin: an exact difference first, and nothing that is zero."""
+        assert self.shift is not None
+        whole, text = float(self.shift.whole[j]), f"s->held[{j}]"
+        if whole != 0:
+            text += " - s->origin" if whole == 1 else f" - ({Precision().literal(whole)} * s->origin)"
+        return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
+
     def factors(self) -> dict[str, float]:
-        """Return by what the recordings of channels are multiplied, by name; a load torque is in the unit of its current."""
+        """Return by what recordings are multiplied, by name; a load torque has the unit of its current."""
         names = (*self.observer.recorded, *self.observer.inputs)
         found = dict(zip(names, recorded_factors(self.observer, names).tolist(), strict=True))
         return found if self.load is None else found | {self.load.load: found[self.load.current]}
@@ -180,20 +222,8 @@ class Source:
         """Return the literals of factors in double precision; none where all are one."""
         return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
 
-    def relative_inputs(self) -> list[str]:
-        """Return the inputs relative to the origin: an exact difference first, and nothing that is zero, which a processor without doubles pays for."""
-        if self.shift is None:
-            return []
-        found = []
-        for j, (whole, rest) in enumerate(zip(self.shift.whole, self.shift.rest, strict=True)):
-            text = f"s->held[{j}]"
-            if whole != 0:
-                text = f"{text} - {'s->origin' if whole == 1 else f'({Precision().literal(float(whole))} * s->origin)'}"
-            found.append(text if rest == 0 else f"({text}) - s->moved_u[{j}]")
-        return found
-
     def tracked(self) -> dict[str, Any] | None:
-        """Return what a phase-locked loop consists of: the observer's linear part, and slopes of lifted functions by states and parameter."""
+        """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
         if self.loop is None:
             return None
         o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
@@ -227,7 +257,7 @@ class Source:
         }
 
     def load_torque(self) -> dict[str, Any] | None:
-        """Return the numbers of `AngleLoad`, in double precision: it sums up for as long as it runs."""
+        """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
         if self.load is None:
             return None
         level, places, write = self.load.level, self.observer.recorded, Precision().literal
@@ -309,7 +339,7 @@ class Source:
         return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
 
     def symbol(self, name: str) -> str:
-        """Return what stands for a quantity of a formula in C: window w, parameters p, inputs u."""
+        """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
         lifting = self.observer.lifting
         for names, array in ((lifting.window.names, "w"), (lifting.parameters, "p"), (self.observer.inputs, "u")):
             if name in names:
@@ -335,22 +365,20 @@ class Source:
         return [Precision().literal(float(v)) for v in values]
 
     def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
-        """Return the bounds of every channel in double precision, and in single precision between which a sample is good as it is."""
-        rows, most = zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True), float(np.finfo(float).max)
-        found = []
-        for row in rows:
+        """Return the bounds of every channel in double precision, and those of good samples in single."""
+        most, single = float(np.finfo(float).max), float(np.finfo(np.float32).max)
+        rows = []
+        for row in zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True):
             lower, upper, least, furthest = (float(np.clip(v, -most, most)) for v in row)
             wide = {"lower": lower, "upper": upper, "least": least, "most": furthest}
-            inner = np.clip([max(lower, least), min(upper, furthest)], *(np.finfo(np.float32).max * np.array([-1, 1])))
+            inner = {"low": max(lower, least, -single), "high": min(upper, furthest, single)}
             texts = {name: Precision().literal(v) for name, v in wide.items()}
-            found.append(
-                texts | {name: Precision("float").literal(v) for name, v in zip(("low", "high"), inner, strict=True)}
-            )
-        return found
+            rows.append(texts | {name: Precision("float").literal(v) for name, v in inner.items()})
+        return rows
 
 
 def _uncorrected(observer: Observer) -> Array:
-    """Return what the model and the direct correction make of a change of the estimate, the lifted functions held; shape (n_lifted, n_lifted)."""
+    """Return the model with the direct correction, lifted functions held, shape (n_lifted, n_lifted)."""
     A = observer.A.copy()
     A[:, list(observer.measured)] -= observer.into @ observer.controller.D
     if observer.bank is not None:

@@ -1,9 +1,11 @@
 r"""The linear part of an observer as numbers that rounding does little to, and with few operations.
 
-Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of one for every other state.
+Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of
+one for every other state.
 
-An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what is left is a millionth of
-either, and rounding is not. So the difference is formed first. For the input j and the measured state i with :math:`B_j \approx -c\,(A - I)_i`
+An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what
+is left is a millionth of either, and rounding is not. So the difference is formed first. For the input j and the
+measured state i with :math:`B_j \approx -c\,(A - I)_i`
 
 .. math:: (A - I)_i\, x_i + B_j u_j = \bigl((A - I)_i + c\, B_j\bigr) x_i + B_j\, (u_j - c\, x_i),
 
@@ -18,7 +20,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...observer import Observer
-from ...observer.origin import OriginShift, find_shift
 
 Array = npt.NDArray[np.float64]
 _ALIKE = 1e4  # condition of the modes, by which rounding grows
@@ -33,7 +34,6 @@ class Realised:
     observer: Observer
     model: Array  # (n, n_lifted + m)
     less: tuple[tuple[int, int, float], ...]
-    shift: OriginShift | None
     start: Array  # (n, n_lifted + m), of a filter bank
     into: Array  # (filters, q), from measurements to the filters of a bank
 
@@ -46,9 +46,9 @@ class Realised:
             A[:, i] += factor * observer.B[:, j]
             if observer.bank is not None:
                 start[:, i] += factor * start[:, len(A) + j]
-        turn, shift = to_modes(observer), find_shift(observer)
+        turn = to_modes(observer)
         if turn is None:
-            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, shift, start, _into(observer))
+            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, start, _into(observer))
         turned = in_coordinates(observer, turn)
         first, own = len(observer.recorded), turned.A.copy()
         measured = list(observer.measured)
@@ -58,7 +58,7 @@ class Realised:
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
         turned = replace(turned, A=own)
-        return cls(turned, model, less, shift, turn[:n, :n] @ start, _into(turned))
+        return cls(turned, model, less, turn[:n, :n] @ start, _into(turned))
 
 
 def _into(observer: Observer) -> Array:
@@ -88,7 +88,7 @@ def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
 
 
 def to_modes(observer: Observer) -> Array | None:
-    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted): one for real modes, pairs for complex ones; None where there are none."""
+    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted); None without a bank."""
     if observer.bank is None:
         return None
     n, first, last = observer.lifting.n_states, len(observer.recorded), len(observer.recorded) + observer.bank.filters
@@ -114,7 +114,7 @@ def _modes(A: Array) -> Array:
 
 
 def in_coordinates(observer: Observer, turn: Array) -> Observer:
-    """The observer in lifted coordinates ``turn @ theta`` that leave the recorded states and the lifted functions alone."""
+    """The observer in coordinates ``turn @ theta`` that leave recorded states and functions alone."""
     n = observer.lifting.n_states
     bank, guard = observer.bank, observer.guard
     return replace(

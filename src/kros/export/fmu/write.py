@@ -19,11 +19,11 @@ from ...core.errors import ConfigError
 from ...core.files import write_bytes
 from ...loops.compiler import compile_library, find_compiler
 from ...observer import Observer
-from ...observer.recorded import recorded_channel
+from ...observer.units import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files
-from ..text import plain, plain_names, require_identifier
+from ..text import plain, plain_names, rendered, require_identifier
 
 log = logging.getLogger(__name__)
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
@@ -40,9 +40,10 @@ def export_fmu(
 ) -> Path:
     """Write an observer as an FMU for co-simulation.
 
-    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of the recordings;
-    ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one sample and gives the estimate for its end.
-    ``condition``, where the monitor knows some, is a tunable enumeration: the recorded condition that the machine is in, ``unknown`` at first.
+    Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of
+    the recordings; ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one
+    sample and gives the estimate for its end. ``condition``, where the monitor knows some, is a tunable enumeration:
+    the recorded condition that the machine is in, ``unknown`` at first.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ def export_fmu(
     Raises
     ------
     ConfigError
-        When the file exists or ends differently, the version or the name is none, or a lifted function has no expression in C.
+        When the file exists or ends differently, the version or the name is none, or a lifted function has no
+        expression in C.
 
     Examples
     --------
@@ -86,7 +88,7 @@ def export_fmu(
     files = c_files(observer, name, precision, track)
     sources = {f"sources/{file}": files[file] for file in (f"{name}.h", f"{name}.c")}
     guid = str(uuid.uuid5(_KROS, sources[f"sources/{name}.c"] + files["manifest.json"]))
-    texts = rendered(Source.of(observer, name, precision, track), fmi, guid)
+    texts = fmu_files(Source.of(observer, name, precision, track), fmi, guid)
     packed: dict[str, bytes] = {
         file: text.encode()
         for file, text in {**texts, **sources, "documentation/README.md": files["README.md"]}.items()
@@ -95,93 +97,61 @@ def export_fmu(
     return out
 
 
-def rendered(source: Source, fmi: int, guid: str) -> dict[str, str]:
+def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-
-    observer, name, context = source.observer, source.name, source.context()
-    units = {c: unit for c in (*observer.recorded, *observer.inputs) if (unit := recorded_channel(observer, c).unit)}
+    observer, name = source.observer, source.name
+    units = {c: plain(recorded_channel(observer, c).unit or "") for c in (*observer.recorded, *observer.inputs)}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
-    context |= {
+    units = {c: unit for c, unit in units.items() if recorded_channel(observer, c).unit}
+    context = source.context() | {
         "version": version("kros"),
         "fmi": fmi,
         "guid": guid,
-        "units": {name: plain(unit) for name, unit in units.items()},
+        "units": units,
         "estimates": len(estimates),
+        "variables": variables(observer, units, estimates),
+        "conditions": conditions(observer),
+        "wide_parameters": [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters],
     }
-    context["variables"] = variables(observer, units, estimates)
-    context["conditions"] = conditions(observer)
-    context["wide_parameters"] = [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters]
-    environment = Environment(
-        loader=PackageLoader("kros.export.fmu"), undefined=StrictUndefined, keep_trailing_newline=True
-    )
-    chosen = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
+    files = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
     if fmi == 3:
-        chosen["sources/buildDescription.xml"] = "build.xml"
-    return {file: environment.get_template(f"{template}.jinja").render(context) for file, template in chosen.items()}
+        files["sources/buildDescription.xml"] = "build.xml"
+    return rendered("kros.export.fmu", files, context)
 
 
 def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the variables in the order of their references: measurements, inputs, parameters, estimates, status, condition."""
-    measured = [observer.lifting.states[i] for i in observer.measured]
+    """Return the variables in the order of their references, measurements first."""
+    found: list[dict[str, Any]] = []
 
-    def rows(
-        names: Any, causality: str, variability: str, description: str, start: Any, suffix: str = ""
-    ) -> list[dict[str, Any]]:
-        return [
-            {
-                "name": plain(n) + suffix,
-                "causality": causality,
-                "variability": variability,
-                "description": description.format(plain(n)),
-                "unit": plain(units[n]) if units.get(n) else "",
-            }
-            | {"start": start(n), "kind": "real"}
-            for n in names
-        ]
+    def add(name: str, causality: str, text: str, start: str | None, suffix: str = "", kind: str = "real") -> None:
+        shown, variability = plain(name), "tunable" if causality == "parameter" else "discrete"
+        row = {"name": shown + suffix, "causality": causality, "variability": variability, "kind": kind}
+        row |= {"description": text.format(shown), "unit": units.get(name, "")}
+        found.append(row | {"start": start, "index": len(found)})
 
-    found = rows(measured, "input", "discrete", "measured {}", lambda _: "0.0")
-    found += rows(observer.inputs, "input", "discrete", "input {}", lambda _: "0.0")
-    found += rows(
-        observer.lifting.parameters,
-        "parameter",
-        "tunable",
-        "this machine's {}",
-        lambda n: f"{observer.parameters.get(n, 0.0):.17g}",
-    )
-    found += rows(estimates, "output", "discrete", "estimate of {} at the end of the step", lambda _: None, "_hat")
+    for i in observer.measured:
+        add(observer.lifting.states[i], "input", "measured {}", "0.0")
+    for name in observer.inputs:
+        add(name, "input", "input {}", "0.0")
+    for name in observer.lifting.parameters:
+        add(name, "parameter", "this machine's {}", f"{observer.parameters.get(name, 0.0):.17g}")
+    for name in estimates:
+        add(name, "output", "estimate of {} at the end of the step", None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
-    found.append(
-        {
-            "name": "status",
-            "causality": "output",
-            "variability": "discrete",
-            "description": bits,
-            "unit": "",
-            "start": None,
-            "kind": "bits",
-        }
-    )
+    add("status", "output", bits, None, kind="bits")
     if conditions(observer):
-        told = rows(
-            ["condition"],
-            "parameter",
-            "tunable",
-            "{} that the machine is in, as far as the monitor knows it",
-            lambda _: "0",
-        )
-        found.append(told[0] | {"kind": "choice"})
-    return [{**variable, "index": i} for i, variable in enumerate(found)]
+        add("condition", "parameter", "{} that the machine is in, as far as the monitor knows it", "0", kind="choice")
+    return found
 
 
 def conditions(observer: Observer) -> list[str]:
-    """Return the conditions that the monitor knows, in the order of their numbers, the unknown one first; nothing where it knows none."""
+    """Return the conditions that the monitor knows, the unknown one first; nothing where it knows none."""
     known = () if observer.monitor is None else observer.monitor.bounds
     return ["unknown", *plain_names(known)] if known else []
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:
-    """Return the shared library for this machine, by its place in the archive; nothing where there is no compiler that works."""
+    """Return the shared library for this machine by its place in the archive, if a compiler works."""
     compiler = find_compiler()
     if compiler is None or sys.platform not in ("linux", "darwin"):
         return {}

@@ -1,12 +1,13 @@
-r"""The extended Kalman filter of the re-lifted model: the gain follows the slopes of the lifted functions at the estimate.
+r"""The extended Kalman filter of the re-lifted model: its gain follows the slopes at the estimate.
 
-The model of the original states is ``x+ = f(x, u) = A_s theta(x) + B_s u``, the first n rows of the lifted model, with white noise Q on x+
-and R on y. At every sample
+The model of the original states is ``x+ = f(x, u) = A_s theta(x) + B_s u``, the first n rows of the lifted model, with
+white noise Q on x+ and R on y. At every sample
 
     S = C P C' + R,   L = P C' S^-1,   x^ = x_hat + L (y - C x_hat),   P^ = P - L C P
     x_hat+ = f(x^, u),   F = df/dx (x^),   P+ = F P^ F' + Q
 
-Slopes by earlier values and of input functions count as noise. With a linear model this is the Kalman filter with its start.
+Slopes by earlier values and of input functions count as noise. With a linear model this is the Kalman filter with its
+start.
 
 References
 ----------
@@ -24,7 +25,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError
 from ...lifting import Lifting
 from ...loops import Library, formulas, library, tape_of
-from ..samples import require_samples
+from ..screen import require_samples
 
 Array = npt.NDArray[np.float64]
 
@@ -50,7 +51,8 @@ class ExtendedKalman:
     parameters : mapping of str to float
         Default values of the lifting's parameters, the nominal unit's.
     delay : int
-        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the model.
+        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the
+        model.
 
     Examples
     --------
@@ -58,7 +60,8 @@ class ExtendedKalman:
     >>> from kros.lifting import Lifting
     >>> from kros.observer import ExtendedKalman
     >>> A, B = np.array([[1.0, 0.01], [0.0, 0.9]]), np.array([[0.0], [0.1]])
-    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0]))
+    >>> Q, R, P0 = np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0])
+    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), Q, R, P0)
     >>> kalman.run(np.zeros((100, 1, 1)), np.zeros((100, 1, 1))).shape
     (100, 1, 2)
     """
@@ -83,10 +86,10 @@ class ExtendedKalman:
             )
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n); parameters of shape (batch,).
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m).
 
-        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is corrected at that sample, and
-        the covariance grows.
+        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
+        corrected at that sample, and the covariance grows.
         """
         return self.run_all(y, u, parameters)[0]
 
@@ -107,39 +110,30 @@ class ExtendedKalman:
         x = np.zeros((k, batch, n))
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
-        drift, drive = np.ascontiguousarray(self.A[:n].T), np.ascontiguousarray(self.B[:n].T)
-        linear, coupling = self.A[:n, :n], self.A[:n, n:]
-        missing = ~np.isfinite(y)
-        gone = np.atleast_1d(missing.any(axis=(1, 2)))
-        driven = u @ drive if not lifting.input_functions else None
-        estimates = np.empty((n_samples, k, batch, n))
-        earlier: Array | None = None
+        estimates, earlier = np.empty((n_samples, k, batch, n)), None
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for sample in range(n_samples):
                 estimates[sample] = x
-                PC, nu = P[..., C], y[sample] - x[..., C]
-                L = _divided(PC, PC[..., C, :] + self.R)
-                if gone[sample]:
-                    lost = np.asarray(
-                        missing[sample].any(axis=-1)
-                    )  # a sample with a measurement missing is left out whole
-                    L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
-                x = x + (L @ nu[..., None])[..., 0]
-                P = P - L @ PC.swapaxes(-1, -2)
+                x, P = self._corrected(x, P, y[sample])
                 held = np.broadcast_to(u[sample], (k, *u[sample].shape))
-                if lifting.history:
-                    earlier = lifting.window.hold(x, held) if earlier is None else earlier
-                    window = np.concatenate([x, earlier], axis=-1)
-                else:
-                    window = x
-                inflow = driven[sample] if driven is not None else lifting.lift_inputs(held, window, values) @ drive
-                x = lifting.lift(window, values) @ drift + inflow
-                F = linear + coupling @ lifting.slopes(window, values)[..., :n] if lifting.functions else linear
+                earlier = lifting.window.hold(x, held) if earlier is None else earlier
+                window = np.concatenate([x, earlier], axis=-1)
+                F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
+                x = (
+                    lifting.lift(window, values) @ self.A[:n].T
+                    + lifting.lift_inputs(held, window, values) @ self.B[:n].T
+                )
                 P = F @ P @ np.swapaxes(F, -1, -2) + Q
                 P = (P + P.swapaxes(-1, -2)) / 2
-                if earlier is not None:
-                    earlier = lifting.window.advance(window, held)
+                earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
+        """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
+        PC, nu = P[..., list(self.measured)], y - x[..., list(self.measured)]
+        L, lost = _divided(PC, PC[..., list(self.measured), :] + self.R), np.atleast_1d(~np.isfinite(y).all(axis=-1))
+        L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
+        return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
     def _compiled(self, loops: Library, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
         lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape
@@ -167,11 +161,12 @@ class ExtendedKalman:
         return states.transpose(1, 0, 3, 2)
 
     def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
-        """Run on what was measured, with the inputs of its time, and predict each estimate to the row in which it is there."""
+        """Run on what was measured, and predict each estimate to the row in which it is there."""
         d, lifting, n = min(self.delay, len(y) - 1), self.lifting, self.lifting.n_states
         if lifting.history:
             raise DimensionError(
-                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found {lifting.functions}."
+                f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
+                f"{lifting.functions}."
             )
         before = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
         values = {**self.parameters, **(parameters or {})}
@@ -187,7 +182,7 @@ class ExtendedKalman:
 
 
 def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
-    """Return the covariance of the first estimate: a state may be anywhere in its range, shape (n,); a measured one has the measurement's noise."""
+    """Return the covariance of the first estimate: a state anywhere in its range, a measured one with noise."""
     P0 = np.diag(scale**2)
     P0[np.ix_(list(measured), list(measured))] = R
     return np.asarray(P0)

@@ -17,7 +17,7 @@ _DECADES_APART = 2
 
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
-    """Sweep the size of white process noise over sixteen decades; the covariance as it is, the textbook's choice, is among them."""
+    """Sweep the size of white process noise over sixteen decades, the covariance itself among them."""
     shape = np.diag(shape**2) if shape.ndim == 1 else shape
     base = like_measurement_noise(C @ shape @ C.T, R)
     start, stop = _SWEEP_DECADES
@@ -29,6 +29,6 @@ def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> 
 
 
 def like_measurement_noise(covariance: Array, R: Array) -> float:
-    """Return the factor that brings a covariance of the measurements to the size of their noise R, as a mean over the measurements' own units."""
+    """Return the factor that brings a covariance of the measurements to the size of their noise R."""
     shares = np.diag(covariance) / np.diag(R)
     return 1.0 / max(float(np.mean(shares)), np.finfo(float).tiny)

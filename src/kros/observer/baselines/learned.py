@@ -1,107 +1,116 @@
-r"""A learned estimator without a model: ridge regression of the hidden states on the recent past, as a yardstick without any guarantee.
+r"""A learned estimator without a model: ridge regression on the last hundred samples, a yardstick.
 
-What it sees at sample k - 1 and before is
+With z = [y; u] and d delays, the estimate at sample k is
 
-    z = [ y - c - M u ;  u ;  sigma(y) ;  d sigma / dy (y) ]
+    x_hat_k = w_0 + sum_j W_j z_{k-1-j},   j = 0, ..., d - 1,
 
-the measurement less what the inputs alone say of it (for a drive: the tracking error; of a measurement that the inputs do not explain, such as a
-position by a voltage, c alone is taken off), the recorded inputs, and those lifted functions that read measured states alone, with their slopes (for a
-drive: sine and cosine of the gearbox angle). The estimate is linear in these samples; what came before the first one is taken to equal it.
+linear in the samples and a constant; what came before the first sample is taken to equal it. The regression is in the
+coordinates [z_{k-1}; z_{k-1-j} - z_{k-j}], divided by their RMS: neighbouring samples of a slow signal are nearly
+equal.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError
-from ...core.linalg import least_squares
-from ...lifting import Lifting
+from ...core.errors import DataError, DimensionError
+from ...data import EpisodeBatch
+from ...data.batch import hold_missing
 
 Array = npt.NDArray[np.float64]
-TAPS = 80
-_EXPLAINED = 0.5  # share of a measurement's variance
 
 
-@dataclass(frozen=True, eq=False)
-class Features:
-    """The channels that the estimator looks at."""
+@dataclass(frozen=True)
+class Ridge:
+    """Settings of the regression."""
 
-    lifting: Lifting
-    measured: tuple[int, ...]
-    static: Array  # (q, 1 + m)
-    taps: int = TAPS
-
-    @classmethod
-    def of(cls, lifting: Lifting, measured: Sequence[int], y: Array, u: Array, taps: int = TAPS) -> Features:
-        """Fit the static part on recordings y (n_samples, batch, q) and u (n_samples, batch, m)."""
-        inputs = np.concatenate([np.ones((*u.shape[:-1], 1)), u], axis=-1).reshape(-1, 1 + u.shape[-1])
-        outputs = y.reshape(-1, y.shape[-1])
-        static = least_squares(inputs, outputs).T
-        mean = outputs.mean(axis=0)
-        alone = np.mean((outputs - inputs @ static.T) ** 2, axis=0) > (1 - _EXPLAINED) * np.mean(
-            (outputs - mean) ** 2, axis=0
-        )
-        static[alone] = 0.0
-        static[alone, 0] = mean[alone]
-        return cls(lifting, tuple(measured), static, taps)
-
-    @cached_property
-    def visible(self) -> tuple[int, ...]:
-        """Lifted functions that read measured states and parameters alone."""
-        seen = {self.lifting.states[i] for i in self.measured} | set(self.lifting.parameters)
-        return tuple(i for i, formula in enumerate(self.lifting.formulas) if set(formula.used) <= seen)
-
-    @cached_property
-    def _bare(self) -> Lifting:
-        """The lifting with these functions alone."""
-        return replace(
-            self.lifting, functions=tuple(self.lifting.functions[i] for i in self.visible), input_functions=()
-        )
-
-    def channels(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Return z, shape (n_samples, batch, channels), of y (n_samples, batch, q) and u (n_samples, batch, m); parameters of shape (batch,)."""
-        if y.shape[:-1] != u.shape[:-1] or y.shape[-1] != len(self.measured) or u.shape[-1] + 1 != self.static.shape[1]:
-            raise DimensionError(
-                f"Learned estimator: expected {len(self.measured)} measurements and {self.static.shape[1] - 1} inputs, found {y.shape} and {u.shape}."
-            )
-        parts = [y - self.static[:, 0] - u @ self.static[:, 1:].T, u]
-        if self.visible:
-            bare = self._bare
-            x = np.zeros((*y.shape[:-1], bare.n_states))
-            x[..., list(self.measured)] = y
-            slopes = bare.slopes(x, parameters)[..., list(self.measured)]
-            parts += [bare.lift(x, parameters)[..., bare.n_states :], slopes.reshape(*y.shape[:-1], -1)]
-        return np.concatenate(parts, axis=-1)
+    delays: int = 100
+    penalty: float = 1e-8  # on coefficients of regressors of RMS one, relative to the mean square of the residual
+    rows: int = 100_000  # of all episodes together, evenly spread; neighbouring samples hardly differ
 
 
 @dataclass(frozen=True, eq=False)
 class Learned:
     """The trained estimator."""
 
-    features: Features
+    measured: tuple[int, ...]
     estimated: tuple[int, ...]
     constant: Array  # (h,)
-    response: Array  # (channels, taps, h)
+    weights: Array  # (delays, q + m, h): the latest sample first
 
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m), shape (n_samples, batch, n)."""
         from scipy.fft import irfft, next_fast_len, rfft
 
-        z = self.features.channels(y, u, parameters)
-        z = np.concatenate([np.repeat(z[:1], self.features.taps, axis=0), z[:-1]])
-        first, z = z[:1], z - z[:1]
-        size = next_fast_len(len(z) + self.features.taps, real=True)
-        spectrum = np.moveaxis(rfft(z, size, axis=0), -1, 1)
-        estimate = np.full((*y.shape[:-1], self.features.lifting.n_states), np.nan)
-        for column, state in enumerate(self.estimated):
-            weights = self.response[..., column]
-            moving = irfft(np.einsum("fcb,cf->fb", spectrum, rfft(weights, size, axis=1), optimize=True), size, axis=0)
-            estimate[..., state] = (
-                self.constant[column] + first[0] @ weights.sum(axis=1) + moving[self.features.taps - 1 : len(z)]
-            )
+        del parameters
+        (delays, channels, _), samples = self.weights.shape, len(y)
+        if y.shape[:-1] != u.shape[:-1] or y.shape[-1] + u.shape[-1] != channels:
+            raise DimensionError(f"Learned estimator: expected {channels} channels, found {y.shape} and {u.shape}.")
+        z = np.concatenate([y, u], axis=-1)
+        first, moved = z[0], np.concatenate([np.zeros((1, *z.shape[1:])), z[:-1] - z[0]])
+        size = next_fast_len(samples + delays, real=True)
+        spectrum = rfft(moved, size, axis=0)[:, :, None] @ rfft(self.weights, size, axis=0)[:, None]
+        estimate = np.full((*y.shape[:-1], len(self.measured) + len(self.estimated)), np.nan)
+        estimate[..., list(self.estimated)] = irfft(spectrum[:, :, 0], size, axis=0)[:samples]
+        estimate[..., list(self.estimated)] += self.constant + first @ self.weights.sum(axis=0)
         return estimate
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Products of regressors and hidden states, summed over the episodes of every unit: a unit can be left out."""
+
+    settings: Ridge
+    measured: tuple[int, ...]
+    estimated: tuple[int, ...]
+    units: tuple[str, ...]
+    products: Array  # (unit, 1 + f + h, 1 + f + h)
+
+    @classmethod
+    def of(
+        cls, batches: Iterable[EpisodeBatch], measured: Sequence[int], step: int = 1, settings: Ridge | None = None
+    ) -> Moments:
+        """Collect every so many rows of training episodes."""
+        settings, total = settings or Ridge(), dict[str, Array]()
+        estimated: tuple[int, ...] = ()
+        for batch in batches:
+            estimated = tuple(i for i in range(batch.states.shape[-1]) if i not in measured)
+            y = hold_missing(batch.measurements(measured))
+            for i, (unit, length) in enumerate(zip(batch.units, batch.lengths.tolist(), strict=True)):
+                z = np.concatenate([y[:length, i], batch.inputs[:length, i]], axis=-1)
+                at = np.arange(0, length, step)
+                rows = np.hstack([regressors(z, at, settings.delays), batch.states[at, i][:, list(estimated)]])
+                total[unit] = total.get(unit, 0.0) + rows.T @ rows
+        if not estimated:
+            raise DataError("Learned estimator: every state is measured, there is nothing to estimate.")
+        return cls(settings, tuple(measured), estimated, tuple(total), np.stack(list(total.values())))
+
+    def estimator(self, without: Collection[str] = ()) -> Learned:
+        """Train on all units but some; names of units that took no part are ignored."""
+        rows = [i for i, unit in enumerate(self.units) if unit not in without]
+        if not rows:
+            raise DataError(
+                f"Learned estimator: no unit is left to train on without {', '.join(sorted(without))}; record more "
+                "units."
+            )
+        h, delays = len(self.estimated), self.settings.delays
+        products = self.products[rows].sum(axis=0)
+        size = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
+        scaled = products / np.outer(size, size)
+        penalty = self.settings.penalty * np.diag([0.0, *[1.0] * (len(size) - h - 1)])
+        weights = np.linalg.solve(scaled[:-h, :-h] + penalty, scaled[:-h, -h:]) * size[-h:] / size[:-h, None]
+        by_delay = weights[1:].reshape(delays, -1, h).copy()
+        by_delay[:-1] -= weights[1:].reshape(delays, -1, h)[1:]
+        return Learned(self.measured, self.estimated, weights[0], by_delay)
+
+
+def regressors(z: Array, at: npt.NDArray[np.int64], delays: int) -> Array:
+    """Return [1, z_{k-1}, z_{k-2} - z_{k-1}, ...] for samples k, shape (len(at), 1 + d channels)."""
+    padded = np.concatenate([np.repeat(z[:1], delays, axis=0), z[:-1]])
+    past = padded[at[:, None] + np.arange(delays - 1, -1, -1)]
+    past[:, 1:] -= past[:, :-1].copy()
+    return np.hstack([np.ones((len(at), 1)), past.reshape(len(at), -1)])

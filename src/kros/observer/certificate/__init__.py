@@ -1,1 +1,1 @@
-"""The certificate of an observer as it runs, retracted and lifted again at every step, and an adversary who tries to break it."""
+"""The certificate of an observer at run time, retracted and lifted again at every step."""

@@ -1,24 +1,18 @@
-r"""Certificate of an observer as it runs: retracted and re-lifted at every step.
+r"""Certificate of an observer at run time: retracted and re-lifted at every step.
 
 For every true trajectory and every sequence of measurement noise, whatever machine they come from,
 
 .. math:: \sum_k |e_k|^2 \le \gamma^2 \sum_k \left(|\omega_k|^2 + |n_k|^2\right) + V(e_0),
 
-with the signals divided by their sizes (`ReliftScales`), omega the one-step residual and n the noise. A second number says how far the error can be from
-its *frozen response* e', the linear response to the same omega and n with every slope in the middle of its interval:
-
-.. math:: \|e - e'\|_2 \le \kappa \, \|q'\|_2,    q' = M e' the largest movement of the lifted functions that e' can cause.
-
-Since e' is computed for the residual as it was, this bound uses its whole course, and not its energy alone. A Riccati equation
-with multipliers proposes; what is returned was proven in exact arithmetic.
+with the signals divided by their sizes (`ReliftScales`), omega the one-step residual and n the noise. A Riccati
+equation with multipliers proposes; what is returned was proven in exact arithmetic.
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from itertools import product
+from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -29,15 +23,40 @@ from ...core.artifacts import load_artifact, loader, save_artifact
 from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
-from .search import MOST_CORNERS, frozen_gain, mismatch_gain, prove
-from .status import ReliftStatus
+from .search import first_proof, frozen_gain, growing_sequence
 
 Array = npt.NDArray[np.float64]
 
 
+class ReliftStatus(str, Enum):
+    """What happened, and what to change.
+
+    CERTIFIED
+        The gain is proven.
+    UNSTABLE
+        A sequence of slopes inside the box makes the error grow without bound in the model: there is no certificate for
+        this observer over this box. Take a smaller box, weaken the correction, or use another model.
+    UNBOUNDED
+        A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
+    NOT_FOUND
+        Neither a proof nor a counterexample was found. Take a smaller box.
+
+    Examples
+    --------
+    >>> from kros.observer import ReliftStatus
+    >>> [status.value for status in ReliftStatus]
+    ['certified', 'unstable', 'unbounded', 'not_found']
+    """
+
+    CERTIFIED = "certified"
+    UNSTABLE = "unstable"
+    UNBOUNDED = "unbounded"
+    NOT_FOUND = "not_found"
+
+
 @dataclass(frozen=True, eq=False)
 class ReliftCertificate:
-    """What is proven about an observer as it runs.
+    """What is proven about an observer at run time.
 
     Parameters
     ----------
@@ -45,40 +64,30 @@ class ReliftCertificate:
     assumptions : tuple of str
         What has to hold, in words.
     box, parameters : mapping of str to (lower, upper)
-        What was asked; see `relift_certificate`.
+        Ranges of states, inputs and parameters that it holds for; see `relift_certificate`.
     status : ReliftStatus
     reason : str
         A sentence; empty where the gain is proven.
-    certified : bool
     gain : float or None
         gamma, in the units of `scales`.
-    mismatch_gain : float or None
-        kappa; 0 where no slope moves, None where it was not found or not asked for.
     lower_bound : float or None
         Gain that a frozen slope attains: no certificate of any kind is below it.
     start : ndarray, shape (n_xi, n_window)
         Where the first error enters.
-    roots : ndarray, shape (1, n_xi, n_xi)
+    root : ndarray, shape (n_xi, n_xi)
         Upper triangular factor of the Lyapunov matrix, ``P = R'R``.
-    corners : ndarray, shape (n_corners, n_p)
-        Places of the slopes in their intervals, -1 or 1.
     multipliers : ndarray, shape (n_p,)
         Of the slopes, where the proof uses them because there are too many corners; empty otherwise.
     channels : tuple of str
         Slopes that move.
-    margin : float or None
-        One minus the largest squared singular value over all corners in the coordinates where P is the identity.
-    method : str
-        By which method.
-    solve_s : float
 
     Examples
     --------
     >>> import numpy as np
     >>> from kros.lifting import Lifting
     >>> from kros.observer import Observer, relift_certificate
-    >>> lifting = Lifting(("x",), ("sin(x)",))
-    >>> plant = Observer.open_loop("x", lifting, np.array([[0.5, 0.2], [0, 0]]), np.ones((2, 1)), (0,), ("u",), 1.0)
+    >>> lifting, A = Lifting(("x",), ("sin(x)",)), np.array([[0.5, 0.2], [0, 0]])
+    >>> plant = Observer.open_loop("x", lifting, A, np.ones((2, 1)), (0,), ("u",), 1.0)
     >>> certificate = relift_certificate(plant)
     >>> certificate.certified, certificate.status.value, certificate.lower_bound <= certificate.gain
     (True, 'certified', True)
@@ -90,48 +99,43 @@ class ReliftCertificate:
     parameters: Box
     status: ReliftStatus = ReliftStatus.UNBOUNDED
     reason: str = ""
-    certified: bool = False
     gain: float | None = None
-    mismatch_gain: float | None = None
     lower_bound: float | None = None
     start: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    roots: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    corners: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    root: Array = field(default_factory=lambda: np.zeros((0, 0)))
     multipliers: Array = field(default_factory=lambda: np.zeros(0))
     channels: tuple[str, ...] = ()
-    margin: float | None = None
-    method: str = ""
-    solve_s: float = 0.0
+
+    @property
+    def certified(self) -> bool:
+        """Whether the gain is proven."""
+        return self.status is ReliftStatus.CERTIFIED
 
     def system(self, observer: ObserverData) -> ErrorSystem:
         """Return the error dynamics that the certificate is about."""
         return error_system(observer, self.scales, self.box, self.parameters)
 
     def initial_energy(self, error: npt.ArrayLike) -> Array:
-        """Return V(e_0) in scaled units, shape (...): the price of starting with an error, shape (..., n_window), the controller at rest.
+        """Return V(e_0) in scaled units, shape (...), of an error, shape (..., n_window), the controller at rest.
 
         The first error is in physical units; behind it are earlier errors where the lifting has delays.
         """
         xi = np.asarray(error, dtype=float) @ self.start[:, : np.shape(error)[-1]].T
-        energies = [np.sum((xi @ R.T) ** 2, axis=-1) for R in self.roots]
-        return np.asarray(np.max(energies, axis=0))
+        return np.asarray(np.sum((xi @ self.root.T) ** 2, axis=-1))
 
     def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
-        """Return what the certificate of an observer says of the same observer for signals divided by other sizes (`kros.observer.in_sizes`)."""
+        """Return what the certificate of an observer says of the same observer for signals divided by other sizes."""
         x, u = factors(observer, sizes)
         n, lifting = observer.lifting.n_states, observer.lifting
-        by_name = dict(
-            zip((*lifting.states, *observer.inputs), np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True)
-        )
+        names = (*lifting.states, *observer.inputs)
+        by_name = dict(zip(names, np.concatenate([x[:n], u[: len(observer.inputs)]]), strict=True))
         errors = [by_name[name] for name, _ in lifting.window.quantities if name in lifting.states]
         y = x[list(observer.measured)]
         scales = ReliftScales(self.scales.error * x[:n], self.scales.residual * x[:n], self.scales.noise * y)
         box = {name: tuple(np.multiply(value, by_name.get(name, 1.0)).tolist()) for name, value in self.box.items()}
+        root = self.root / state_sizes(observer, self.scales, np.array(errors)) if self.root.size else self.root
         assumptions = _assumptions(observer, box, self.parameters)
-        roots = self.roots.copy()
-        if roots.size:
-            roots /= state_sizes(observer, self.scales, np.array(errors))
-        return replace(self, scales=scales, box=box, assumptions=assumptions, roots=roots)
+        return replace(self, scales=scales, box=box, assumptions=assumptions, root=root)
 
     def save(self, folder: Path) -> None:
         """Write ``relift.json`` and ``arrays.npz``."""
@@ -146,24 +150,18 @@ class ReliftCertificate:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "relift")
         values: dict[str, Any] = {name: content[name] for name in _PLAIN}
-        values |= {"status": ReliftStatus(content["status"])} | {
-            name: tuple(content[name]) for name in ("channels", "assumptions")
-        }
+        values |= {name: tuple(content[name]) for name in ("channels", "assumptions")}
         scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
-        values |= {name: arrays[name] for name in _ARRAYS}
+        values |= {name: arrays[name] for name in _ARRAYS} | {"status": ReliftStatus(content["status"])}
         return cls(scales=scales, **values)
 
     def __repr__(self) -> str:
         """Say what is proven, in a line."""
-        said = (
-            f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})"
-            if self.certified
-            else f"{self.status.value}: {self.reason}"
-        )
-        return f"<ReliftCertificate {said}>"
+        proven = f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})" if self.certified else ""
+        return f"<ReliftCertificate {proven or f'{self.status.value}: {self.reason}'}>"
 
 
-_ARRAYS = ("start", "roots", "corners", "multipliers")
+_ARRAYS = ("start", "root", "multipliers")
 _PLAIN = tuple(name for name in ReliftCertificate.__dataclass_fields__ if name not in (*_ARRAYS, "scales"))
 
 
@@ -172,23 +170,20 @@ def relift_certificate(
     box: Box | None = None,
     scales: ReliftScales | None = None,
     parameters: Box | None = None,
-    *,
-    mismatch: bool = True,
 ) -> ReliftCertificate:
-    """Certify an observer as it runs: any lifting with bounded slopes, any correction filter or none, either way of injection.
+    """Certify an observer at run time, with any lifting of bounded slopes and any correction.
 
     Parameters
     ----------
     observer : ObserverData
         With the delay and limits that its `runtime` declares.
     box : mapping of str to (lower, upper), optional
-        Ranges of states (and of inputs, for input functions) inside which true and estimated values stay; needed where slopes have no global bound.
+        Ranges of states (and of inputs, for input functions) inside which true and estimated values stay; needed where
+        slopes have no global bound.
     scales : ReliftScales, optional
         Sizes of errors, residuals and noise; one by default, which leaves physical units.
     parameters : mapping of str to number or (lower, upper), optional
         Ranges of the lifting's parameters; any value by default, so that the certificate holds for every unit.
-    mismatch : bool
-        Whether to certify the distance from the frozen response as well.
 
     Returns
     -------
@@ -200,47 +195,33 @@ def relift_certificate(
     >>> import numpy as np
     >>> from kros.lifting import Lifting
     >>> from kros.observer import Observer, relift_certificate
-    >>> lifting = Lifting(("x",), ("sin(x)",))  # x+ = 0.5 x + 0.2 sin(x) + u: the error shrinks at least by 0.7 a step
-    >>> plant = Observer.open_loop("x", lifting, np.array([[0.5, 0.2], [0, 0]]), np.ones((2, 1)), (0,), ("u",), 1.0)
+    >>> lifting, A = Lifting(("x",), ("sin(x)",)), np.array([[0.5, 0.2], [0, 0]])
+    >>> plant = Observer.open_loop("x", lifting, A, np.ones((2, 1)), (0,), ("u",), 1.0)
+    >>> # x+ = 0.5 x + 0.2 sin(x) + u: the error shrinks at least by 0.7 a step
     >>> round(relift_certificate(plant).gain, 1)
     3.3
     """
-    start = time.perf_counter()
-    asked = ReliftCertificate(
-        scales or ReliftScales.ones(observer),
-        _assumptions(observer, box, parameters),
-        dict(box or {}),
-        dict(parameters or {}),
-    )
+    assumptions = _assumptions(observer, box, parameters)
+    scales = scales or ReliftScales.ones(observer)
+    result = ReliftCertificate(scales, assumptions, dict(box or {}), dict(parameters or {}))
     try:
-        system = asked.system(observer)
+        system = result.system(observer)
     except UnboundedSlopeError as error:
-        return replace(
-            asked,
-            status=ReliftStatus.UNBOUNDED,
-            reason=f"No certificate: {error}.",
-            solve_s=time.perf_counter() - start,
-        )
-    few, width = system.corner_count <= MOST_CORNERS, system.L.shape[1]
-    corners = np.array(list(product((-1.0, 1.0), repeat=width))) if few else np.zeros((0, width))
-    found, reason, status = prove(system)
-    first = np.zeros((0, 0)) if system.start is None else system.start
-    tried = replace(asked, corners=corners, channels=system.channels, status=status, reason=reason, start=first)
-    if found is None:
-        return replace(tried, solve_s=time.perf_counter() - start)
-    proposal, margin = found
-    kappa = mismatch_gain(system) if mismatch else None
+        return replace(result, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.")
+    result = replace(result, channels=system.channels, start=np.zeros((0, 0)) if system.start is None else system.start)
+    if growing := growing_sequence(system):
+        return replace(result, status=ReliftStatus.UNSTABLE, reason=growing)
+    proof = first_proof(system)
+    if proof is None:
+        reason = f"No Lyapunov function was found for all slopes in the box; {len(system.channels)} move."
+        return replace(result, status=ReliftStatus.NOT_FOUND, reason=reason)
     return replace(
-        tried,
-        certified=True,
-        gain=proposal.gain,
-        mismatch_gain=kappa,
+        result,
+        status=ReliftStatus.CERTIFIED,
+        gain=proof.gain,
         lower_bound=frozen_gain(system),
-        roots=proposal.root[None],
-        multipliers=np.zeros(0) if few or proposal.multipliers is None else proposal.multipliers,
-        margin=margin,
-        method=proposal.how,
-        solve_s=time.perf_counter() - start,
+        root=proof.root,
+        multipliers=proof.multipliers,
     )
 
 
@@ -259,8 +240,6 @@ def _assumptions(observer: ObserverData, box: Box | None, parameters: Box | None
         found.append(f"measurements arrive {limits.delay} samples late")
     if clips := limits.limited_states(len(names)):
         found.append(f"the true {', '.join(names[i] for i in clips)} stays within the limits of the estimate")
-    if any(side is not None and np.isfinite(side).any() for side in (limits.input_lower, limits.input_upper)):
-        found.append("the residual is that of the model with inputs within their limits")
     if observer.seen is not None:
         found.append("no measurement and no input is refused as implausible")
     return tuple(found)

@@ -1,4 +1,4 @@
-r"""The error of an observer that retracts and lifts its state at every step, as a linear system with slopes that move in a box.
+r"""The error of an observer that lifts its state at every step: a linear system with slopes in a box.
 
             ┌────────────────────────────┐
      w ────►│ xi+ = A xi + L p + B w     ├────► z = C xi
@@ -6,13 +6,15 @@ r"""The error of an observer that retracts and lifts its state at every step, as
      p │    └────────────────────────────┘   │ q
        └────────────── diag(d_k) ◄───────────┘            -1 <= d_k <= 1 in every entry, arbitrary from step to step
 
-For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this exactly (`docs/proofs.md`
-has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i its slope at a point between the two, hence in the
-box of its slopes; the middle of the box goes into A, every entry that can move into a channel of its own.
+For a true trajectory ``x+ = f(x, u) + omega`` and measurements ``y = C x + n`` the error ``e = x - x_hat`` obeys this
+exactly (`docs/proofs.md` has the proof). A lifted function moves by ``sigma_i(x) - sigma_i(x_hat) = s_i' e`` with s_i
+its slope at a point between the two, hence in the box of its slopes; the middle of the box goes into A, every entry
+that can move into a channel of its own.
 
 Symbols
 -------
-xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first, and the predicted errors that count
+xi        : [e, earlier errors that the lifting reads, x^c], with a delay followed by its residuals, the latest first,
+and the predicted errors that count
 w, z      : [omega / residual, n / noise] and e / error, the scaled signals of `ReliftScales`
 p, q      : what the slopes' movement adds, and what it acts on
 d_k       : position of every slope in its interval
@@ -51,7 +53,8 @@ class ReliftScales:
     Parameters
     ----------
     error : ndarray, shape (n,)
-        Range of every state: a scaled error of 0.01 is one percent of the largest value. Infinite for a state whose error does not count.
+        Range of every state: a scaled error of 0.01 is one percent of the largest value. Infinite for a state whose
+        error does not count.
     residual : ndarray, shape (n,)
         Size of the one-step residual in every state; zero for a state without.
     noise : ndarray, shape (q,)
@@ -84,9 +87,10 @@ class ReliftScales:
 
     @classmethod
     def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:
-        """Return the scales for which a population's residual has unit power: its gain then *is* the error that is certified on a typical unit.
+        """Return the scales for which a population's residual has unit power: the gain is then a typical error.
 
-        Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every measurement's noise, shape (q,).
+        Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every
+        measurement's noise, shape (q,).
         """
         n, sigma = residual.shape[-1], np.atleast_1d(np.asarray(noise, dtype=float))
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
@@ -112,7 +116,6 @@ class ErrorSystem:
     dt: float  # s
     channels: tuple[str, ...] = ()  # what moves in every channel, for people
     E: Array | None = None  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
-    rest: Array | None = None  # (n_p,): places at which a frozen response is taken
     start: Array | None = None  # (n_xi, n_window): where the first error goes; the first states by default
 
     @property
@@ -125,18 +128,13 @@ class ErrorSystem:
         """E, shape (n_p, n_p)."""
         return np.zeros((self.L.shape[1], self.L.shape[1])) if self.E is None else self.E
 
-    @property
-    def place(self) -> Array:
-        """Places of a frozen response, shape (n_p,)."""
-        return np.zeros(self.L.shape[1]) if self.rest is None else self.rest
-
     def closed(self, d: npt.ArrayLike) -> Array:
-        """Return ``(I - diag(d) E)^-1 diag(d)``, from what the channels act on but for other channels to what they add; shape (n_p, n_p)."""
+        """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
         moved = np.diag(np.asarray(d, dtype=float))
         return moved if self.E is None else np.asarray(np.linalg.solve(np.eye(len(moved)) - moved @ self.E, moved))
 
     def corner(self, d: npt.ArrayLike) -> tuple[Array, Array]:
-        """Return ``A + L diag(d) M`` and ``B + L diag(d) D``, other channels in between, for slopes at a place in the box, shape (n_p,)."""
+        """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
         moved = self.L @ self.closed(d)
         return self.A + moved @ self.M, self.B + moved @ self.D
 
@@ -145,7 +143,7 @@ class ErrorSystem:
         return [self.corner(d) for d in product((-1.0, 1.0), repeat=self.L.shape[1])]
 
     def multiplied(self, multipliers: Array, gain: float) -> tuple[tuple[Array, Array], Array, Array]:
-        """Return (A, B), C and D with p as an input and q as an output, scaled by multipliers: a gain proven for it holds in the whole box."""
+        """Return (A, B), C and D with p as input and q as output: a gain proven for it holds in the whole box."""
         root = np.sqrt(multipliers)
         B = np.hstack([self.L / root * gain, self.B])
         C = np.vstack([_WIDER * root[:, None] * self.M, self.C])
@@ -154,49 +152,22 @@ class ErrorSystem:
         D[: len(root), len(root) :] = _WIDER * root[:, None] * self.D
         return (self.A, B), C, D
 
-    def frozen(self, d: npt.ArrayLike | None = None) -> StateSpace:
-        """Return the system from w to z with slopes that stay where they are, at their place of rest by default."""
-        A, B = self.corner(self.place if d is None else d)
+    def frozen(self, d: npt.ArrayLike) -> StateSpace:
+        """Return the system from w to z with slopes that stay where they are."""
+        A, B = self.corner(d)
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
     def moved(self) -> StateSpace:
-        """Return the system from w to q, what the channels act on, of the frozen response."""
-        A, B = self.corner(self.place)
-        back = self.nested @ self.closed(self.place)
-        return StateSpace(A, B, self.M + back @ self.M, self.D + back @ self.D, self.dt)
+        """Return the system from w to q, what the channels act on, with slopes in the middle: the frozen response."""
+        return StateSpace(self.A, self.B, self.M, self.D, self.dt)
 
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' of the frozen response to the rest of the error.
 
-        The frozen response has ``p' = d' q'``. With ``r = xi - xi'`` and ``pi = p - p' + d' q'`` the rest obeys ``r+ = A r + L (pi - d' q')``,
-        ``pi = d (M r + E (pi - d' q') + q')``, from zero.
+        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p``, ``p = d (M r + E p + q')``.
         """
         width = self.L.shape[1]
-        return replace(self, B=-self.L * self.place, D=np.eye(width) - self.nested * self.place, start=None)
-
-
-class _Signals:
-    """Rows of signals as functions of [xi, p, w]."""
-
-    def __init__(self, n_xi: int, n_p: int, n_w: int) -> None:
-        self.sizes = n_xi, n_p, n_w
-
-    def _one(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
-        rows = np.zeros((count, sum(self.sizes)))
-        rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
-        return rows
-
-    def xi(self, first: int, count: int) -> Array:
-        return self._one(0, first, count)
-
-    def p(self, first: int, count: int) -> Array:
-        return self._one(1, first, count)
-
-    def w(self, first: int, count: int, scale: npt.ArrayLike) -> Array:
-        return self._one(2, first, count, scale)
-
-    def split(self, rows: Array) -> list[Array]:
-        return np.split(rows, np.cumsum(self.sizes)[:-1], axis=1)
+        return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
 
 
 def error_system(
@@ -204,90 +175,100 @@ def error_system(
     scales: ReliftScales | None = None,
     box: Box | None = None,
     parameters: Box | None = None,
-    *,
-    arrives: npt.ArrayLike = True,
 ) -> ErrorSystem:
-    """Return the error dynamics of an observer as it runs, its delay and limits included."""
-    scales = scales or ReliftScales.ones(observer)
-    lifting, K, q = observer.lifting, observer.controller, len(observer.measured)
-    n, delay, limits = lifting.n_states, observer.runtime.delay, observer.runtime
-    if (scales.error.shape, scales.residual.shape, scales.noise.shape) != ((n,), (n,), (q,)):
-        raise DimensionError(
-            f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found {scales.error.shape}, "
-            f"{scales.residual.shape}, {scales.noise.shape}."
+    """Return the error dynamics of an observer at run time, its delay included."""
+    return _Assembly(observer, scales or ReliftScales.ones(observer), box, parameters).system()
+
+
+class _Assembly:
+    """The error dynamics while they are put together: rows of signals as functions of [xi, p, w]."""
+
+    def __init__(self, observer: ObserverData, scales: ReliftScales, box: Box | None, parameters: Box | None) -> None:
+        lifting, n, q = observer.lifting, observer.lifting.n_states, len(observer.measured)
+        shapes = (scales.error.shape, scales.residual.shape, scales.noise.shape)
+        if shapes != ((n,), (n,), (q,)):
+            raise DimensionError(
+                f"Re-lift scales of observer {observer.name}: needs {n} errors, {n} residuals and {q} noises, found "
+                f"{', '.join(map(str, shapes))}."
+            )
+        self.observer, self.scales, self.n = observer, scales, n
+        self.delay, self.order = observer.runtime.delay, observer.controller.n_states
+        lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
+        self.names, self.h = [delayed_name(name, lag) for name, lag in lags], len(lags)
+        lower, upper = slope_box(observer, self.names, box, parameters)
+        self.columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
+        middle, self.half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
+        moves = (self.half > _CONSTANT * np.abs(middle)) & np.any(self.columns, axis=0)[:, None]
+        self.moving, self.into = np.argwhere(moves), observer.into[:n]
+        self.following = np.zeros((self.h, self.h))
+        self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
+        for row, (name, lag) in enumerate(lags[n:], n):
+            self.following[row, lags.index((name, lag - 1))] = 1.0
+        self.slots, self.counted = _driven(observer, scales, self.h), _counted(scales)
+        self.link = len(self.moving)
+        late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
+        self.sizes = (self.h + self.order + late, self.link * (self.delay + 1), n + q)
+        self.q_rows = np.zeros((self.sizes[1], sum(self.sizes)))
+        self.channels = [""] * self.sizes[1]
+
+    def rows(self, where: int, first: int, count: int, scale: npt.ArrayLike = 1.0) -> Array:
+        """Return some entries of xi (0), p (1) or w (2)."""
+        rows = np.zeros((count, sum(self.sizes)))
+        rows[range(count), sum(self.sizes[:where]) + first + np.arange(count)] = scale
+        return rows
+
+    def predicted(self, e: Array, at: int) -> Array:
+        """Return the next errors (h) without correction; the channels of their slopes begin at `at`."""
+        late = f", {at // self.link} samples on" if self.link and at else ""
+        functions = self.observer.lifting.functions + self.observer.lifting.input_functions
+        after = self.following @ e
+        for k, (i, j) in enumerate(self.moving, at):
+            self.q_rows[k] = self.half[i, j] * e[j]
+            self.channels[k] = f"{functions[i]} by {self.names[j]}{late}"
+            after[: self.n] += np.outer(self.columns[:, i], self.rows(1, k, 1)[0])
+        return after
+
+    def system(self) -> ErrorSystem:
+        """Return the error dynamics."""
+        n, h, order, K = self.n, self.h, self.order, self.observer.controller
+        e = self.rows(0, 0, h)
+        after = self.predicted(e, 0)
+        nu = e[list(self.observer.measured)] + self.rows(2, n, len(self.observer.measured), self.scales.noise)
+        v = K.C @ self.rows(0, h, order) + K.D @ nu
+        after[:n] -= self.into @ v
+        following = self.late(after) if self.delay else [after]
+        if not self.delay:
+            after[:n] += self.rows(2, 0, n, self.scales.residual)
+        following.insert(1, K.A @ self.rows(0, h, order) + K.B @ nu)
+        (A, L, B), (M, E, D) = (
+            np.split(rows, np.cumsum(self.sizes)[:-1], axis=1) for rows in (np.vstack(following), self.q_rows)
         )
-    lags = [(name, lag) for name, lag in lifting.window.quantities if name in lifting.states]
-    names = [delayed_name(name, lag) for name, lag in lags]
-    lower, upper = slope_box(observer, names, box, parameters)
-    columns = np.hstack([observer.A[:n, n:], observer.B[:n, len(observer.inputs) :]])
-    functions = lifting.functions + lifting.input_functions
-    middle, half = (lower + upper) / 2, (upper - lower) / 2 * _WIDER
-    moving = np.argwhere((half > _CONSTANT * np.abs(middle)) & np.any(columns, axis=0)[:, None])
-    clips, cuts, into = limits.clipped_states(n), limits.limited_corrections(observer.into[:n]), observer.into[:n]
+        n_xi, shown = self.sizes[0], self.counted
+        start, C = np.eye(n_xi, h), np.zeros((n, n_xi))
+        places = n_xi - len(shown) + np.arange(len(shown)) if self.delay else shown
+        C[shown, places] = 1 / self.scales.error[shown]
+        if self.delay:
+            start = np.zeros((n_xi, h))
+            start[h + order + np.arange(len(self.slots)), self.slots] = 1.0
+            start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
+        dt, nested = self.observer.sample_period_s, E if E.any() else None
+        return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, start)
 
-    h, order, link = len(names), K.n_states, len(clips) + len(moving)
-    slots = _driven(observer, scales, h)
-    width, own = len(slots), sum(i < n for i in slots)
-    shown = _counted(scales)
-    n_xi, n_p = h + order + (delay * width + len(shown) if delay else 0), link * (delay + 1) + len(cuts)
-    of = _Signals(n_xi, n_p, n + q)
-    q_rows, channels = np.zeros((n_p, sum(of.sizes))), [""] * n_p
-    rest = np.zeros(n_p)
-
-    following = np.zeros((h, h))
-    following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, h - n))]) + columns @ middle
-    for row, (name, lag) in enumerate(lags[n:], n):
-        following[row, lags.index((name, lag - 1))] = 1.0
-
-    def predicted(e: Array, at: int) -> tuple[Array, Array]:
-        """Errors (h) that act where some are estimated, and what becomes of them without correction; its channels begin at `at`."""
-        e, late = e.copy(), f", {at // link} samples on" if link and at else ""
-        for k, i in enumerate(clips, at):
-            q_rows[k], channels[k], rest[k] = _WIDER / 2 * e[i], f"limits of {names[i]}{late}", 1.0
-            e[i] = e[i] / 2 + of.p(k, 1)[0]
-        after = following @ e
-        for k, (i, j) in enumerate(moving, at + len(clips)):
-            q_rows[k], channels[k] = half[i, j] * e[j], f"{functions[i]} by {names[j]}{late}"
-            after[:n] += np.outer(columns[:, i], of.p(k, 1)[0])
-        return e, after
-
-    e, after = predicted(of.xi(0, h), 0)
-    nu = e[list(observer.measured)] + of.w(n, q, scales.noise)
-    nu[~np.broadcast_to(np.asarray(arrives, dtype=bool), (q,))] = 0.0
-    v = K.C @ of.xi(h, order) + K.D @ nu
-    for k, i in enumerate(cuts, n_p - len(cuts)):
-        q_rows[k], channels[k], rest[k] = _WIDER / 2 * v[i], f"limit of correction {i}", 1.0
-        v[i] = v[i] / 2 + of.p(k, 1)[0]
-    after[:n] -= into @ v
-    omega = of.w(0, n, scales.residual)
-    held = [of.xi(h + order + i * width, width) for i in range(delay)]  # residuals, the latest first
-    enters = np.zeros((h, width))
-    enters[slots, range(width)] = 1.0
-    arriving = np.zeros((width, sum(of.sizes)))
-    arriving[:own] = omega[slots[:own]]
-    new = [
-        after + enters @ held[-1] if delay else np.vstack([after[:n] + omega, after[n:]]),
-        K.A @ of.xi(h, order) + K.B @ nu,
-    ]
-    if delay:
-        ahead = new[0]
-        for i in range(1, delay + 1):
-            ahead = predicted(ahead, i * link)[1] + enters @ (held[delay - 1 - i] if i < delay else arriving)
-        new += [arriving, *held[:-1], ahead[shown]]
-    A, L, B = of.split(np.vstack(new))
-    M, E, D = of.split(q_rows)
-    C = np.zeros((n, n_xi))
-    C[shown, n_xi - len(shown) + np.arange(len(shown)) if delay else shown] = 1 / scales.error[shown]
-    start = np.eye(n_xi, h)
-    if delay:
-        start = np.zeros((n_xi, h))
-        start[h + order : h + order + width] = enters.T
-        start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
-    return ErrorSystem(A, L, B, M, D, C, observer.sample_period_s, tuple(channels), E if E.any() else None, rest, start)
+    def late(self, after: Array) -> list[Array]:
+        """Return what follows with a delay: the measured error, its residuals, the latest first, and the predicted one."""
+        width, inside = len(self.slots), [i for i in self.slots if i < self.n]
+        held = [self.rows(0, self.h + self.order + i * width, width) for i in range(self.delay)]
+        enters, arriving = np.eye(self.h)[:, self.slots], np.zeros((width, sum(self.sizes)))
+        arriving[: len(inside)] = self.rows(2, 0, self.n, self.scales.residual)[inside]
+        measured = ahead = after + enters @ held[-1]
+        for i in range(1, self.delay + 1):
+            ahead = self.predicted(ahead, i * self.link)
+            ahead = ahead + enters @ (held[self.delay - 1 - i] if i < self.delay else arriving)
+        return [measured, arriving, *held[:-1], ahead[self.counted]]
 
 
 def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
-    """Return the errors, of h with the earlier ones, that a residual or a start drives: those of internal states start at zero."""
+    """Return the errors, of h, that a residual or a start drives: internal states start at zero."""
     n = observer.lifting.n_states
     return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
@@ -298,7 +279,7 @@ def _counted(scales: ReliftScales) -> list[int]:
 
 
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
-    """Return the sizes of all of xi, shape (n_xi,), from those of the errors with the earlier ones, shape (n_window,)."""
+    """Return the sizes of xi, shape (n_xi,), from those of the errors, shape (n_window,)."""
     delay = observer.runtime.delay
     late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[_counted(scales)]] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
@@ -307,7 +288,7 @@ def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> 
 def slope_box(
     observer: ObserverData, names: Sequence[str], box: Box | None = None, parameters: Box | None = None
 ) -> tuple[Array, Array]:
-    """Return bounds of the slopes of lifted and input functions by some entries of the window, each of shape (p + r, len(names))."""
+    """Return bounds of the slopes of all functions by entries of the window, each (p + r, len(names))."""
     formulas = observer.lifting.formulas + observer.lifting.input_formulas
     ranges = {**(box or {}), **(parameters or {})}
     lower, upper = slope_bounds_of(formulas, names, ranges)

@@ -1,18 +1,20 @@
-r"""Matrices that no response of a system exceeds throughout a band of frequencies: what turns energies of signals into bounds of errors.
+r"""Matrices that no response of a system exceeds throughout a band of frequencies.
 
 For a row t(z) of a stable system, and bands of the unit circle, a matrix is looked for with
 
 .. math:: M_b \succeq t(z)^H t(z) \quad\text{for all } z \text{ in band } b, \qquad \mathrm{tr}(M_b W_b) \text{ small},
 
-W_b the energies that it is for. Bands are covered by arcs, along which the response stays close to the straight segment between two ends ``t_s``: no entry is
-further from it than ``delta_i`` (`Enclosure.segments`). The least matrix above all ``t_s^H t_s``, and so above the squares on the segments, has the dual
-``max tr(sum_s mu_s t_s^H t_s)^{1/2}`` over weights mu that sum to one, which a multiplicative iteration solves; it is enlarged until it covers. For the rest,
-with any sizes s_i > 0,
+W_b the energies that it is for. Bands are covered by arcs, along which the response stays close to the straight segment
+between two ends ``t_s``: no entry is further from it than ``delta_i`` (`Enclosure.segments`). The least matrix above
+all ``t_s^H t_s``, and so above the squares on the segments, has the dual ``max tr(sum_s mu_s t_s^H t_s)^{1/2}`` over
+weights mu that sum to one, which a multiplicative iteration solves; it is enlarged until it covers. For the rest, with
+any sizes s_i > 0,
 
 .. math:: d^H d \preceq \Big(\sum_i \delta_i s_i\Big) \mathrm{diag}(\delta_i / s_i) \quad (|d_i| \le \delta_i), \qquad
           (t + d)^H (t + d) \preceq (1 + \epsilon)\, t^H t + (1 + 1/\epsilon)\, d^H d .
 
-Arcs are cut until the rest is a small share of the whole. Nothing is decided at points: what lies between them is in delta.
+Arcs are cut until the rest is a small share of the whole. Nothing is decided at points: what lies between them is in
+delta.
 """
 
 from __future__ import annotations
@@ -28,7 +30,7 @@ from ...synthesis.worst_case.arcs import Enclosure
 
 Array = npt.NDArray[Any]
 _CLOSE = 0.004  # distance from segments, of a row's size in its band, or of its mean size over all of them
-_ARCS, _MOST_ARCS = 20_000, 40_000  # beyond which arcs of finite reach are not cut further, and none at all
+_ARCS, _MOST_ARCS = 20_000, 40_000  # at most, where an arc has a finite reach, and at all
 _AT_ONCE = 4_000_000  # numbers of resolvents in memory
 _ROUNDS = 30
 _PARTS = 8  # most that an arc is cut into at once
@@ -43,7 +45,7 @@ _SAFE = 1 + 1e-9  # for rounding of small matrices
 
 
 def majorants(system: StateSpace, edges: Array, weight: Array) -> Array | None:
-    """Return matrices above the responses of every row of a system in every band, shape (p, b, m, m); None where the search ends without."""
+    """Return matrices (p, b, m, m) above every row's responses in every band, or None."""
     size = np.sqrt(np.maximum(np.einsum("bii->i", weight).real, 0.0))
     size = np.where(size > 1e-100, size, 1.0)  # a channel without energy
     scaled = StateSpace(system.A, system.B * size, system.C, system.D * size, system.dt)
@@ -82,7 +84,7 @@ def energy(matrices: Array, energies: Array) -> Array:
 
 
 def _arcs(system: StateSpace, edges: Array, root: Array, sizes: Array) -> tuple[Array, Array, Array]:
-    """Return the band of every arc, in order, the ends of its segment, (k, 2, p, m), and the distances of entries from it, (k, p, m)."""
+    """Return every arc's band, the ends of its segment, (k, 2, p, m), and the distances from it, (k, p, m)."""
     enclosed, n_bands = Enclosure(system), len(edges) - 1
     theta, half, band = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2 * _SAFE, np.arange(n_bands)
     done: list[tuple[Array, Array, Array, Array]] = []
@@ -121,7 +123,7 @@ def _some(rows: Array) -> Array:
 
 
 def _least_above(rows: Array) -> Array:
-    """Return the shape of the matrix of least trace above the squares of rows, (b, s, p, m); shape (b, p, m, m), to be scaled."""
+    """Return the matrices (b, p, m, m) of least trace above the squares of rows (b, s, p, m), but for scale."""
     n_bands, _, p, m = rows.shape
     rows = np.ascontiguousarray(np.swapaxes(rows, 1, 2)).reshape(n_bands * p, -1, m)
     mu = np.full(rows.shape[:2], 1 / rows.shape[1])

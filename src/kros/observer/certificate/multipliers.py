@@ -1,14 +1,15 @@
-r"""Best multipliers over a grid of frequencies: a convex problem in as many numbers as there are slopes, solved by a barrier.
+r"""Best multipliers over a grid of frequencies: a convex problem, solved by a barrier.
 
     minimise g   subject to   F_f(t, g) = diag(t, g I) - sum_j t_j h_fj h_fj' - H_z' H_z > 0   at every frequency f,
 
-with ``h_fj`` the row of H that leads to the slope's input q_j. The set of multipliers that prove stability at all is found first, as the
-one for which ``lambda diag(t) > sum_j t_j h_fj h_fj'`` with a lambda below one. Newton's method on batches of small Hermitian matrices: whatever the number
-of disturbances, of two rows for every slope.
+with ``h_fj`` the row of H that leads to the slope's input q_j. The set of multipliers that prove stability at all is
+found first, as the one for which ``lambda diag(t) > sum_j t_j h_fj h_fj'`` with a lambda below one. Newton's method on
+batches of small Hermitian matrices: whatever the number of disturbances, of two rows for every slope.
 
 References
 ----------
-S. Boyd and L. El Ghaoui, "Method of centers for minimizing generalized eigenvalues", Linear Algebra and its Applications 188 (1993) 63-111.
+S. Boyd and L. El Ghaoui, "Method of centers for minimizing generalized eigenvalues", Linear Algebra and its
+Applications 188 (1993) 63-111.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ _BINDING = 0.1
 
 
 def best_multipliers(H: Array, width: int) -> Array | None:
-    """Return multipliers for which the gain is close to least, shape (n_p,); None where no multipliers prove stability."""
+    """Return multipliers, (n_p,), for which the gain is close to least; None where none prove stability."""
     G, some = H[:, :width, :width], _MOST_FREQUENCIES // 2
     largest = [
         np.argsort(-size)[:some]
@@ -75,7 +76,7 @@ def _best(H: Array, width: int) -> Array | None:
 
 
 def _stabilising(G: Array) -> Array | None:
-    """Return multipliers with ``diag(t) > G_f' diag(t) G_f`` at every frequency, well inside; None where there are none."""
+    """Return multipliers with ``diag(t) > G_f' diag(t) G_f`` at every frequency, well inside, or None."""
     width = G.shape[1]
     t = min((np.ones(width), _balanced(np.abs(G).max(axis=0))), key=lambda t: _needed(G, t).max())
     needed = _needed(G, t)
@@ -125,16 +126,17 @@ def _adjoint(matrices: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Barrier:
-    r"""``-sum_f log det F_f(t, g)``, with ``F = diag(looser t, g I) - R diag(t) R' - P`` of the columns r_j = h_j' of R and ``P = H_z' H_z``.
+    r"""``-sum log det F``, ``F = diag(looser t, g I) - R diag(t) R' - P``, R of columns ``h_j'``, ``P = H_z'H_z``.
 
-    F is the Schur complement of ``diag(1/t)`` in a matrix whose block for the disturbances is diagonal, ``g I - sizes``, in the eigenvectors of P_ww:
+    F is the Schur complement of ``diag(1/t)`` in a matrix whose block for the disturbances is diagonal, ``g I -
+    sizes``, in the eigenvectors of P_ww:
 
         [ looser diag(t) - P_pp   R_p         -P_pw       ]
         [ R_p'                    diag(1/t)   R_w'        ]
         [ -P_wp                   R_w         g I - sizes ]
 
-    Without that block M is left, two rows for every slope: ``log det F = log det (g I - sizes) + log det M + sum log t``, and ``M^-1`` says all of
-    F^-1 along ``e_j`` and ``r_j``, where t changes F.
+    Without that block M is left, two rows for every slope: ``log det F = log det (g I - sizes) + log det M + sum log
+    t``, and ``M^-1`` says all of F^-1 along ``e_j`` and ``r_j``, where t changes F.
     """
 
     fixed: Array  # [[-P_pp, R_p], [R_p', 0]], (f, 2 n_p, 2 n_p)

@@ -4,17 +4,18 @@ With a Lyapunov matrix ``P = R' R`` the gain gamma is proven when
 
     F = [[P, 0], [0, gamma^2 I]] - [A_c, B_c]' P [A_c, B_c] - [C, D]' [C, D] > 0
 
-for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers stand in for corners: then p is
-an input and q an output.)
+for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers
+stand in for corners: then p is an input and q an output.)
 
-In the coordinates in which ``P = I`` it says that a matrix has a spectral norm below one: that is the margin, in floating point. The decision
-is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by a Cholesky factorisation in floating
-point of what is left without all that rounding can do; where that is not enough, by elimination of integers.
+The decision is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by
+a Cholesky factorisation in floating point of what is left without all that rounding can do; where that is not enough,
+by elimination of integers.
 
 References
 ----------
 S. M. Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46 (2006) 433-452.
-E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation 22 (1968) 565-578.
+E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation
+22 (1968) 565-578.
 """
 
 from __future__ import annotations
@@ -33,17 +34,6 @@ _BITS = 96  # of the scaled matrix that is decided on; the rounding to them is s
 _ROUNDING = 8.0  # times what a factorisation may be off, with a factor of five to spare
 
 
-def margin(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> float:
-    """Return ``1 - max ||.||^2`` over corners (A, B) in the coordinates where ``P = R'R`` is the identity."""
-    worst = 0.0
-    for A, B in corners:
-        top = root @ np.hstack([_right_divide(A, root), B / gain])
-        direct = np.zeros((len(C), B.shape[1])) if D is None else D / gain
-        bottom = np.hstack([_right_divide(C, root), direct])
-        worst = max(worst, float(np.linalg.norm(np.vstack([top, bottom]), 2)))
-    return 1 - worst**2
-
-
 def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
     """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored."""
     numbers = [root, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
@@ -54,9 +44,9 @@ def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None
     held = _gram(_Exact.of(root))
     for A, B in corners:
         n, width = A.shape[1], B.shape[1]
-        moved = [_gram(_Exact.of(root) @ _Exact.of(step)) for step in np.split(np.hstack([A, B]), len(A) // n)]
-        shift = max(part.shift for part in (*moved, held, out, level))
-        F = -sum(part.at(shift) for part in moved) - out.at(shift)
+        moved = _gram(_Exact.of(root) @ _Exact.of(np.hstack([A, B])))
+        shift = max(part.shift for part in (moved, held, out, level))
+        F = -moved.at(shift) - out.at(shift)
         F[:n, :n] += held.at(shift)
         F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
         if not _positive(F):
@@ -107,7 +97,7 @@ def _positive(F: Integers) -> bool:
 
 
 def _clearly_positive(M: Integers) -> bool:
-    """Tell whether a matrix of integers is positive definite by far: a factorisation exists, whatever was rounded on the way."""
+    """Tell whether a matrix of integers is positive definite by more than rounding."""
     try:
         rounded = M.astype(float) * 2.0**-_BITS
         spare = _ROUNDING * (len(M) + 4) * np.finfo(float).eps * float(np.trace(rounded))
@@ -126,9 +116,3 @@ def _eliminated(M: Integers) -> bool:
         M[k + 1 :, k + 1 :] = (M[k, k] * M[k + 1 :, k + 1 :] - np.outer(M[k + 1 :, k], M[k, k + 1 :])) // pivot
         pivot = M[k, k]
     return True
-
-
-def _right_divide(matrix: Array, R: Array) -> Array:
-    from scipy.linalg import solve_triangular
-
-    return np.asarray(solve_triangular(R, matrix.T, trans="T").T)

@@ -4,13 +4,14 @@ A common quadratic Lyapunov function over all slopes in the box follows where mu
 
     sum |z|^2 + t_j (|q_j|^2 - |p_j|^2) - gamma^2 |w|^2 <= 0        on every trajectory with |p_j| <= |q_j|,
 
-and for one channel the S-lemma makes the converse true: nothing is lost against the corners. By the Kalman-Yakubovich-Popov lemma this is
+and for one channel the S-lemma makes the converse true: nothing is lost against the corners. By the
+Kalman-Yakubovich-Popov lemma this is
 
     H(theta)* [[T, 0], [0, I]] H(theta) < [[T, 0], [0, gamma^2 I]],     H = [[G_qp, G_qw], [G_zp, G_zw]]
 
-at all frequencies, an inequality in (T, gamma^2) alone, whatever the order. The least gamma over a grid of frequencies is found first; the Lyapunov
-matrix then solves the Riccati equation of the scaled system [sqrt(T) q, z] / [p sqrt(T), gamma w] with a small extra output that makes
-the inequality strict in every direction.
+at all frequencies, an inequality in (T, gamma^2) alone, whatever the order. The least gamma over a grid of frequencies
+is found first; the Lyapunov matrix then solves the Riccati equation of the scaled system [sqrt(T) q, z] / [p sqrt(T),
+gamma w] with a small extra output that makes the inequality strict in every direction.
 """
 
 from __future__ import annotations
@@ -28,10 +29,6 @@ from .multipliers import best_multipliers
 
 Array = npt.NDArray[np.float64]
 _GRID = 200
-_LOG_RANGE = (
-    -5.0,
-    20.0,
-)  # of what is above the least multiplier; closer to it, a peak between frequencies of the grid would break the proof
 _NOTHING = 1e-12
 _STEPS = (1.001, 1.003, 1.01, 1.03, 1.1, 1.3, 2.0)
 _SPARE = 0.25  # share of the distance to one that the extra output may take
@@ -43,49 +40,41 @@ _DOUBLINGS = 60
 
 @dataclass(frozen=True, eq=False)
 class Proposal:
-    """A gain, not proven yet, with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers where there are any, shape (n_p,)."""
+    """A gain, not proven yet, with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers, shape (n_p,)."""
 
     gain: float
     root: Array
-    how: str
-    multipliers: Array | None = None
+    multipliers: Array
 
 
 def riccati_proposals(system: ErrorSystem) -> Iterator[Proposal]:
-    """Yield proposals with a growing distance from the least gain, best first; none where the frequency inequality has no solution."""
+    """Yield proposals, best first; none where the frequency inequality has no solution."""
     if not _plain(system).is_stable():
         return
     multipliers, least = frequency_bound(system)
     if not np.isfinite(least):
         return
-    how = (
-        "Riccati equation with a multiplier for every slope"
-        if len(multipliers)
-        else "Riccati equation of the bounded-real lemma"
-    )
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
     least = max(least, _NOTHING * size, np.finfo(float).tiny)  # where nothing arrives, any small gain will do
     for factor in _STEPS:
-        # Multipliers that grow with the gain leave the error less weight, and the disturbance too: room for what the grid did not see.
+        # Multipliers that grow with the gain leave room for what the grid did not see.
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
-            yield Proposal(least * factor, R, how, multipliers * factor)
+            yield Proposal(least * factor, R, multipliers * factor)
 
 
 def frequency_bound(system: ErrorSystem) -> tuple[Array, float]:
-    """Return the best multipliers, shape (n_p,), and the least gain they allow on a grid; infinity where there are none."""
+    """Return the best multipliers, (n_p,), and the least gain they allow on a grid, infinity where none do."""
     width = system.L.shape[1]
     if not width or not np.any(system.C) or not np.any(np.hstack([system.B.ravel(), system.D.ravel()])):
         return np.ones(width), hinf_norm(_plain(system))
     H = _responses(system)
-    if width == 1:
-        return _single(H)
     found = best_multipliers(H, width)
     return (np.ones(width), np.inf) if found is None else (found, float(np.sqrt(_level(H, found))))
 
 
 def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:
-    """Return the triangular factor of a Lyapunov matrix for one gain, or None where the Riccati equation has no solution."""
+    """Return the triangular factor of a Lyapunov matrix for a gain, or None without a solution."""
     from scipy.linalg import solve_discrete_are
 
     width = system.L.shape[1]
@@ -157,7 +146,7 @@ def _responses(system: ErrorSystem) -> Array:
 
 
 def _level(H: Array, multipliers: Array) -> float:
-    """Return the least gamma^2 that given multipliers allow on the grid, by a Schur complement; infinity where there is none."""
+    """Return the least gamma^2 that multipliers allow on the grid, by a Schur complement, or infinity."""
     width = len(multipliers)
     weight = np.concatenate([multipliers, np.ones(H.shape[1] - width)])
     F = np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
@@ -166,22 +155,3 @@ def _level(H: Array, multipliers: Array) -> float:
         return np.inf
     schur = F[:, width:, width:] + F[:, width:, :width] @ np.linalg.solve(rest, F[:, :width, width:])
     return float(np.linalg.eigvalsh(schur)[:, -1].max())
-
-
-def _single(H: Array) -> tuple[Array, float]:
-    """One slope: the best multiplier by a search over its logarithm above the least that is possible."""
-    from scipy.optimize import minimize_scalar
-
-    small = 1 - np.abs(H[:, 0, 0]) ** 2
-    if small.min() <= 0:
-        return np.ones(1), np.inf
-    lowest = float(np.max(np.sum(np.abs(H[:, 1:, 0]) ** 2, axis=1) / small))
-    if lowest == 0.0:  # the slope does not reach the output
-        return np.ones(1), float(np.linalg.norm(H[:, 1:, 1:], 2, axis=(1, 2)).max())
-    found = minimize_scalar(
-        lambda log: _level(H, np.array([lowest * (1 + np.exp(log))])),
-        bounds=_LOG_RANGE,
-        method="bounded",
-        options={"xatol": 1e-2},
-    )
-    return np.array([lowest * (1 + np.exp(found.x))]), float(np.sqrt(found.fun))

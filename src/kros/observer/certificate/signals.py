@@ -1,13 +1,15 @@
-r"""A bound on the error of every unit of a set of signals: the residuals of recorded motion, known by their energies in bands of frequency.
+r"""A bound on the error for a set of signals: residuals of recorded motion, by their energies in bands.
 
-Let ``w_k``, k from -1, be the first error followed by the one-step residual and the noise of a recording, and T_j the frozen response from w to the error of
-state j as the observer runs, delay included. Then (`relift` page)
+Let ``w_k``, k from -1, be the first error followed by the one-step residual and the noise of a recording, and T_j the
+frozen response from w to the error of state j as the observer runs, delay included. Then (`relift` page)
 
-.. math:: \|e_j\| \le \Big(\sum_b \mathrm{tr}(M_{jb} \Phi_b)\Big)^{1/2} + \kappa_j \Big(\sum_l \frac{1}{s_l^2} \sum_b \mathrm{tr}(M_{lb} \Phi_b)\Big)^{1/2},
+.. math:: \|e_j\| \le \Big(\sum_b \mathrm{tr}(M_{jb} \Phi_b)\Big)^{1/2}
+          + \kappa_j \Big(\sum_l \frac{1}{s_l^2} \sum_b \mathrm{tr}(M_{lb} \Phi_b)\Big)^{1/2},
 
-``M_b`` above ``T^H T`` throughout band b for the error and for what the slopes and limits act on (`majorants`), and ``kappa_j`` the proven gain from the
-latter, divided by sizes s, to what they can add to state j alone. It holds for every signal with energies of at most ``Phi_b``: for those of a unit
-whatever course they take, for the cover of all units whatever unit they come from.
+``M_b`` above ``T^H T`` throughout band b for the error and for what the slopes and limits act on (`majorants`), and
+``kappa_j`` the proven gain from the latter, divided by sizes s, to what they can add to state j alone. It holds for
+every signal with energies of at most ``Phi_b``: for those of a unit whatever course they take, for the cover of all
+units whatever unit they come from.
 """
 
 from __future__ import annotations
@@ -21,30 +23,25 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace
 from ...data import EpisodeBatch
-from ...uncertainty.coprime.bands import BandEnergies, band_edges, cover
+from ...uncertainty.band_energies import BandEnergies, band_edges, cover
 from ..data import ObserverData
-from ..simulate import run_observer
 from .certificate import ReliftCertificate
+from .course import Course, course
 from .error import ErrorSystem, error_system
 from .majorants import energy, majorants
-from .report import Course, course
-from .search import quick_gain
+from .search import proven_gain
 
 Array = npt.NDArray[np.float64]
 _BANDS, _BELOW = 96, 10  # bands, the lowest of which ends at a tenth of an episode's lowest frequency
 _TOO_SHARP = "no bound: the responses of its error are too sharp to be enclosed by the arcs that are tried"
 _RIDGE = 1e-6
 _SPARE = 1e-6
-_OTHERS = (
-    0.0,
-    1e-3,
-    1.0,
-)  # weights of other states' errors beside the one that counts: with them the Riccati equation is better conditioned
+_OTHERS = (0.0, 1e-3, 1.0)  # weights of other states' errors: with them the Riccati equation is better conditioned
 
 
 @dataclass(frozen=True, eq=False)
 class SignalBound:
-    """Bounds on the errors of one observer as it runs.
+    """Bounds on the errors of one observer at run time.
 
     Parameters
     ----------
@@ -52,21 +49,18 @@ class SignalBound:
         The recorded ones.
     units : tuple of str
     cover : ndarray, shape (n,)
-        Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is none.
+        Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is
+        none.
     bounds : ndarray, shape (units, n)
         For any signal with the energies of one unit.
     errors : ndarray, shape (units, n)
         RMS errors as they were.
-    movement : ndarray, shape (n,)
-        What slopes and limits may add, within `cover`.
     sizes : ndarray, shape (n,)
         Ranges of the states; all of the above are in the states' own units of measure.
     reason : str
         Why there is no bound; empty where there is one.
     outside : tuple of str
         Units of which the observer refuses samples as implausible. Their rows are infinite.
-    within : bool, optional
-        Of an observer that goes on from limits: true where these change no estimate of the recordings, and the bound is for signals that keep it so.
 
     Examples
     --------
@@ -86,11 +80,9 @@ class SignalBound:
     cover: Array
     bounds: Array
     errors: Array
-    movement: Array
     sizes: Array
     reason: str = ""
     outside: tuple[str, ...] = ()
-    within: bool | None = None
 
     @property
     def certified(self) -> bool:
@@ -109,40 +101,21 @@ class SignalBound:
         return {name: float(v) if np.isfinite(v) else None for name, v in zip(self.states, values, strict=True)}
 
     def facts(self, measured: Sequence[int] = ()) -> dict[str, Any]:
-        """Return what goes into the metrics; ratios are those of hidden states (of all where none is), over units that keep what is assumed."""
+        """Return what goes into the metrics; ratios are those of hidden states, of all where none is."""
         if not self.certified:
             return {"set_certified": False, "set_reason": self.reason}
         hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratios, over = self.ratios[:, hidden], (self.cover / self.errors)[:, hidden]
-        ratios, over = (v[np.isfinite(self.bounds[:, hidden]) & np.isfinite(v)] for v in (ratios, over))
+        ratios = self.ratios[:, hidden]
+        ratios = ratios[np.isfinite(ratios)]
         facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
-        facts |= {} if self.within is None else {"set_within_limits": self.within}
         least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
-        facts |= {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
-        return facts | {
-            "set_cover_to_error_max": float(over.max()) if over.size else None,
-            "set_outside": list(self.outside),
-        }
+        ratio = {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
+        return facts | ratio | {"set_outside": list(self.outside)}
 
     def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""
         by = np.asarray(factors, dtype=float)
-        return replace(
-            self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "movement", "sizes")}
-        )
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return it for a record; what is infinite is None."""
-        arrays = {name: _finite(getattr(self, name)) for name in ("cover", "bounds", "errors", "movement", "sizes")}
-        return {
-            "states": self.states,
-            "units": self.units,
-            **arrays,
-            "reason": self.reason,
-            "outside": self.outside,
-            "within_limits": self.within,
-        }
+        return replace(self, **{name: getattr(self, name) * by for name in ("cover", "bounds", "errors", "sizes")})
 
 
 def signal_bound(
@@ -151,7 +124,6 @@ def signal_bound(
     batch: EpisodeBatch,
     estimates: Array | None = None,
     known: dict[bytes, BandEnergies] | None = None,
-    seen: Course | None = None,
 ) -> SignalBound:
     """Bound the errors of an observer for signals like those of recorded episodes.
 
@@ -166,8 +138,6 @@ def signal_bound(
         Of `run_observer` for these measurements; it is run where they are missing.
     known : dict, optional
         Energies that were found already, for observers of one model: filled here.
-    seen : Course, optional
-        What `course` found for these, where it is known already.
 
     Returns
     -------
@@ -183,84 +153,67 @@ def signal_bound(
     >>> from kros.observer import Observer, relift_certificate, signal_bound
     >>> from kros.synthesis import Injection
     >>> x = np.random.default_rng(0).normal(size=(2, 200, 2)).cumsum(axis=1)
-    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, states=["x"], measured=["x"], inputs=["u"], sample_period_s=0.01)
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, **names, sample_period_s=0.01)
     >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
-    >>> observer = Observer("x", Lifting(("x",)), np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",), gain([[0.5]], 0.01), Injection.STATE, 0.01)
+    >>> model = np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",)
+    >>> observer = Observer("x", Lifting(("x",)), *model, gain([[0.5]], 0.01), Injection.STATE, 0.01)
     >>> bound = signal_bound(relift_certificate(observer), observer, batch)
     >>> bool((bound.errors <= bound.bounds).all())
     True
     """
-    seen = seen or course(observer, batch, estimates)
-    n, within, inside = len(observer.recorded), None, seen.taken(observer)
-    if observer.runtime.clipped_states(observer.lifting.n_states):
-        free = replace(observer, runtime=replace(observer.runtime, lower=None, upper=None))
-        if _alike(free, observer, batch, seen):
-            observer, within = free, True
-    units = list(dict.fromkeys(batch.units))
+    seen = course(observer, batch, estimates)
+    n, taken = len(observer.recorded), seen.taken(observer)
+    units = tuple(dict.fromkeys(batch.units))
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)
-    beyond = np.sqrt(member @ seen.mean_square(seen.beyond))
     errors = np.sqrt(member @ seen.mean_square(seen.error[..., :n] + seen.beyond))
-    nothing = np.full(n, np.inf)
-    found = SignalBound(
-        observer.recorded,
-        tuple(units),
-        nothing,
-        np.full(errors.shape, np.inf),
-        errors,
-        nothing,
-        certificate.scales.error[:n].copy(),
-        within=within,
-    )
+    none, sizes = np.full(n, np.inf), certificate.scales.error[:n].copy()
+    result = SignalBound(observer.recorded, units, none, np.full(errors.shape, np.inf), errors, sizes)
     if not certificate.certified:
-        return replace(found, reason="it has no certificate as it runs")
+        return replace(result, reason="it has no certificate at run time")
     signal, system = _signals(certificate, observer, seen)
+    if not system.moved().is_stable():
+        return replace(result, reason="its error does not settle where slopes and limits rest")
+    bounds = _bounds(system, n, _energies(signal, batch, known).of_units(batch.units))
+    if bounds is None:
+        return replace(result, reason=_TOO_SHARP)
+    cover, each = bounds
+    outside = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not taken[rows].all())
+    each[[unit in outside for unit in units]] = np.inf
+    reason = "" if np.isfinite(cover).all() else "what slopes and limits can add has no proven gain"
+    by, beyond = sizes * (1 + _SPARE), np.sqrt(member @ seen.mean_square(seen.beyond))
+    cover = cover * by + beyond.max(axis=0)
+    return replace(result, cover=cover, bounds=each * by + beyond, reason=reason, outside=outside)
+
+
+def _bounds(system: ErrorSystem, n: int, energies: BandEnergies) -> tuple[Array, Array] | None:
+    """Return bounds of n scaled errors for the cover of all units, (n,), and for every unit, (units, n)."""
     frozen = system.moved()
-    if not frozen.is_stable():
-        return replace(found, reason="its error does not settle where slopes and limits rest")
-    energies = _energies(signal, batch, known).of_units(batch.units)
-    plant = StateSpace(
-        frozen.A,
-        frozen.B,
-        np.vstack([system.C[:n], frozen.C]),
-        np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D]),
-        system.dt,
-    )
+    C, D = np.vstack([system.C[:n], frozen.C]), np.vstack([np.zeros((n, frozen.n_inputs)), frozen.D])
+    plant = StateSpace(frozen.A, frozen.B, C, D, system.dt)
     # The cover is made for the errors and for what slopes act on: a matrix that no unit exceeds, where it matters.
     rough = majorants(plant, energies.edges, energies.energy.mean(axis=0))
     if rough is None:
-        return replace(found, reason=_TOO_SHARP)
-    matter = np.einsum(
-        "p,pbij->bij", 1 / np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny), rough
-    )
+        return None
+    size = np.maximum(energy(rough, energies.energy).max(axis=0), np.finfo(float).tiny)
+    matter = np.einsum("p,pbij->bij", 1 / size, rough)
     matter = matter + _RIDGE * np.einsum("bii->b", matter).real[:, None, None] * np.eye(matter.shape[-1])
     final = cover(energies.energy, matter)
     M = majorants(plant, energies.edges, final)
     if M is None:
-        return replace(found, reason=_TOO_SHARP)
-    linear, own = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
-    acted = np.maximum(linear[n:], np.finfo(float).tiny)
+        return None
+    whole, each = np.sqrt(energy(M, final)), np.sqrt(energy(M, energies.energy))
+    acted = np.maximum(whole[n:], np.finfo(float).tiny)
     kappa = mismatch_gains(system, acted, n)
+    share = np.linalg.norm(each[:, n:] / acted, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
-        movement = np.where(kappa > 0, kappa * np.sqrt(len(acted)), 0.0)
-        each = own[:, :n] + np.where(kappa > 0, kappa * np.linalg.norm(own[:, n:] / acted, axis=1)[:, None], 0.0)
-    left = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not inside[rows].all())
-    each[[unit in left for unit in units]] = np.inf
-    reason = "" if np.isfinite(kappa).all() else "what slopes and limits can add has no proven gain"
-    by = found.sizes * (1 + _SPARE)
-    of_all = (linear[:n] + movement) * by + beyond.max(axis=0)
-    return replace(found, cover=of_all, bounds=each * by + beyond, movement=movement * by, reason=reason, outside=left)
-
-
-def _alike(one: ObserverData, other: ObserverData, batch: EpisodeBatch, seen: Course) -> bool:
-    """Whether two observers have the same estimates of the recordings."""
-    ours, theirs = (run_observer(o, seen.y, seen.inputs, o.own(batch.parameters)) for o in (one, other))
-    beyond = np.arange(len(ours))[:, None] >= seen.lengths
-    return bool(((ours == theirs).all(axis=-1) | beyond).all())
+        movement = [np.where(kappa > 0, kappa * part, 0.0) for part in (np.sqrt(len(acted)), share)]
+    return whole[:n] + movement[0], each[:, :n] + movement[1]
 
 
 def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
-    """Return the proven gains from what the channels act on, divided by sizes, to what they add to every one of n errors; infinite where none is."""
+    """Return proven gains from what the channels act on, over sizes, to what they add to each of n errors."""
     if not len(acted):
         return np.zeros(n)
     if not np.isfinite(acted).all():
@@ -273,14 +226,14 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
         for others in _OTHERS:
             weight = np.full((len(rest.C), 1), others)
             weight[j] = 1.0
-            found[j] = quick_gain(replace(rest, C=weight * rest.C))
+            found[j] = proven_gain(replace(rest, C=weight * rest.C))
             if np.isfinite(found[j]):
                 break
     return found * top
 
 
 def _signals(certificate: ReliftCertificate, observer: ObserverData, seen: Course) -> tuple[Array, ErrorSystem]:
-    """Return the signals, shape (n_samples, batch, m), each of size one, and the system from them to the errors over their ranges."""
+    """Return the signals, (n_samples, batch, m), of size one, and the system from them to the scaled errors."""
     n, q = len(observer.recorded), len(observer.measured)
     start = seen.first[None, :, :n]
     later = np.concatenate([seen.omega[..., :n], seen.noise], axis=-1)
@@ -321,9 +274,3 @@ def _energies(signal: Array, batch: EpisodeBatch, known: dict[bytes, BandEnergie
     if known is not None:
         known[key] = found
     return found
-
-
-def _finite(values: Array) -> Any:
-    plain = values.astype(object)
-    plain[~np.isfinite(values)] = None
-    return plain.tolist()

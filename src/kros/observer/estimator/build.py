@@ -135,7 +135,7 @@ def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
     lower, upper = (np.full(observer.lifting.n_states, end) for end in (-np.inf, np.inf))
     hidden = [i for i in range(len(low)) if i not in observer.measured]
     lower[hidden], upper[hidden] = (low - room * (high - low))[hidden], (high + room * (high - low))[hidden]
-    return Runtime(0, lower, upper, relift=False)
+    return Runtime(0, lower, upper)
 
 
 def best_family(

@@ -1,13 +1,15 @@
-r"""Which model a residual-shaped observer should run: rows that were identified for free runs, or rows fitted to single steps.
+r"""The model of a residual-shaped observer: rows identified for free runs, or fitted to single steps.
 
-Models that are refined for long free runs predict well as a whole, and their rows may be poor by themselves: on drives the position of the
-next sample is missed by a hundred times more than a row fitted by least squares to single steps misses it, and a filter has to undo that from the
-measurement. The rows of lifted models are independent in the one-step residual, so every choice of rows comes from two residuals,
+Models that are refined for long free runs predict well as a whole, and their rows may be poor by themselves: on drives
+the position of the next sample is missed by a hundred times more than a row fitted by least squares to single steps
+misses it, and a filter has to undo that from the measurement. The rows of lifted models are independent in the one-step
+residual, so every choice of rows comes from two residuals,
 
     omega_i = x_i(k + 1) - [A_i | B_i] [theta(x); u]          with [A_i | B_i] as identified, or by least squares.
 
-Choices are ordered by the error that the Kalman predictor for their measured spectra promises; nothing has to be simulated for that. A model
-with rows of both kinds is no member of any uncertain set, and need not be stable by itself: the correction makes the observer stable.
+Choices are ordered by the error that the Kalman predictor for their measured spectra promises; nothing has to be
+simulated for that. A model with rows of both kinds is no member of any uncertain set, and need not be stable by itself:
+the correction makes the observer stable.
 """
 
 from __future__ import annotations
@@ -56,7 +58,8 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     regressors, following = regressors[counted], x[:, h + 1 :][counted]
     if len(regressors) < regressors.shape[1]:
         raise DataError(
-            f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record more."
+            f"One-step rows: {regressors.shape[1]} coefficients need as many steps, found {len(regressors)}; record "
+            "more."
         )
     W = least_squares(regressors, following).T
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
@@ -75,7 +78,7 @@ class Refitted:
 def refitted_models(
     lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch
 ) -> tuple[list[Refitted], Array]:
-    """Return the model as identified and with rows fitted to single steps; measured rows with every choice of hidden ones."""
+    """Return the model as identified and with choices of rows fitted to single steps."""
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
     fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
@@ -99,7 +102,7 @@ def residual_models(
     noise: Array,
     scale: Array,
 ) -> list[ResidualModel]:
-    """Return the model as identified and with rows fitted to single steps, the one that promises the smallest hidden errors first."""
+    """Return models with rows of both kinds, the one that promises the smallest hidden errors first."""
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
     refitted, residual = refitted_models(lifting, A, B, measured, batch)

@@ -1,14 +1,16 @@
 r"""One-step residuals: what drives the error of an observer that retracts and lifts its state at every step.
 
-Let the nominal's one-step model be :math:`x^+ = f(x, u) = A_s x + a\,\sigma(x) + B_s u`, the first n rows of the lifted model. Along any recording
+Let the nominal's one-step model be :math:`x^+ = f(x, u) = A_s x + a\,\sigma(x) + B_s u`, the first n rows of the lifted
+model. Along any recording
 
 .. math:: \omega_k = x_{k+1} - f(x_k, u_k)
 
-does not depend on the observer, and holds everything that the model does not know: the unit's own parameters, loads, the lifting's error.
-The deployed error obeys, exactly, ``e+ = (A_s + a delta_k) e - y^c + omega_k`` with ``delta_k`` between the slopes of the lifted functions.
-**Only the rows of the original states drive it**: the lifted functions are computed again from the states at every step, so their rows of
-the model, and what these rows miss, never enter. The linear time-invariant stand-in for the error dynamics takes the mean of ``delta_k`` over
-the recordings. Where functions oscillate as the machine moves, as ``sin(100 position + phase)`` does, that mean is nearly zero.
+does not depend on the observer, and holds everything that the model does not know: the unit's own parameters, loads,
+the lifting's error. The deployed error obeys, exactly, ``e+ = (A_s + a delta_k) e - y^c + omega_k`` with ``delta_k``
+between the slopes of the lifted functions. **Only the rows of the original states drive it**: the lifted functions are
+computed again from the states at every step, so their rows of the model, and what these rows miss, never enter. The
+linear time-invariant stand-in for the error dynamics takes the mean of ``delta_k`` over the recordings. Where functions
+oscillate as the machine moves, as ``sin(100 position + phase)`` does, that mean is nearly zero.
 """
 
 from __future__ import annotations
@@ -61,29 +63,30 @@ def mean_slopes(
 
 
 def mean_error_dynamics(A: Array, slopes: Array) -> Array:
-    """Return the dynamics of the deployed error, shape (n, n), of a model A, shape (n_lifted, n_lifted), with slopes of shape (p, n) (`mean_slopes`)."""
+    """Return the dynamics of the deployed error, (n, n), of a model with slopes of shape (p, n)."""
     n = slopes.shape[1]
     return np.asarray(A[:n, :n] + A[:n, n:] @ slopes)
 
 
 def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:
-    """Return the mean product of residuals over all episodes, shape (n, n); residual (n_samples, batch, n), lengths (batch,)."""
+    """Return the mean product of residuals (n_samples, batch, n) over all episodes, shape (n, n)."""
     counted = residual[np.arange(len(residual))[:, None] < np.asarray(lengths)]
     return np.asarray(counted.T @ counted / len(counted))
 
 
 def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
-    """Return every unit's cross spectral density of the residual by Welch's method; means are kept, since a bias is an error too."""
+    """Return every unit's cross spectral density of the residual by Welch's method, means included."""
     lengths = np.asarray(lengths, dtype=int)
     if residual.ndim != 3 or lengths.shape != (residual.shape[1],) or len(units) != residual.shape[1]:
         raise DimensionError(
-            f"Residual spectra: {residual.shape} should be (n_samples, batch, n) with as many lengths ({lengths.shape}) and units ({len(units)})."
+            f"Residual spectra: {residual.shape} should be (n_samples, batch, n) with as many lengths "
+            f"({lengths.shape}) and units ({len(units)})."
         )
     size = int(min(segment, lengths.min(), len(residual)))
     if size < FEWEST_SAMPLES:
         raise DataError(
-            f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least {FEWEST_SAMPLES} are needed; "
-            "leave short episodes out."
+            f"Residual spectra: an episode of unit {units[int(lengths.argmin())]} has {size} samples, at least "
+            f"{FEWEST_SAMPLES} are needed; leave short episodes out."
         )
     size -= size % 2
     hann = np.sin(np.pi * np.arange(size) / size) ** 2

@@ -35,10 +35,9 @@ def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
     scale = model.input_scale / model.output_scale[:, None]
     responses = models.systems(model.unit_ids).frequency_response(freqs) * scale
     nominal_response = model.scaled_nominal().frequency_response(freqs)
-    dt, units, nominal = model.sample_period_s, model.unit_ids, model.nominal_id
-    return unit_residuals(
-        model.form, nominal_response, responses, model.weight, freqs, dt, unit_ids=units, nominal_id=nominal
-    )
+    units = dict(zip(model.unit_ids, responses, strict=True))
+    nominal = model.nominal_id, nominal_response
+    return unit_residuals(model.form, nominal, units, model.weight, freqs, model.sample_period_s)
 
 
 def differing(residuals: UnitResiduals) -> list[int]:

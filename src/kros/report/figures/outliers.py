@@ -32,9 +32,8 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
     return scores_figure(models), text
 
 
-def scores_figure(models: Mapping[str, OutlierModel] | OutlierModel) -> Figure:
+def scores_figure(conditions: Mapping[str, OutlierModel]) -> Figure:
     """Draw scores with their ranges, a column a condition."""
-    conditions = {"": models} if isinstance(models, OutlierModel) else models
     units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
     figure, axes = grid(1, len(conditions), 1.9, sharey=True)
     for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):

@@ -107,14 +107,6 @@ def synthesis_figure(result: Synthesis, labels: Sequence[str] = (), name: str = 
     return figure
 
 
-def observer_figure(observer: Observer) -> Figure:
-    """Draw the entries of an observer's correction filter."""
-    figure, axes = _filter_figure(observer.controller, _entries(observer))
-    axes[0, 0].set_title(observer_label(observer.name))
-    axes[0, 2].remove()
-    return figure
-
-
 def _entries(observer: Observer) -> list[str]:
     """Return from which innovation to which input or state each entry of the filter leads."""
     states, K = observer.lifting.states, observer.controller

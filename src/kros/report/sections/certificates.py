@@ -65,10 +65,7 @@ def _table(facts: Facts) -> Table | None:
         group = f"recorded signals: {axis_label(channel, facts.unit(channel))}"
         columns.append(Column("bound", [(e.get("set_bound") or {}).get(channel) for e in rows], group))
         columns.append(Column("worst RMS error", worst, group))
-    columns += [
-        Column("gain at most", [e.get("relift_gain") for e in rows], "at run time"),
-        Column("losses certified", [e.get("dropout_certified") for e in rows], "at run time"),
-    ]
+    columns.append(Column("gain at most", [e.get("relift_gain") for e in rows], "at run time"))
     return build("Certificates of all observers", columns, facts.label, sortable=True)
 
 

@@ -71,7 +71,7 @@ def _ends(limit: Mapping[str, Any]) -> str:
     """Return the ends of a limit in words."""
     ends = [(limit["lower"], "at least"), (limit["upper"], "at most")]
     text = joined([f"{word} {number(value)}" for value, word in ends if value is not None])
-    return f"{text}, {'declared' if limit['declared'] else 'estimated from the recordings'}"
+    return f"{text}, estimated from the recordings"
 
 
 def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -57,8 +57,7 @@ def _limit(limit: Mapping[str, Any] | None) -> str:
         return ""
     ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
     seen = (limit.get("seen") or {}).get("units")
-    text = f"{ends}, {'declared' if limit['declared'] else 'estimated'}"
-    return f"{text}, reached by {some_of(seen, 3)}" if seen else text
+    return f"{ends}, estimated, reached by {some_of(seen, 3)}" if seen else f"{ends}, estimated"
 
 
 def calibration(facts: Facts) -> Section | None:
@@ -136,7 +135,6 @@ def uncertainty(facts: Facts) -> Section | None:
     orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
     columns = [
         Column("model", [model_label(name) for name in entries]),
-        Column("weights", [entry["structure"] for entry in weights]),
         Column("orders, left and right", orders),
         Column("largest normalised residual", [number(w["cover_max"], 6) for w in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),

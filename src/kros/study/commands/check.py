@@ -1,4 +1,4 @@
-"""Scores of new units against a finished study."""
+"""Scores of new units against a finished study, and the level of the deployed observer's innovation on them."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import re
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
+
+import numpy as np
+import numpy.typing as npt
 
 from ...core.artifacts import plain
 from ...core.errors import ConfigError, DataError
@@ -16,16 +19,19 @@ from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
 from ...observer import Observer
+from ...observer.monitor import Monitor
+from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import score_row
 from ...uncertainty.outliers.recorded import Evidence, Recorded
+from ...uncertainty.outliers.score import FEWEST_UNITS, Status
 from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
-from .field import FieldRecordings
-from .innovation import monitored
-from .recordings import (
+from .field import (
+    DEPLOYED,
+    FieldRecordings,
     check_channels,
     hidden_states,
     identify_on,
@@ -36,94 +42,83 @@ from .recordings import (
 )
 from .verdict import with_verdict
 
+Rows = list[dict[str, Any]]
+Judged = list[tuple[npt.NDArray[np.float64], npt.NDArray[np.bool_]]]  # innovations, and which samples are judged
 
-def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> list[dict[str, Any]]:
+
+def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False) -> Rows:
     """Identify the units of some recordings as the study did, score each against its population, and give a verdict.
 
     A name of a unit of the study is refused for other recordings, unless `same_unit` says it is the same machine.
     """
-    with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE) as (
-        config,
-        store,
-    ):
-        return scored(config, store, data, workers, same_unit)
+    stages = Stage.READ, Stage.CALIBRATE, Stage.IDENTIFY, Stage.QUANTIFY, Stage.SYNTHESIZE
+    with open_finished(run, *stages) as (config, store):
+        rows = scored(config, store, data, workers, same_unit)
+    return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
 
 
-def scored(
-    config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False
-) -> list[dict[str, Any]]:
+def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False) -> Rows:
     """Score the units of some recordings against a run that is open."""
     pattern = re.compile("outliers/([^/]+)/outlier_model.json")
     folders = [store.path("outliers", m[1]) for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
-    deployed = ("observers", "deployed.json")
-    observer = Observer.load(store.path(*deployed)) if store.holds(*deployed) else None
+    observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
     population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
-    watched: list[dict[str, Any]] = []
+    watched: Rows = []
     if observer is not None:
-        check_channels(population, observer, field_recordings=True)
+        check_channels(population, observer, hidden=False)
         hidden = any(name not in population.states for name in observer.recorded)
-        recordings = FieldRecordings.open(config, store, data)
-        watched = monitored(recordings) if hidden or observer.monitor is not None else []
+        if hidden or observer.monitor is not None:
+            watched = monitored(FieldRecordings.open(config, store, data))
         if hidden:
-            return in_order(watched)
+            return watched
         check_channels(population, observer)
     if not folders:
         advice = "run the study until quantify, with at least three units"
         raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
-    rows: list[dict[str, Any]] = []
-    with open_executor(workers) as executor:
-        for folder in folders:
-            models = ModelSet.load(store.path("models", folder.name))
-            if models.condition in population.conditions:
-                rows += score_condition(store, population, models, OutlierModel.load(folder), executor, same_unit)
-    if not rows:
-        modelled = ", ".join(ModelSet.load(store.path("models", folder.name)).condition for folder in folders)
+    sets = {folder: ModelSet.load(store.path("models", folder.name)) for folder in folders}
+    known = {folder: models for folder, models in sets.items() if models.condition in population.conditions}
+    if not known:
+        modelled = ", ".join(models.condition for models in sets.values())
         recorded = f"the recordings have the conditions {', '.join(population.conditions)}"
         both = f"{recorded}, and the run has models of {modelled} alone"
         raise DataError(f"Checking {data}: {both}; name the condition, as in the study.")
-    names = ("level_db", "level_rate", "level_units", "bands_db")
-    levels = {(row["unit"], row["condition"]): {key: row[key] for key in names} for row in watched}
-    return in_order([row | levels.get((row["unit"], row["condition"]), {}) for row in rows])
-
-
-def in_order(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Return rows of scores by condition and unit, with their verdicts, in JSON's types."""
-    return [plain(with_verdict(row)) for row in sorted(rows, key=lambda r: (r["condition"], r["unit"]))]
+    levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
+    rows: Rows = []
+    with open_executor(workers) as executor:
+        for folder, models in known.items():
+            rows += score_condition(store, population, models, OutlierModel.load(folder), executor, same_unit)
+    return [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
 
 
 def score_condition(
     store: Store, population: Population, models: ModelSet, outliers: OutlierModel, executor: Executor, same_unit: bool
-) -> list[dict[str, Any]]:
+) -> Rows:
     """Score all units that were recorded in one condition."""
-    training, everything = training_keys(population), {(u, c): keys for u, c, keys in population.groups()}
-    units = [u for u in population.unit_ids if training.get((u, models.condition))]
-    parameters = (
-        unit_parameters(population.select(units), load_calibration(store), identify_on(store))
-        if models.lifting.parameters
-        else {u: {} for u in units}
-    )
-    tasks = [
-        (population.select([u], [models.condition]), everything[u, models.condition], models.lifting) for u in units
-    ]
-    recorded, rows = Recorded.of(factors_of(store, models.condition), models, outliers.freqs_hz), []
+    condition, training = models.condition, training_keys(population)
+    everything = {unit: keys for unit, c, keys in population.groups() if c == condition}
+    units = [u for u in population.unit_ids if training.get((u, condition))]
+    parameters: dict[str, dict[str, float]] = {u: {} for u in units}
+    if models.lifting.parameters:
+        parameters = unit_parameters(population.select(units), load_calibration(store), identify_on(store))
+    tasks = [(population.select([u], [condition]), everything[u], models.lifting) for u in units]
+    recorded, rows = Recorded.of(factors_of(store, condition), models, outliers.freqs_hz), Rows()
     halves = recorded.halves()
     motion = None if halves is None else outliers.motion_levels(*halves)
     for unit, factor in zip(units, executor.map(reduce_episodes, tasks), strict=True):
-        keys, used = everything[unit, models.condition], training[unit, models.condition]
-        evidence = Evidence.of(factor, models, parameters[unit]).part([keys.index(k) for k in used])
+        keys = everything[unit]
+        chosen = [keys.index(k) for k in training[unit, condition]]
+        evidence = Evidence.of(factor, models, parameters[unit]).part(chosen)
         known = recorded.same_recordings(factor)
         if unit in recorded.units and unit not in known and not same_unit:
-            known_name = "the study has a unit of this name, with other recordings"
+            other = "the study has a unit of this name, with other recordings"
             same = "Give --same-unit if it is the same machine, which is then compared with the other units alone"
-            raise DataError(f"Checking unit {unit} ({models.condition}): {known_name}. {same}; else rename it.")
+            raise DataError(f"Checking unit {unit} ({condition}): {other}. {same}; else rename it.")
         known |= {unit} & set(recorded.units)
         (response,) = recorded.response([evidence])
-        score = recorded.qualified(
-            outliers.score(unit, response, known, None if recorded.same_motions(factor) else motion), evidence
-        )
-        seconds = float(factor.n_samples.sum()) * models.sample_period_s
-        row = score_row(score, models.condition, len(keys), seconds)
+        level = None if recorded.same_motions(factor) else motion
+        score = recorded.qualified(outliers.score(unit, response, known, level), evidence)
+        row = score_row(score, condition, len(keys), float(factor.n_samples.sum()) * models.sample_period_s)
         rows.append(row | {"units": outliers.n_units, "left_out": sorted(known)})
     return rows
 
@@ -131,3 +126,37 @@ def score_condition(
 def factors_of(store: Store, condition: str) -> EpisodeFactors:
     """Return the factors of a run's training episodes."""
     return EpisodeFactors.load(store.path("factors", quote(condition, safe="")))
+
+
+def monitored(recordings: FieldRecordings) -> Rows:
+    """Return a row for every unit and condition, as `check_units` does; what needs hidden channels is unknown."""
+    population, observer, rows = recordings.population, recordings.observer, Rows()
+    missing = [name for name in observer.recorded if name not in population.states]
+    monitor = observer.monitor
+    for unit, condition, keys in population.groups():
+        counts: dict[str, dict[str, int]] = {}
+        judged, samples = Judged(), 0
+        for arrived in recordings.batches(keys):
+            samples += int(arrived.batch.lengths.sum())
+            recordings.count_status(arrived, counts)
+            if monitor is not None:
+                values = arrived.parameters(observer, list(range(len(arrived.batch.keys))))
+                nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
+                judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
+        level = highest_level(monitor, judged, condition)
+        outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
+        row: dict[str, Any] = {"unit": unit, "condition": condition, "outlier": outlier, "level_db": level}
+        row |= dict.fromkeys(("score", "threshold", "detectable"))
+        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "episodes": len(keys), "left_out": []}
+        row |= {"recorded_s": samples * population.sample_period_s, "missing": missing}
+        row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}
+        rows.append(row | {"samples": counts.get(unit, {}), "parameters": recordings.sources.get(unit)})
+    return rows
+
+
+def highest_level(monitor: Monitor | None, innovations: Judged, condition: str) -> float | None:
+    """Return the highest level over the bound of a condition, dB; None where nothing is judged."""
+    if monitor is None or not any(judged.any() for _, judged in innovations):
+        return None
+    squares = np.concatenate(monitor.in_turn(innovations))
+    return float(monitor.level(squares, condition if condition in monitor.bounds else None).max())

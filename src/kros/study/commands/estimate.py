@@ -6,9 +6,8 @@ Estimates are in the units of the recordings that the study read, as those of an
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ import numpy.typing as npt
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...data.population import EpisodeKey
-from ...observer.recorded import recorded_channel, recorded_factors
+from ...observer.units import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.run_folder import open_finished
 from .field import FieldRecordings
@@ -29,51 +28,45 @@ ENDINGS = (".parquet", ".csv")
 KEYS = ("unit", "condition", "episode", "k")
 
 
-@dataclass(frozen=True)
-class Estimated:
-    """What was written: episodes, sources of every unit's parameters, and its samples by bit of the status."""
-
-    episodes: int
-    parameters: dict[str, str]
-    samples: dict[str, dict[str, int]] = field(default_factory=dict)
-
-    def lines(self) -> list[str]:
-        """Return it for people at a terminal, a line a unit where there is anything to say."""
-        units, lines = dict.fromkeys([*self.parameters, *(u for u, counts in self.samples.items() if counts)]), []
-        for unit in units:
-            parts = [f"parameters {self.parameters[unit]}"] if unit in self.parameters else []
-            parts += [f"{count} samples {bit}" for bit, count in self.samples.get(unit, {}).items()]
-            lines.append(f"unit {unit}: {'; '.join(parts)}")
-        return lines
-
-
 def estimate_recordings(
     run: Path, data: Path, out: Path, given: Collection[str] = (), track: str | None = None
-) -> Estimated:
-    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample, then the parameter that is followed."""
+) -> list[str]:
+    """Write ``unit, condition, episode, k, <channel>_hat`` for every sample, then the parameter that is followed.
+
+    Return what people read at the terminal.
+    """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
         recordings = FieldRecordings.open(config, store, data, given, track)
-        samples: dict[str, dict[str, int]] = {}
+        counts: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
-            for found in recordings.batches():
-                estimates, followed, status = recordings.estimates(found)
+            for arrived in recordings.batches():
+                estimates, followed, status = recordings.estimates(arrived)
                 estimates /= recorded_factors(recordings.observer, recordings.observer.recorded)
                 columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
-                for i, key in enumerate(found.batch.keys):
-                    write(key, columns[: found.batch.lengths[i], i])
-                recordings.count_status(found, samples, status)
-    return Estimated(len(recordings.population.episodes), recordings.sources, samples)
+                for i, key in enumerate(arrived.batch.keys):
+                    write(key, columns[: arrived.batch.lengths[i], i])
+                recordings.count_status(arrived, counts, status)
+    count = len(recordings.population.episodes)
+    return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
+
+
+def unit_lines(sources: Mapping[str, str], counts: Mapping[str, Mapping[str, int]]) -> list[str]:
+    """Return a line a unit with the source of its parameters and its samples by status, where there is any."""
+    lines = []
+    for unit in dict.fromkeys([*sources, *(u for u, of_unit in counts.items() if of_unit)]):
+        parts = [f"parameters {sources[unit]}"] if unit in sources else []
+        parts += [f"{count} samples {bit}" for bit, count in counts.get(unit, {}).items()]
+        lines.append(f"  unit {unit}: {'; '.join(parts)}")
+    return lines
 
 
 def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
     """Return the observer, columns with their units of measure, and parameters of every unit with their sources."""
-    observer = recordings.observer
-    name = recordings.name
-    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded} | (
-        {} if name is None else {name: "rad"}
-    )
+    observer, name = recordings.observer, recordings.name
+    columns = {f"{s}_hat": recorded_channel(observer, s).unit for s in observer.recorded}
+    columns |= {} if name is None else {name: "rad"}
     parameters = {u: {**recordings.values[u], "source": source} for u, source in recordings.sources.items()}
     about = {key: observer.about.get(key) for key in ("kros", "study")}
     return {"observer": observer.name, **about, "columns": columns, "parameters": parameters}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...core.artifacts import load_artifact, read_json
+from ...core.artifacts import load_artifact, read_json, write_json
 from ...core.errors import ConfigError, KrosError
 from ...core.files import did_you_mean
 from ...data import EpisodeBatch
@@ -16,13 +16,13 @@ from ...data.survey import RecordingFacts
 from ...design.validation import spread
 from ...evaluate.sensor import as_arriving
 from ...export import HeldOut, LoadOutput, export_c, export_fmu
-from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ..config import Stage, StudyConfig
 from ..engine.run_folder import open_finished
 from ..engine.store import Store
+from ..stages.load import TrialSettings
 from ..stages.read import open_source
-from .recordings import load_calibration
+from .field import load_calibration
 
 log = logging.getLogger(__name__)
 
@@ -59,12 +59,12 @@ def export_run(
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)
-        limit = np.inf if config.load.limit is None else config.load.limit
-        level = AngleLoad(config.load.level_s, chosen.sample_period_s, limit=limit)
-        load = LoadOutput(level, current=config.load.current) if observer in loads else None
-        return export_c(
-            chosen, out, name, precision, config.dump(), track, load, held_out(config, store, chosen), on_board=True
-        )
+        settings, facts = TrialSettings(), RecordingFacts.load(store.path("population"))
+        level = settings.level(chosen.sample_period_s, facts.limits)
+        load = LoadOutput(level, current=settings.current) if observer in loads else None
+        folder = export_c(chosen, out, name, precision, track, load, held_out(config, store, chosen))
+        write_json(folder / "study.json", config.dump())
+        return folder
 
 
 def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut | None:

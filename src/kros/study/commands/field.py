@@ -1,38 +1,164 @@
-"""The deployed observer on recordings from the field: what arrives, parameters of every unit, estimates."""
+"""Recordings beside a finished run: opened as those of the run were, with parameters of every unit, and estimates."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from dataclasses import dataclass
+import logging
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import ConfigError, IdentificationError
-from ...data import Population
+from ...core.errors import ConfigError, DataError, IdentificationError
+from ...core.files import read_toml
+from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
+from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
+from ...identify import PhaseCalibration
+from ...identify.calibration import segments_of
 from ...observer import Observer, run_with_status, track_parameter
-from ...observer.samples import Bits, SampleStatus
-from ...observer.screen import sample_status
+from ...observer.screen import Bits, SampleStatus, sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
-from ..config import StudyConfig
+from ..config import StudyConfig, validate_config
 from ..engine.store import Store
-from .recordings import (
-    UnitValues,
-    check_channels,
-    hidden_states,
-    identify_on,
-    load_calibration,
-    open_data,
-    parse_given,
-    unit_values,
-)
+from ..stages.read import ARRAYS
 
+log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-_BATCH, _PHASES, _SEEN = 64, 24, 20_000  # episodes, phases, samples
+Values = dict[str, dict[str, float]]  # lifting parameters by unit
+DEPLOYED = ("observers", "deployed.json")
+_BATCH, _SAMPLES = 64, 200_000  # episodes at a time, and their samples
+
+
+def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
+    """Open a folder with the run's reader, or what a TOML with ``[data]`` names; `optional` channels may be absent."""
+    section = config.data
+    if data.is_file():
+        raw = read_toml(data, "DATA is no folder of recordings, and")
+        section = validate_config({"data": raw.get("data", {})}, data.parent, str(data)).data
+    else:
+        section = section.model_copy(update={"source": data})
+    reader = None if section.reader == ARRAYS else section.reader
+    try:
+        return read(section.source, reader, prepare=section.prepare, mapping=section.csv, optional=optional)
+    except (ConfigError, DataError) as error:
+        if not data.is_dir() or data.suffix == ".toml":
+            raise
+        other = "Recordings of another kind than the run's are named by a TOML with [data], as in a study."
+        raise type(error)(f"{error} {other}") from error
+
+
+def hidden_states(observer: Observer) -> tuple[str, ...]:
+    """Return the recorded states that are not measured at run time."""
+    return tuple(name for i, name in enumerate(observer.recorded) if i not in observer.measured)
+
+
+def check_channels(population: Population, observer: Observer, *, hidden: bool = True) -> None:
+    """Refuse other channels, units of measure or sampling periods than those of the run, perhaps of hidden states."""
+    expected, there = (observer.recorded, observer.inputs), (population.states, population.inputs)
+    needed = (*(observer.lifting.states[i] for i in observer.measured), *observer.inputs)
+    names = [*population.states, *population.inputs]
+    if not hidden and (missing := [name for name in needed if name not in names]):
+        absent = f"{', '.join(missing)} is missing from the recordings, which have {', '.join(names)}"
+        raise DataError(
+            f"Channels: the observer needs {', '.join(needed)}; {absent}; record it, or correct the mapping."
+        )
+    if hidden and expected != there:
+        both = f"the run has states and inputs {expected}, the recordings {there}"
+        raise DataError(f"Channels: {both}; read them the same way.")
+    units = observer.about.get("units_of_measure", {})
+    for channel in population.channels:
+        if channel.unit and units.get(channel.name, channel.unit) not in ("", channel.unit):
+            both = f"is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
+            advice = "declare a scale step, or leave the unit out where it is only written differently"
+            raise DataError(f"Channels: {channel.name} {both}; {advice}.")
+    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
+        both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
+        raise DataError(f"Sampling period: {both}; declare a resample step.")
+
+
+def identify_on(store: Store) -> str:
+    """Return the condition that feeds synthesis in a run."""
+    return RecordingFacts.load(store.path("population")).identify_on
+
+
+def load_calibration(store: Store) -> PhaseCalibration | None:
+    """Return the run's calibration, where it has one."""
+    return PhaseCalibration.load(store.path("calibration")) if store.holds("calibration", "calibration.json") else None
+
+
+def training_keys(population: Population) -> dict[tuple[str, str], tuple[EpisodeKey, ...]]:
+    """Return the episodes that a unit is identified on: its training part, or its only episode."""
+    groups = {(u, c): keys for u, c, keys in population.groups()}
+    several = tuple(k for keys in groups.values() if len(keys) > 1 for k in keys)
+    splits = split_episodes(replace(population, episodes=several))
+    return groups | {group: split.train for group, split in splits.items()}
+
+
+@dataclass(frozen=True)
+class UnitValues:
+    """Lifting parameters of every unit, where each came from, and why one is unknown."""
+
+    values: Values
+    sources: dict[str, str] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+
+def unit_values(
+    population: Population, calibration: PhaseCalibration | None, prefer: str, given: Values | None = None
+) -> UnitValues:
+    """Return every unit's lifting parameters: given, calibrated in a condition, or those of the run."""
+    units = UnitValues({unit: dict((given or {}).get(unit, {})) for unit in population.unit_ids})
+    if calibration is None:
+        return units
+    training, spec = training_keys(population), calibration.spec
+    derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
+    for unit, values in units.values.items():
+        if spec.parameter in values:
+            units.sources[unit] = "given"
+            continue
+        by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        try:
+            keys = by_condition.get(prefer) or next(iter(by_condition.values()))
+            phase = calibration.calibrate(segments_of((population, keys, spec)), unit)
+            units.sources[unit] = f"calibrated{derived}"
+        except IdentificationError as error:
+            if unit not in calibration.units:
+                units.sources[unit], units.reasons[unit] = "unknown", str(error)
+                continue
+            phase, units.sources[unit] = calibration.units[unit], "of the run"
+            log.info("unit %s: its recordings do not show the phase, that of the run is taken", unit)
+        values[spec.parameter] = phase.phase_rad
+    return units
+
+
+def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> Values:
+    """Return every unit's lifting parameters, as `unit_values` finds them; refuse one that is unknown."""
+    units = unit_values(population, calibration, prefer)
+    for reason in units.reasons.values():
+        raise IdentificationError(reason)
+    return units.values
+
+
+def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> Values:
+    """Return parameters given as ``UNIT.NAME=VALUE``."""
+    given: Values = {}
+    for text in texts:
+        place, _, number = text.partition("=")
+        unit, _, name = place.rpartition(".")
+        try:
+            value = float(number)
+        except ValueError:
+            value = np.nan
+        if unit not in units or name not in known or not np.isfinite(value):
+            of = f"a unit of the recordings ({', '.join(sorted(units)[:5])})"
+            name_of = f"a parameter of the observer ({', '.join(known) or 'it has none'})"
+            raise ConfigError(f"--parameter {text}: should be UNIT.NAME=VALUE with {of}, {name_of} and a number.")
+        given.setdefault(unit, {})[name] = value
+    return given
 
 
 @dataclass(frozen=True)
@@ -41,93 +167,102 @@ class FieldRecordings:
 
     observer: Observer
     population: Population
-    values: dict[str, dict[str, float]]
-    sources: dict[str, str]
-    followed: frozenset[str]
-    name: str | None
+    values: Values
+    sources: Mapping[str, str] = field(default_factory=dict)
+    followed: frozenset[str] = frozenset()  # units whose parameter is followed
+    name: str | None = None  # of that parameter
 
     @classmethod
     def open(
         cls, config: StudyConfig, store: Store, data: Path, given: Collection[str] = (), track: str | None = None
     ) -> FieldRecordings:
         """Open what `data` names, and settle the parameters of every unit."""
-        if not store.holds("observers", "deployed.json"):
+        if not store.holds(*DEPLOYED):
             raise ConfigError(f"Run {store.folder}: has no deployed observer; run the study at least until synthesize.")
-        observer = Observer.load(store.path("observers", "deployed.json"))
+        observer = Observer.load(store.path(*DEPLOYED))
         known = observer.lifting.parameters
         if track is not None and track not in known:
             raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
         population = with_gaps(open_data(config, data, hidden_states(observer)))
-        check_channels(population, observer, field_recordings=True)
+        check_channels(population, observer, hidden=False)
         calibration = load_calibration(store)
         units = unit_values(population, calibration, identify_on(store), parse_given(given, population.unit_ids, known))
         phase = None if calibration is None else calibration.spec.parameter
-        return cls(observer, population, *_settled(units, observer, population, track, phase))
+        return cls(observer, population, units.values, units.sources)._tracking(units.reasons, track, phase)
+
+    def _tracking(self, reasons: Mapping[str, str], track: str | None, phase: str | None) -> FieldRecordings:
+        """Return the same with parameters that are followed, by option or since they are unknown."""
+        unknown = {u: [p for p in self.observer.lifting.parameters if p not in v] for u, v in self.values.items()}
+        name = track or next((p for missing in unknown.values() for p in missing), "")
+        values, sources, followed = {u: dict(v) for u, v in self.values.items()}, dict(self.sources), set[str]()
+        for unit, missing in unknown.items():
+            if track is None and not missing:
+                continue
+            if set(missing) - {name} or not _trackable(self.observer, name):
+                reason = reasons.get(unit, "it was not calibrated.")
+                loop = "a phase-locked loop either, which needs one unknown parameter and an observer without delays"
+                follow = f"It cannot be followed by {loop}; give it, --parameter {unit}.{name}=VALUE."
+                raise IdentificationError(f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} {follow}")
+            source = f"value that is {sources.get(unit)}"
+            if name in missing:
+                source = "value of the smallest innovation" if name == phase else "value of the nominal unit"
+            if name in missing and name == phase:
+                values[unit][name] = self._start(unit, name)
+            sources[unit] = f"tracked from the {source}"
+            followed.add(unit)
+        return replace(self, values=values, sources=sources, followed=frozenset(followed), name=name or None)
+
+    def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
+        """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
+        chosen, seen = list[EpisodeKey](), 0
+        for key in self.population.keys(unit)[:_BATCH]:
+            if seen < samples:
+                chosen, seen = [*chosen, key], seen + len(self.population.read(key))
+        values = self.values[unit]
+        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, samples)
+        step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
+        signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
+        coarse = least_innovation(*signals, np.arange(phases) * step)
+        return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
     def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
-        """Read episodes, some at a time."""
+        """Read episodes, long ones one by one, so that memory does not grow with their number."""
         keys = keys or self.population.episodes
         values = {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
-        for start in range(0, len(keys), _BATCH):
-            yield arriving(self.observer, self.population, keys[start : start + _BATCH], values)
+        start, count = 0, 1
+        while start < len(keys):
+            batch = arriving(self.observer, self.population, keys[start : start + count], values)
+            start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
+            yield batch
 
-    def estimates(self, found: Arriving) -> tuple[Array, Array | None, Bits]:
+    def estimates(self, arrived: Arriving) -> tuple[Array, Array | None, Bits]:
         """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
-        observer, units, n = self.observer, found.batch.units, len(self.observer.recorded)
-        estimates, status = np.empty((*found.y.shape[:2], n)), sample_status(observer, found.y, found.u)
-        others, rows = (
-            [i for i, unit in enumerate(units) if (unit in self.followed) is wanted] for wanted in (False, True)
-        )
+        observer, n, units = self.observer, len(self.observer.recorded), arrived.batch.units
+        estimates, status = np.empty((*arrived.y.shape[:2], n)), sample_status(observer, arrived.y, arrived.u)
+        rows = [i for i, unit in enumerate(units) if unit in self.followed]
+        others = [i for i in range(len(units)) if i not in rows]
         if others:
-            parameters = found.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, found.y[:, others], found.u[:, others], parameters)
+            parameters = arrived.parameters(observer, others)
+            x, status[:, others] = run_with_status(observer, arrived.y[:, others], arrived.u[:, others], parameters)
             estimates[:, others] = x[..., :n]
         if self.name is None:
             return estimates, None, status
-        followed = np.tile(found.batch.parameters[self.name], (len(found.y), 1))
+        followed = np.tile(arrived.batch.parameters[self.name], (len(arrived.y), 1))
         if rows:
-            tracked = track_parameter(
-                observer, found.y[:, rows], found.u[:, rows], found.parameters(observer, rows), self.name
-            )
+            parameters = arrived.parameters(observer, rows)
+            tracked = track_parameter(observer, arrived.y[:, rows], arrived.u[:, rows], parameters, self.name)
             estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
             status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
         return estimates, followed, status
 
-    def count_status(self, found: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
+    def count_status(self, arrived: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
         """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
-        status = sample_status(self.observer, found.y, found.u) if status is None else status
-        for i, (unit, length) in enumerate(zip(found.batch.units, found.batch.lengths, strict=True)):
+        status = sample_status(self.observer, arrived.y, arrived.u) if status is None else status
+        for i, (unit, length) in enumerate(zip(arrived.batch.units, arrived.batch.lengths, strict=True)):
             of_unit = counts.setdefault(unit, {})
             for bit in SampleStatus:
                 if number := int(np.count_nonzero(status[:length, i] & bit)):
                     of_unit[str(bit.name)] = of_unit.get(str(bit.name), 0) + number
-
-
-def _settled(
-    units: UnitValues, observer: Observer, population: Population, track: str | None, phase: str | None
-) -> tuple[dict[str, dict[str, float]], dict[str, str], frozenset[str], str | None]:
-    """Return the values, sources and the units whose parameter is followed, with its name; refuse what is not known."""
-    sources, followed = dict(units.sources), set()
-    values = {unit: dict(own) for unit, own in units.values.items()}
-    unknown = {unit: [p for p in observer.lifting.parameters if p not in own] for unit, own in values.items()}
-    name = track or next((p for missing in unknown.values() for p in missing), "")
-    for unit, missing in unknown.items():
-        if track is None and not missing:
-            continue
-        if set(missing) - {name} or not _trackable(observer, name):
-            reason = units.reasons.get(unit, "it was not calibrated.")
-            loop = "a phase-locked loop either, which needs one unknown parameter and an observer without delays"
-            follow = f"It cannot be followed by {loop}; give it, --parameter {unit}.{name}=VALUE."
-            raise IdentificationError(f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} {follow}")
-        source = f"value that is {sources.get(unit)}"
-        if name in missing and name == phase:
-            values[unit][name] = _start(observer, population, unit, values[unit], name)
-            source = "value of the smallest innovation"
-        elif name in missing:
-            source = "value of the nominal unit"
-        sources[unit] = f"tracked from the {source}"
-        followed.add(unit)
-    return values, sources, frozenset(followed), name if followed else None
 
 
 def _trackable(observer: Observer, name: str) -> bool:
@@ -136,16 +271,3 @@ def _trackable(observer: Observer, name: str) -> bool:
     except ConfigError:
         return False
     return True
-
-
-def _start(observer: Observer, population: Population, unit: str, own: dict[str, float], name: str) -> float:
-    """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
-    seen = 0
-    chosen: list[EpisodeKey] = []
-    for key in population.keys(unit)[:_BATCH]:
-        if seen < _SEEN:
-            chosen, seen = [*chosen, key], seen + len(population.read(key))
-    found, step = arriving(observer, population, tuple(chosen), {unit: own}, _SEEN), 2 * np.pi / _PHASES
-    asked = (observer, found.y, found.u, found.batch.lengths, {**observer.parameters, **own}, name)
-    coarse = least_innovation(*asked, np.arange(_PHASES) * step)
-    return float(np.mod(least_innovation(*asked, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))

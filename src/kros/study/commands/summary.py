@@ -51,7 +51,7 @@ def list_run(run: Path) -> list[str]:
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
         if store.is_kept("metrics.json"):
-            result = RunResult(store.folder, read_json(store.path("metrics.json")), ())
+            result = RunResult(store.folder, read_json(store.path("metrics.json")))
             return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]

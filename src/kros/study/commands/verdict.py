@@ -10,7 +10,6 @@ from xml.sax.saxutils import quoteattr
 
 from ...core.errors import ConfigError
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
-from .innovation import level_text
 
 
 class Verdict(StrEnum):
@@ -47,8 +46,8 @@ def worst(rows: Sequence[dict[str, Any]]) -> Verdict:
 def verdict_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the word and the name of every unit, each followed by an indented line for every condition."""
     lines = []
-    for unit, own in by_unit(rows).items():
-        lines += [f"{worst(own):<9}  {unit}", *(f"  {row['condition']}: {row['reason']}" for row in own)]
+    for unit, of_unit in by_unit(rows).items():
+        lines += [f"{worst(of_unit):<9}  {unit}", *(f"  {row['condition']}: {row['reason']}" for row in of_unit)]
     return lines
 
 
@@ -61,12 +60,12 @@ def require_folder(path: Path) -> None:
 def junit_text(rows: Sequence[dict[str, Any]]) -> str:
     """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
     units, cases = by_unit(rows), []
-    for unit, own in units.items():
-        tag = {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}.get(worst(own))
-        text = "; ".join(f"{row['condition']}: {row['reason']}" for row in own)
-        inside = "" if tag is None else f"<{tag} type={_quoted(worst(own))} message={_quoted(text)}/>"
+    for unit, of_unit in units.items():
+        tag = {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}.get(worst(of_unit))
+        text = "; ".join(f"{row['condition']}: {row['reason']}" for row in of_unit)
+        inside = "" if tag is None else f"<{tag} type={_quoted(worst(of_unit))} message={_quoted(text)}/>"
         cases.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
-    counts = {tag: sum(worst(own) is verdict for own in units.values()) for tag, verdict in _COUNTED.items()}
+    counts = {tag: sum(worst(of_unit) is verdict for of_unit in units.values()) for tag, verdict in _COUNTED.items()}
     numbers = f'tests="{len(units)}" failures="{counts["failures"]}" errors="{counts["errors"]}"'
     head = f'<testsuite name="kros check" {numbers}>'
     return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *cases, "</testsuite>", ""])
@@ -100,7 +99,8 @@ def _reasons(row: dict[str, Any]) -> list[str]:
         reasons.append(f"no score without {', '.join(row['missing'])}")
     if row.get("level_db") is not None:
         few = f", from {row['level_units']} units of which {FEWEST_UNITS} are needed"
-        reasons.append(f"innovation {level_text(row)}{few if row['level_units'] < FEWEST_UNITS else ''}")
+        place = f"{abs(row['level_db']):.2f} dB {'over' if row['level_db'] > 0 else 'below'} the monitor's bound"
+        reasons.append(f"innovation {place}{few if row['level_units'] < FEWEST_UNITS else ''}")
     elif "missing" in row:
         reasons.append("the deployed observer has no monitor, or no sample can be judged")
     if row["left_out"]:

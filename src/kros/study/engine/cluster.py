@@ -88,8 +88,8 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
             raise KrosError(
-                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, which has the "
-                "same path on every worker."
+                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, the same "
+                "path on every worker."
             ) from error
 
 

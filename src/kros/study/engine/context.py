@@ -10,7 +10,7 @@ from ...core.artifacts import load_artifact
 from ...core.work import Work
 from ...data.population import Population
 from ...data.survey import RecordingFacts
-from ...identify import PhaseSpec
+from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...lifting import Lifting
@@ -47,6 +47,11 @@ class Context:
     def phase_spec(self) -> PhaseSpec | None:
         """What is calibrated, if anything."""
         return resolve_phase(self.config.calibrate, self.population, self.lifting)
+
+    @cached_property
+    def calibration(self) -> PhaseCalibration | None:
+        """What the calibrate stage left, where the lifting has a phase."""
+        return None if self.phase_spec is None else PhaseCalibration.load(self.store.path("calibration"))
 
     @cached_property
     def identified(self) -> IdentifiedModels:

@@ -5,55 +5,34 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
-from threading import Event, Lock, Thread
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from ...core.work import Progress
 
 
 class Lines(Progress):
-    """One line a finished stage, and one every ten seconds where there is no other."""
+    """One line a finished stage, and one every ten seconds while a stage advances."""
 
     def __init__(self, every_s: float = 10.0) -> None:
-        self._every_s, self._lock, self._over = every_s, Lock(), Event()
+        self._every_s, self._said = every_s, time.monotonic()
         self._stage, self._done, self._began = "", 0, 0.0
         self._total: int | None = None
-        self._thread = Thread(target=self._beat, name="says how far it is", daemon=True)
-        self._said = time.monotonic()
-        self._thread.start()
 
     def start(self, stage: str, total: int | None) -> None:
         """Remember what runs."""
-        with self._lock:
-            self._stage, self._total, self._done, self._began = stage, total, 0, time.monotonic()
+        self._stage, self._total, self._done, self._began = stage, total, 0, time.monotonic()
 
     def advance(self) -> None:
         """Count."""
-        with self._lock:
-            self._done += 1
+        self._done += 1
+        if time.monotonic() - self._said >= self._every_s:
+            of = f" of {self._total}" if self._total else ""
+            self._say(f"  {self._stage} ... {self._done}{of}, {time.monotonic() - self._began:.0f} s")
 
     def finish(self, stage: str, seconds: float, skipped: bool) -> None:
         """Write one line."""
-        with self._lock:
-            self._stage = ""
-            self._say(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}")
-
-    def close(self) -> None:
-        """Say nothing more."""
-        self._over.set()
-        self._thread.join()
-
-    def _beat(self) -> None:
-        while not self._over.wait(max(self._said + self._every_s - time.monotonic(), 0.01)):
-            with self._lock:
-                if time.monotonic() - self._said < self._every_s:
-                    continue
-                if self._stage:
-                    count = f" {self._done} of {self._total}," if self._total else ""
-                    self._say(f"  {self._stage} ...{count} {time.monotonic() - self._began:.0f} s")
-                else:
-                    self._said = time.monotonic()
+        self._say(_finished(stage, seconds, skipped))
 
     def _say(self, line: str) -> None:
         self._said = time.monotonic()
@@ -81,12 +60,16 @@ class Bars(Progress):
     def finish(self, stage: str, seconds: float, skipped: bool) -> None:
         """Replace the bar by a line."""
         self._clear()
-        self._display.console.print(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}", highlight=False)
+        self._display.console.print(_finished(stage, seconds, skipped), highlight=False)
 
     def _clear(self) -> None:
         if self._task is not None:
             self._display.remove_task(self._task)
             self._task = None
+
+
+def _finished(stage: str, seconds: float, skipped: bool) -> str:
+    return f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}"
 
 
 @contextmanager
@@ -95,8 +78,7 @@ def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
     if quiet or asks:
         yield Progress()
     elif not sys.stderr.isatty():
-        with closing(Lines()) as lines:
-            yield lines
+        yield Lines()
     else:
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn

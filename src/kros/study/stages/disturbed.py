@@ -1,4 +1,4 @@
-"""Observers of a study on disturbed measurements: which ones, on which episodes, and what the records say about them."""
+"""Observers of a study on disturbed measurements: which ones, on which episodes, and their errors."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey, Population
-from ...design.estimators import Baseline
+from ...design.baselines import Baseline
 from ...design.task import split_name
 from ...evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
 from ...evaluate.disturb import Measured
@@ -23,22 +23,22 @@ from ...observer.sensor import Sensors
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]
-FEW_UNITS, FEW_SAMPLES = 3, 3_000
+Errors = Mapping[str, tuple[Array, Sequence[int] | None]]  # by observer, with the states that it estimates
 _SIDE_BY_SIDE = 8  # observers of one piece of work: few enough to keep all processes busy
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """Disturbed runs of a study."""
+    """Episodes of a study on which measurements are disturbed."""
 
     population: Population
     keys: tuple[EpisodeKey, ...]
-    samples: int
-    units: dict[str, dict[str, float]]
+    units: Mapping[str, dict[str, float]]
     measured: tuple[int, ...]
     disturbances: tuple[Disturbance, ...]
-    names: tuple[str, ...]
+    kind: str  # of the models whose observers run
     sensor: Sensors = field(default_factory=dict)
+    samples: int = 3_000  # of an episode, at most
 
     def episodes(self) -> DisturbedEpisodes:
         """Read the episodes."""
@@ -48,10 +48,9 @@ class Trial:
 
     def errors_of_observers(self, observers: Sequence[Observer]) -> list[Array]:
         """Return the errors of observers that can run side by side, each of shape (1 + disturbance, episode, n)."""
-        lifted = bool(observers[0].lifting.parameters)
 
-        def run(given: Measured, u: Array) -> Array:
-            return run_observers(observers, given.y, u, given.parameters if lifted else None)
+        def run(measured: Measured, u: Array) -> Array:
+            return run_observers(observers, measured.y, u, observers[0].own(measured.parameters))
 
         return list(self.episodes().errors(run, len(observers)))
 
@@ -60,72 +59,53 @@ class Trial:
         episodes = self.episodes()
         keys = episodes.batch.keys
 
-        def run(given: Measured, u: Array) -> list[Array]:
-            return [baseline.estimate(keys * (given.y.shape[1] // len(keys)), given.y, u, given.parameters)]
+        def run(measured: Measured, u: Array) -> list[Array]:
+            return [baseline.estimate(keys * (measured.y.shape[1] // len(keys)), measured.y, u, measured.parameters)]
 
         return np.asarray(episodes.errors(run)[0])
 
+    def content(self, errors: Errors) -> dict[str, Any]:
+        """Return what the records say."""
+        episodes, states = self.episodes(), self.population.states
+        rows = [
+            robustness_rows(name, error, episodes, states, estimated) for name, (error, estimated) in errors.items()
+        ]
+        seconds = self.samples * self.population.sample_period_s
+        units = list(dict.fromkeys(k.unit for k in self.keys))
+        return {"units": units, "seconds": seconds, "robustness": [row for part in rows for row in part]}
+
 
 def make_trial(
-    context: Context, keys: Sequence[EpisodeKey], units: dict[str, dict[str, float]], roles: Mapping[str, str]
+    context: Context, keys: Sequence[EpisodeKey], units: Mapping[str, dict[str, float]], roles: Mapping[str, str]
 ) -> Trial | None:
-    """Return what is run on disturbed measurements; None where the study asks for nothing of it."""
-    if not context.config.evaluate.robustness:
+    """Return what runs on disturbed measurements of a few units; None where the study asks for nothing of it."""
+    few, config = 3, context.config
+    firsts = {k.unit: k for k in reversed(keys) if k.condition == context.facts.identify_on}
+    chosen = sorted((k for u, k in firsts.items() if roles[u] != "outlier"), key=keys.index)
+    chosen = sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:few]
+    if not config.evaluate.robustness or not chosen:
         return None
-    record = context.observers_record
-    kind = split_name(str(record["deployed"]))[0]
-    names = tuple(name for name in record["names"] if split_name(name)[0] == kind)
-    models = context.identified.models()
-    firsts = {(k.unit, k.condition): k for k in reversed(keys) if roles[k.unit] != "outlier"}
-    chosen = [k for k in keys if firsts.get((k.unit, k.condition)) == k and k.condition == context.facts.identify_on]
-    given = tuple(sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:FEW_UNITS])
-    if not given:
-        return None
-    calibrated = any(units.values())
-    disturbances = tuple(standard_disturbances([k for k in Kind if calibrated or k is not Kind.PHASE]))
-    return Trial(
-        context.population, given, FEW_SAMPLES, units, models.measured, disturbances, names, context.config.sensor
-    )
+    disturbances = tuple(standard_disturbances([k for k in Kind if any(units.values()) or k is not Kind.PHASE]))
+    kind, measured = split_name(str(context.observers_record["deployed"]))[0], context.identified.models().measured
+    return Trial(context.population, tuple(chosen), units, measured, disturbances, kind, config.sensor)
 
 
-def run_disturbed(
-    context: Context,
-    trial: Trial | None,
-    observers: Mapping[str, Observer],
-    baselines: Mapping[str, tuple[Array, Sequence[int] | None]],
-) -> None:
-    """Run the observers of a trial on disturbed measurements, and save what comes out."""
+def run_disturbed(context: Context, trial: Trial | None, observers: Mapping[str, Observer], baselines: Errors) -> None:
+    """Run the observers of a trial on disturbed measurements, and save their errors."""
     if trial is None:
         return
-    folder = context.store.draft("disturbed")
-    chosen = {name: observer for name, observer in observers.items() if name in trial.names}
+    chosen = {name: observer for name, observer in observers.items() if split_name(name)[0] == trial.kind}
     groups = alike(chosen.values())
-    done = context.work.run("disturb", [partial(trial.errors_of_observers, group) for group in groups])
+    results = context.work.run("disturb", [partial(trial.errors_of_observers, group) for group in groups])
     by_name = {
-        o.name: found
-        for group, errors in zip(groups, done, strict=True)
-        for o, found in zip(group, errors, strict=True)
+        o.name: one for group, errors in zip(groups, results, strict=True) for o, one in zip(group, errors, strict=True)
     }
     errors = {name: (by_name[observer.name], None) for name, observer in chosen.items()} | dict(baselines)
-    save_artifact(folder, "disturbed", contents(trial, errors))
-
-
-def contents(trial: Trial, errors: Mapping[str, tuple[Array, Sequence[int] | None]]) -> dict[str, Any]:
-    """Return what the records say."""
-    episodes, channels = trial.episodes(), trial.population.states
-    return {
-        "units": list(dict.fromkeys(k.unit for k in trial.keys)),
-        "seconds": trial.samples * trial.population.sample_period_s,
-        "robustness": [
-            row
-            for name, (found, own) in errors.items()
-            for row in robustness_rows(name, found, episodes, channels, own)
-        ],
-    }
+    save_artifact(context.store.draft("disturbed"), "disturbed", trial.content(errors))
 
 
 def alike(observers: Iterable[Observer]) -> list[list[Observer]]:
-    """Return observers in groups that can run side by side: of one lifting, with the same parameters, measured states and inputs."""
+    """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
     groups: list[list[Observer]] = []
     for observer in observers:
         key = _model_of(observer)

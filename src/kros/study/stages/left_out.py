@@ -1,10 +1,11 @@
 """Stage: every unit estimated by observers that were made without it.
 
-The pooled units are parted into folds. For every fold the study up to its observers is made once more in a folder of its own, by the same
-stages, from the recordings of all other units; what comes out runs on the test episodes of the fold's own units in all conditions. The phase of
-such a unit comes from its own training episodes, on the branch of the fold's population, as that of any new machine.
+The pooled units are split into folds. For every fold the same stages design observers in a separate folder, from the
+recordings of all other units. These observers run on the test episodes of the fold's units in all conditions. The phase
+of such a unit comes from its training episodes, on the branch of the fold's population, as that of any new machine.
 
-Units in reserve are a fold that the study itself is made without: they meet the deployed observer alone, and bound what the next unit's errors are.
+Units in reserve are a fold that the study itself does not use: only the deployed observer runs on them, and its errors
+bound those of the next unit.
 """
 
 from __future__ import annotations
@@ -28,21 +29,12 @@ from ...evaluate.next_unit import fewest_units
 from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
-from ..config import RequireConfig, Stage, StudyConfig
+from ..config import Stage, StudyConfig
 from ..engine.context import Context
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
-from . import calibrate
-from .evaluate import (
-    TestOutcome,
-    UnitParameters,
-    band_hz,
-    error_rows,
-    estimation,
-    evaluate_observers,
-    facts_of,
-    outcomes,
-)
+from .evaluate import band_hz, estimation, facts_of, outcomes
+from .held_out import HeldOut, Outcome
 from .read import FEWEST
 
 log = logging.getLogger(__name__)
@@ -50,6 +42,7 @@ FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"
 NEXT = "next_unit"
 _MEASURES = ("error_percent", "rms")
 Rows = list[dict[str, Any]]
+UnitParameters = dict[str, dict[str, float]]
 
 
 def wanted(config: StudyConfig) -> bool:
@@ -72,14 +65,14 @@ def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     parts = [list(units[fold::folds]) for fold in range(folds)]
     if len(units) - len(parts[0]) < FEWEST:
         raise ConfigError(
-            f"evaluate.folds = {folds}: leaves {len(units) - len(parts[0])} of {len(units)} units to learn from, and a population needs {FEWEST}; "
-            "ask for more folds, or record more units."
+            f"evaluate.folds = {folds}: leaves {len(units) - len(parts[0])} of {len(units)} units to learn from, and a "
+            f"population needs {FEWEST}; ask for more folds, or record more units."
         )
     return parts
 
 
 def run(context: Context) -> None:
-    """Make the study once for every fold, run the deployed observer on the units in reserve, and collect what observers do on units they do not know."""
+    """Make the study once for every fold, and run the deployed observer on the units in reserve."""
     models, wanted_folds = context.identified.models(), context.config.evaluate.folds
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], wanted_folds) if wanted_folds else []
     for surplus in context.store.runs(FOLDER):
@@ -93,25 +86,25 @@ def run(context: Context) -> None:
 
 def results(context: Context) -> dict[str, Any]:
     """Return what the stage adds to the metrics."""
-    asked = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
-    return {name: load_artifact(context.store.path(name), name)[0] for name, n in asked.items() if n}
+    parts = {FOLDER: context.config.evaluate.folds, NEXT: context.config.evaluate.reserve}
+    return {name: load_artifact(context.store.path(name), name)[0] for name, n in parts.items() if n}
 
 
 def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
     """Make the study once for every fold."""
-    found = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
+    results = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
     content = {
         "folds": folds,
         "errors": "empirical",  # of these units: folds share what they learn from, so nothing follows for the next one
-        "failed": {str(number): fold["failed"] for number, fold in enumerate(found) if "failed" in fold},
-        "rows": [{"fold": number, **row} for number, fold in enumerate(found) for row in fold.get("rows", [])],
-        "observers": facts_of_folds([fold.get("observers", {}) for fold in found]),
+        "failed": {str(number): fold["failed"] for number, fold in enumerate(results) if "failed" in fold},
+        "rows": [{"fold": number, **row} for number, fold in enumerate(results) for row in fold.get("rows", [])],
+        "observers": facts_of_folds([fold.get("observers", {}) for fold in results]),
     }
     save_artifact(context.store.draft(FOLDER), KIND, content)
 
 
 def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
-    """Make the study without some units, and run its observers on these; a fold that fails is a result too, with its reason."""
+    """Make the study without some units, and run its observers on these; return the reason where it fails."""
     progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
     store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
     context = Context(without(whole, held), store, replace(whole.work, progress=progress))
@@ -125,7 +118,7 @@ def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> di
 
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
-    """Return the study on the prepared recordings of all other units, which hands nothing over and so requires nothing."""
+    """Return the study on the prepared recordings of all other units."""
     config = whole.config
     prepared = {
         "source": recordings_path(whole.store.folder).absolute(),
@@ -136,11 +129,8 @@ def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     data = config.data.model_copy(
         update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)}
     )
-    observer = config.observer.model_copy(update={"deployed": None})
-    changes: dict[str, Any] = {"data": data, "observer": observer, "require": RequireConfig()}
+    changes: dict[str, Any] = {"data": data}
     changes["evaluate"] = config.evaluate.model_copy(update={"reserve": 0})
-    if config.uncertainty.nominal in held:
-        changes["uncertainty"] = config.uncertainty.model_copy(update={"nominal": None})
     return config.model_copy(update=changes)
 
 
@@ -150,15 +140,13 @@ def absent(whole: Context) -> tuple[str, ...]:
 
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
-    """Run what a fold made on the test episodes of the units it does not know."""
-    facts, population = whole.facts, whole.population.select(held)
+    """Run the observers of a fold on the test episodes of the units that took no part in it."""
+    facts, population, record = whole.facts, whole.population.select(held), context.observers_record
     units, keys = held_parameters(context, population, facts), tuple(k for k in facts.test if k.unit in held)
-    results = outcomes(context, estimation(context, population, keys, units))
-    record = context.observers_record
-    band, rows = band_hz(whole), []
-    for name, outcome in results.items():
-        if isinstance(outcome, TestOutcome):
-            rows += error_rows(name, outcome, keys, dict.fromkeys(held, "left_out"), population.states, band)
+    episodes = HeldOut(population, keys, units, sensor=context.config.sensor)
+    results, band, roles = outcomes(context, estimation(context, episodes)), band_hz(whole), dict.fromkeys(held, FOLDER)
+    estimates = {name: outcome for name, outcome in results.items() if isinstance(outcome, Outcome)}
+    rows = [row for item in estimates.items() for row in episodes.rows(*item, roles, band)]
     others = {name: facts_of(name, outcome) for name, outcome in results.items() if name not in record["facts"]}
     parameters = {unit: values for unit, values in units.items() if values}
     content = {"units": held, "parameters": parameters, "rows": rows, "observers": {**record["facts"], **others}}
@@ -166,44 +154,34 @@ def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None
 
 
 def held_parameters(context: Context, population: Population, facts: RecordingFacts) -> UnitParameters:
-    """Return the lifting parameters of the units of a population that a study does not know, as `kros estimate` finds them."""
-    calibration, held = calibrate.load(context), population.unit_ids
+    """Return the lifting parameters of units that took no part in a study, as `kros estimate` finds them."""
+    calibration, held = context.calibration, population.unit_ids
     if calibration is None:
         return {unit: {} for unit in held}
     tasks = [(population.select([u]), calibration_keys(facts, u), calibration.spec) for u in held]
     segments = context.work.map("calibrate", segments_of, tasks)
-    return {
-        u: {calibration.spec.parameter: calibration.calibrate(found, u).phase_rad}
-        for u, found in zip(held, segments, strict=True)
-    }
+    phases = {u: calibration.calibrate(part, u).phase_rad for u, part in zip(held, segments, strict=True)}
+    return {unit: {calibration.spec.parameter: phase} for unit, phase in phases.items()}
 
 
 def next_unit(context: Context) -> dict[str, Any]:
-    """Run the deployed observer on the units in reserve; return their errors, and what these say about the next unit in every condition."""
-    config, facts = context.config.evaluate, context.facts
-    deployed = context.observers_record["deployed"]
+    """Run the deployed observer on the units in reserve; return what their errors say about the next unit."""
+    config, facts, population = context.config.evaluate, context.facts, context.population
+    deployed, evaluated = context.observers_record["deployed"], context.evaluation["rows"]
     rows, failed = reserve_rows(context, deployed)
-    evaluated: Rows = context.evaluation["rows"]
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
-    hidden = [c for c in context.population.states if c not in context.population.measured] or list(
-        context.population.states
-    )
-    content: dict[str, Any] = {
-        "reserve": len(facts.reserve),
-        "units": facts.reserve,
-        "confidence": config.confidence,
-        "observer": deployed,
+    hidden = [c for c in population.states if c not in population.measured] or list(population.states)
+    bounds = {
+        c: bounds_of(_of_condition(rows, c), _of_condition(known, c), hidden, config.confidence)
+        for c in population.conditions
     }
-    found = {
-        c: bounds_of(of_condition(rows, c), of_condition(known, c), hidden, config.confidence)
-        for c in context.population.conditions
-    }
-    content |= {"jointly": True, "condition": facts.identify_on, **found.pop(facts.identify_on), "others": found}
-    return content | {"rows": rows, "failed": failed}
+    content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence}
+    content |= {"observer": deployed, "jointly": True, "condition": facts.identify_on, **bounds.pop(facts.identify_on)}
+    return content | {"others": bounds, "rows": rows, "failed": failed}
 
 
 def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
-    """Return the deployed observer's errors on the test episodes of the units in reserve, infinite for one that cannot be calibrated, and the reasons."""
+    """Return the errors on the units in reserve, infinite where one cannot be calibrated, and the reasons."""
     whole, facts = recordings_of(context.store.folder).select(context.facts.reserve), context.facts
     splits = split_episodes(whole, context.config.split.test).values()
     train, test = (tuple(k for split in splits for k in getattr(split, part)) for part in ("train", "test"))
@@ -215,57 +193,52 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
             known |= held_parameters(context, whole.select([unit]), facts)
         except IdentificationError as error:
             failed[unit] = str(error)
-    keys, roles = tuple(k for k in test if k.unit in known), dict.fromkeys(facts.groups, "reserve")
-    rows: Rows = []
+    keys, rows = tuple(k for k in test if k.unit in known), Rows()
     if keys:
         observer = Observer.load(context.store.path("observers", "deployed.json"))
-        (outcome,) = evaluate_observers([observer], whole, keys, known, (), context.config.sensor)
-        rows = error_rows(deployed, outcome, keys, roles, whole.states, band_hz(context))
+        episodes = HeldOut(whole, keys, known, sensor=context.config.sensor)
+        (outcome,) = episodes.observers([observer])
+        rows = episodes.rows(deployed, outcome, dict.fromkeys(facts.groups, "reserve"), band_hz(context))
     lost = dict.fromkeys((k.unit, k.condition) for k in test if k.unit in failed)
     base = {"observer": deployed, "role": "reserve"} | dict.fromkeys(_MEASURES, float("inf"))
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
 
 
-def of_condition(rows: Rows, condition: str) -> Rows:
-    """Return the rows of a condition."""
+def _of_condition(rows: Rows, condition: str) -> Rows:
     return [row for row in rows if row["condition"] == condition]
 
 
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> dict[str, Any]:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
-    own = {(c, m): np.array([r[m] for r in known if r["channel"] == c], float) for c in channels for m in _MEASURES}
-    scale = {place: float(values.mean()) if values.size else np.nan for place, values in own.items()}
+    places = [(c, m) for c in channels for m in _MEASURES]
+    scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
     usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
     units, needed = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence)
+    reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
+    bound = None
     if not usable:
-        return {"bounds": None, "reason": "the observer has no finite error on the units that it was made from"}
-    if len(units) < needed:
-        return {
-            "bounds": None,
-            "reason": f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}",
-        }
-    errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-    bound = next_unit_bound(
-        [[errors[u, c, m] for c, m in usable] for u in units], [scale[p] for p in usable], confidence
-    )
+        reason = "the observer has no finite error on the units that it was made from"
+    elif len(units) < needed:
+        reason = f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"
+    else:
+        errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
+        of_units = [[errors[u, c, m] for c, m in usable] for u in units]
+        bound = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
     if bound is None or not np.isfinite(bound).all():
-        return {
-            "bounds": None,
-            "reason": "the observer diverges on too many of the units in reserve, or they cannot be calibrated",
-        }
+        return {"bounds": None, "reason": reason}
     values = dict(zip(usable, bound.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 
 
-def facts_of_folds(found: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
+def facts_of_folds(folds: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, Any]]:
     """Return what all folds together say about every observer."""
     facts = {}
-    for name in dict.fromkeys(name for fold in found for name in fold):
-        entries = [fold[name] for fold in found if name in fold]
-        made = [e for e in entries if e.get("status") != "failed"]
-        observers = [e for e in made if "relift_certified" in e]
+    for name in dict.fromkeys(name for fold in folds for name in fold):
+        entries = [fold[name] for fold in folds if name in fold]
+        designed = [e for e in entries if e.get("status") != "failed"]
+        observers = [e for e in designed if "relift_certified" in e]
         facts[name] = {
-            "made": len(made),
+            "made": len(designed),
             "orders": sorted({e["order"] for e in observers}),
             "relift_certified": sum(bool(e["relift_certified"]) for e in observers) if observers else None,
             "robust": sum(is_robust(e) for e in observers) if observers else None,

@@ -1,4 +1,4 @@
-"""Stage: read, prepare and check all recordings; what is not kros's own format yet is written to the run folder in it."""
+"""Stage: read, prepare and check all recordings; those in other formats are copied to the run folder as Parquet."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from ...data.steps import parse_steps
 from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
-from ...observer.limits import limits_of
 from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ..config import StudyConfig
@@ -22,7 +21,7 @@ FEWEST = 2  # units that a population is learned from
 
 
 def open_source(config: StudyConfig, given: Population | None = None) -> Population:
-    """Open the study's recordings, or take those that are given, lazily, prepared and without the units that are excluded."""
+    """Open the study's recordings, or take those that are given, prepared and without excluded units."""
     data = config.data
     if given is not None:
         if data.csv is not None:
@@ -45,14 +44,14 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
 
 
 def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
-    """Return the units in reserve: drawn from those of the population that the study does not name, by their places alone."""
-    n, named = config.evaluate.reserve, {config.uncertainty.nominal, *config.load.units}
+    """Return the units in reserve, drawn from those that the study does not name, by their places alone."""
+    n, named = config.evaluate.reserve, set(config.load.units)
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
         raise ConfigError(
-            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} of them named by the study, and a population is learned from at "
-            f"least {FEWEST}; reserve fewer, or record more units."
+            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
+            f"a population needs at least {FEWEST}; reserve fewer, or record more units."
         )
     return draw_reserve(free, n)
 
@@ -71,7 +70,6 @@ def check_source(config: StudyConfig, population: Population, single_allowed: bo
         config.calibrate, population, resolve_lifting(config.lifting, config.calibrate, population, config.split.test)
     )
     require_measured(config.sensor, population.measured)
-    limits_of(config.limits, {}, population.states)
 
 
 def run(context: Context) -> None:

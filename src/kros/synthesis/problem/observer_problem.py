@@ -33,7 +33,6 @@ from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
-from ...uncertainty.weights.cover import Structure
 from ..assumptions import require_detectable
 from ..generalized_plant import GeneralizedPlant, split
 from ..result import Injection
@@ -155,14 +154,10 @@ class ObserverProblem:
         Raises
         ------
         SynthesisError
-            For entrywise weights, and a nominal that is none of the models' units or not the model that the set
-            surrounds.
+            When the nominal is none of the models' units, or not the model that the set surrounds.
         DimensionError
             When the noise does not fit the measured channels.
         """
-        if uncertain.weight.structure is Structure.ENTRYWISE:
-            problem = "the weights are entrywise, made for a diagonal perturbation, and synthesis is for a full one"
-            raise SynthesisError(f"Observer problem: {problem}; quantify with diagonal weights.")
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
             problem = f"the nominal {unit!r} is none of the models' units"

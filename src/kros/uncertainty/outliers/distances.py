@@ -9,7 +9,7 @@ every row and column of the residual counts alike, at every frequency by itself.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,7 @@ from ..forms import Form, residual
 
 Array = npt.NDArray[Any]
 
-MOST_NOMINALS = 64
-MOST_PAIRS = MOST_NOMINALS * 4096  # beyond, there are fewer nominals, but
-FEW_NOMINALS = 16  # at least
+_MOST_NOMINALS = 64
 _SMOOTHING_DECADES = 1.0 / 3.0
 _SINKHORN = 50
 _SMALLEST = 1e-12  # relative to the largest typical entry of row and column
@@ -36,11 +34,15 @@ class Distances:
     """Distances of all units."""
 
     nominals: Array  # (nominal,): rows of the units that were the nominal in turn
-    # (nominal, unit, frequency), dB: largest singular value of the scaled residual, smoothed; NaN against itself
-    by_nominal: Array
-    levels: Array  # (unit, frequency), dB: the median over the nominals
+    peaks: Array  # (nominal, unit), dB: largest level with one nominal; NaN against itself
+    levels: Array  # (unit, frequency), dB: smoothed singular value of the scaled residual, median over the nominals
     left: Array  # (frequency, p'): typical size of the residual's rows
     right: Array  # (frequency, m'): of its columns
+
+    def joined(self, levels: Array) -> Distances:
+        """Return the distances with one more unit, whose levels (nominal, frequency) are known; it comes last."""
+        peaks = np.hstack([self.peaks, levels.max(axis=1)[:, None]])
+        return replace(self, peaks=peaks, levels=np.vstack([self.levels, np.median(levels, axis=0)]))
 
 
 def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
@@ -54,26 +56,17 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
         part = G[:, start : start + step]
         E = np.stack([residual(form, part[k], part) for k in nominals])  # (nominal, unit, frequency, p', m')
         E[_same(part, nominals)] = 0.0
-        scales = typical(_middle(squared(E[~own])))
+        squares = squared(E[~own])
+        middle = np.median(squares, axis=0)
+        equal = middle.max(axis=(1, 2)) == 0  # most pairs are
+        middle[equal] = squares[:, equal].mean(axis=0)
+        scales = typical(middle)
         sigma.append(sigma_max_first(entries_first(E / scales[0][:, :, None] / scales[1][:, None, :])))
         left.append(scales[0])
         right.append(scales[1])
     level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), _LEAST)), freqs_hz)
     level[own] = np.nan
-    return Distances(nominals, level, _median(level, own), np.concatenate(left), np.concatenate(right))
-
-
-def joined(form: Form, known: Distances, rows: Array, nominals: Array, response: Array, freqs_hz: Array) -> Distances:
-    """Return distances of some units of a population, and of one more, which comes last."""
-    there = np.flatnonzero(np.isin(known.nominals, rows))
-    own = scaled_levels(form, nominals[there], response, known, freqs_hz)
-    levels = np.concatenate([known.levels[rows], np.median(own, axis=0)[None]])
-    few = np.unique(
-        np.linspace(0, len(there) - 1, FEW_NOMINALS).round().astype(int)
-    )  # what is said of every nominal by itself is said of these
-    some = there[few]
-    by_nominal = np.concatenate([known.by_nominal[np.ix_(some, rows)], own[few, None]], axis=1)
-    return Distances(np.searchsorted(rows, known.nominals[some]), by_nominal, levels, known.left, known.right)
+    return Distances(nominals, level.max(axis=2), _median(level, own), np.concatenate(left), np.concatenate(right))
 
 
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
@@ -85,19 +78,19 @@ def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances
 def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:
     """Return the entries of units' residuals that are largest for their typical size, each at its own frequency."""
     nominal, perturbed = responses[found.nominals[:, None], rows], responses[units, rows]
-    size = (
-        np.abs(residual(form, nominal, perturbed[None])) / found.left[rows][:, :, None] / found.right[rows][:, None, :]
-    )
-    own = found.nominals[:, None] == units
-    middle = _median(size, own)
+    size = np.abs(residual(form, nominal, perturbed[None]))
+    scaled = size / found.left[rows][:, :, None] / found.right[rows][:, None, :]
+    middle = _median(scaled, found.nominals[:, None] == units)
     entries = [np.unravel_index(int(np.argmax(m)), m.shape) for m in middle]
     return [(int(i), int(j)) for i, j in entries]
 
 
 def typical(squares: Array) -> tuple[Array, Array]:
     """Return left and right scales that bring squared entries to equal row and column sums."""
-    row = _positive(squares.max(axis=2, keepdims=True))
-    column = _positive((squares / row).max(axis=1, keepdims=True))
+    row = squares.max(axis=2, keepdims=True)
+    row[row <= 0] = 1.0
+    column = (squares / row).max(axis=1, keepdims=True)
+    column[column <= 0] = 1.0
     weights = np.maximum(squares / row / column, _SMALLEST)
     left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
     for _ in range(_SINKHORN):
@@ -113,32 +106,19 @@ def balance(responses: Array) -> tuple[Array, Array]:
 
 
 def _nominals(G: Array) -> Array:
-    """All units, or 64 (of thousands fewer) spread evenly over their distances from the entrywise median."""
-    if len(G) <= MOST_NOMINALS:
+    """All units, or 64 spread evenly over their distances from the entrywise median."""
+    if len(G) <= _MOST_NOMINALS:
         return np.arange(len(G))
     middle = np.median(G.real, axis=0) + 1j * np.median(G.imag, axis=0)
     size = np.maximum(np.abs(middle), np.finfo(float).tiny)
     order = np.argsort((np.abs(G - middle) / size).mean(axis=(1, 2, 3)), kind="stable")
-    most = int(np.clip(MOST_PAIRS // len(G), FEW_NOMINALS, MOST_NOMINALS))
-    return np.sort(order[np.linspace(0, len(G) - 1, most).round().astype(int)])
+    return np.sort(order[np.linspace(0, len(G) - 1, _MOST_NOMINALS).round().astype(int)])
 
 
 def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
     return np.stack([np.abs(G - G[k]).max(axis=(2, 3)) <= _EQUAL * np.maximum(size, size[k]) for k in nominals])
-
-
-def _positive(values: Array) -> Array:
-    return np.where(values > 0, values, 1.0)
-
-
-def _middle(squares: Array) -> Array:
-    """Median over the pairs; the mean at frequencies where most pairs are equal."""
-    median = np.median(squares, axis=0)
-    equal = median.max(axis=(1, 2)) == 0
-    median[equal] = squares[:, equal].mean(axis=0)
-    return median
 
 
 def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:

@@ -35,19 +35,20 @@ from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError, DimensionError
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
-from .distances import Distances, balance, distances, joined, scaled_levels
-from .score import FEWEST_UNITS, OutlierScore, Status
-from .scoring import Nominals, scores_of
-from .separation import margins, separate
+from .distances import Distances, balance, distances, largest_entries, scaled_levels
+from .score import FEWEST_UNITS, OutlierScore, Status, room_db
+from .tail import Flags, excesses, margins, separate
 
 Array = npt.NDArray[Any]
 
 FALSE_ALARM_RATE = 1e-2
 _FREQUENCIES = 120
-MANY = 200  # inliers from which on a unit that is scored does not change how they are scaled
 _HALVES_DB = 10 * np.log10(2.0)
 _LEAST_LEVEL = 1e-10  # in amplitude, as distances have it
 _FEWEST = 2  # others that a unit can be compared with
+_PERCENT = 1.0
+_MOST = 12  # units whose changes are tried
+_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +72,6 @@ class OutlierModel:
         Nominal rate per unit.
     extrapolated : bool
         Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone.
-    nominal_ids : tuple of str
-        Units that were the nominal in turn: all, or 64 of them.
-    by_nominal_db : ndarray, shape (nominal, scored unit), dB
-        The excess with one unit as the only nominal, NaN of a unit against itself.
 
     Examples
     --------
@@ -98,8 +95,6 @@ class OutlierModel:
     threshold_db: float
     false_alarm_rate: float
     extrapolated: bool
-    nominal_ids: tuple[str, ...]
-    by_nominal_db: Array
 
     def score(
         self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
@@ -141,31 +136,26 @@ class OutlierModel:
                 f"frequencies, found {G.shape}."
             )
         _require_finite(G[None], (unit,), self.freqs_hz)
-        everyone = np.concatenate([self.responses[rows], (G / self.output_scale[:, None] * self.input_scale)[None]])
-        many = len(self.unit_ids) > MANY
-        found = self._with(rows, everyone[-1]) if many else distances(self.form, everyone, self.freqs_hz)
-        last = np.arange(len(everyone)) == len(everyone) - 1
-        known = self.n_units >= FEWEST_UNITS
-        margin = float(margins(found.levels, ~last, self.false_alarm_rate)[1][-1]) if known else -np.inf
-        level = found.levels[-1]
-        beyond_motion = np.maximum(
-            10 ** (level / 20) - (0.0 if motion_db is None else 10 ** (motion_db / 20)), _LEAST_LEVEL
-        )
-        certain = margin - float(level.max() - 20 * np.log10(beyond_motion.max()))
-        summary = Nominals.of(found, ~last, self.false_alarm_rate)
-        (score,) = scores_of(
-            self.form,
-            everyone,
-            self.freqs_hz,
-            found,
-            ~last,
-            (margin,),
-            (unit,),
-            self.threshold_db,
-            summary,
-            [len(last) - 1],
-        )
+        comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
+        margin = -np.inf
+        if self.n_units >= FEWEST_UNITS:
+            levels = comparison.distances.levels
+            margin = float(margins(levels, comparison.inliers, self.false_alarm_rate)[1][-1])
+        (score,) = comparison.scores((unit,), self.threshold_db, {len(rows): margin})
+        level = comparison.distances.levels[-1]
+        motion = 0.0 if motion_db is None else 10 ** (motion_db / 20)
+        beyond = np.maximum(10 ** (level / 20) - motion, _LEAST_LEVEL)
+        certain = margin - float(level.max() - 20 * np.log10(beyond.max()))
         return replace(score, outlier=False, status=Status.OTHER_MOTIONS) if margin > 0 >= certain else score
+
+    def _comparison(self, rows: Array, response: Array) -> Comparison:
+        """Return some inliers and one more unit, which comes last."""
+        responses = self.responses[rows]
+        known = self._known if len(rows) == len(self.unit_ids) else distances(self.form, responses, self.freqs_hz)
+        levels = scaled_levels(self.form, responses[known.nominals], response, known, self.freqs_hz)
+        inliers = np.arange(len(rows) + 1) < len(rows)
+        everyone = np.concatenate([responses, response[None]])
+        return Comparison(self.form, everyone, self.freqs_hz, known.joined(levels), inliers)
 
     def motion_levels(self, one: Array, other: Array) -> Array:
         """Return the level, shape (frequency,), dB, by which estimates differ where motions do.
@@ -174,9 +164,8 @@ class OutlierModel:
         as the whole, in variance.
         """
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
-        return np.asarray(
-            np.median(scaled_levels(self.form, first, second, self._known, self.freqs_hz), axis=0) - _HALVES_DB
-        )
+        levels = scaled_levels(self.form, first, second, self._known, self.freqs_hz)
+        return np.asarray(np.median(levels, axis=0) - _HALVES_DB)
 
     @property
     def n_units(self) -> int:
@@ -185,12 +174,7 @@ class OutlierModel:
 
     @cached_property
     def _known(self) -> Distances:
-        """Distances of the inliers, of which many are not compared anew with every unit that is scored."""
         return distances(self.form, self.responses, self.freqs_hz)
-
-    def _with(self, rows: Array, response: Array) -> Distances:
-        known = self._known
-        return joined(self.form, known, rows, self.responses[known.nominals], response, self.freqs_hz)
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
@@ -200,7 +184,6 @@ class OutlierModel:
             "threshold_db": self.threshold_db,
             "false_alarm_rate": self.false_alarm_rate,
             "extrapolated": self.extrapolated,
-            "nominal_ids": self.nominal_ids,
             "scores": [{**vars(s), "threshold_db": None} for s in self.scores],
         }
         save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
@@ -210,7 +193,7 @@ class OutlierModel:
     def load(cls, folder: Path) -> OutlierModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "outlier_model")
-        axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m", "by_nominal_db": "sn"}
+        axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
         scores = tuple(OutlierScore.from_content(s, threshold) for s in content["scores"])
@@ -221,12 +204,8 @@ class OutlierModel:
             threshold_db=threshold,
             false_alarm_rate=content["false_alarm_rate"],
             extrapolated=content["extrapolated"],
-            nominal_ids=tuple(content["nominal_ids"]),
             **{name: arrays[name] for name in _ARRAYS},
         )
-
-
-_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale", "by_nominal_db")
 
 
 def score_outliers(
@@ -285,13 +264,26 @@ def score_outliers(
         raise ConfigError(f"Outlier scores: need a false alarm rate between 0 and 1, found {rate}; 0.01 is usual.")
     rows = _scored(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
-    given = output_scale is not None or input_scale is not None
-    scales = (
-        (check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3]))
-        if given
-        else balance(G)
+    scales = balance(G)
+    if output_scale is not None or input_scale is not None:
+        scales = check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])
+    G = G / scales[0][:, None] * scales[1]
+    found = distances(form, G, freqs)
+    parts = separate(found.levels, rate)
+    comparison = Comparison(form, G, freqs, found, parts.inliers)
+    inliers = np.flatnonzero(parts.inliers)
+    return OutlierModel(
+        form=form,
+        unit_ids=tuple(ids[k] for k in inliers),
+        freqs_hz=freqs,
+        responses=G[inliers],
+        output_scale=scales[0],
+        input_scale=scales[1],
+        scores=comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist()))),
+        threshold_db=parts.threshold_db,
+        false_alarm_rate=rate,
+        extrapolated=rate < 1 / (len(inliers) + 1),
     )
-    return _compared(G / scales[0][:, None] * scales[1], ids, freqs, form, rate, scales)
 
 
 def scored_frequencies(freqs_hz: Array) -> Array:
@@ -303,30 +295,76 @@ def _scored(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, _FREQUENCIES).round().astype(int))
 
 
-def _compared(
-    G: Array, ids: tuple[str, ...], freqs: Array, form: Form, rate: float, scales: tuple[Array, ...]
-) -> OutlierModel:
-    """Score units whose estimates are equally good, responses in scaled coordinates."""
-    found = distances(form, G, freqs)
-    parts = separate(found.levels, rate)
-    summary = Nominals.of(found, parts.inliers, rate)
-    margins = tuple(float(m) for m in parts.margin_db)
-    scores = scores_of(form, G, freqs, found, parts.inliers, margins, ids, parts.threshold_db, summary, range(len(G)))
-    inliers = np.flatnonzero(parts.inliers)
-    return OutlierModel(
-        form=form,
-        unit_ids=tuple(ids[k] for k in inliers),
-        freqs_hz=freqs,
-        responses=G[inliers],
-        output_scale=scales[0],
-        input_scale=scales[1],
-        scores=scores,
-        threshold_db=parts.threshold_db,
-        false_alarm_rate=rate,
-        extrapolated=rate < 1 / (len(inliers) + 1),
-        nominal_ids=tuple(ids[k] for k in found.nominals),
-        by_nominal_db=summary.excess_db,
-    )
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Units and their distances; units are scored against the inliers among them.
+
+    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
+    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
+    first order, so what it takes to reach the bound follows in percent.
+    """
+
+    form: Form
+    responses: Array  # (unit, frequency, p, m), scaled
+    freqs_hz: Array
+    distances: Distances
+    inliers: Flags
+
+    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
+        """Return scores of the units with margins, whose names are given."""
+        units = np.array(list(margin_db))
+        rows = self.distances.levels[units].argmax(axis=1)
+        entries = largest_entries(self.form, self.responses, self.distances, units, rows)
+        excess = excesses(self.distances.levels.max(axis=1), self.inliers)
+        by_nominal = excesses(self.distances.peaks, self.inliers)[:, units]
+        lowest, highest, scores = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0), []
+        for k, (unit, margin) in enumerate(margin_db.items()):
+            value, known = float(excess[unit]), bool(np.isfinite(threshold) and np.isfinite(margin))
+            score = OutlierScore(
+                unit=ids[k],
+                score_db=threshold + margin if known else value,
+                threshold_db=threshold,
+                outlier=known and margin > 0,
+                freq_hz=float(self.freqs_hz[rows[k]]),
+                entry=entries[k],
+                excess_db=value,
+                lowest_db=float(lowest[k]),
+                highest_db=float(highest[k]),
+            )
+            scores.append(self._detectable(score, unit, value - margin) if known else score)
+        return tuple(scores)
+
+    def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
+        """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
+        cover = float(self.distances.levels[unit].max()) - score.excess_db
+        percent = _PERCENT * 10 ** ((cover + bound_db - self._changes) / 20)
+        i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
+        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
+        if score.outlier:
+            status = Status.OUTLIER
+        elif room_db(bound_db, smallest) >= 0:
+            status = Status.OK
+        return replace(
+            score,
+            status=status,
+            detectable_db=bound_db,
+            detectable_percent=smallest,
+            detectable_hz=float(self.freqs_hz[row]),
+            detectable_entry=(i, j),
+        )
+
+    @cached_property
+    def _changes(self) -> Array:
+        """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
+        G = self.responses[self.inliers]
+        G = G[np.unique(np.linspace(0, len(G) - 1, min(_MOST, len(G))).round().astype(int))]
+        levels = np.empty((*G.shape[2:], G.shape[1]))
+        for i, j in np.ndindex(*G.shape[2:]):
+            changed = G.copy()
+            changed[:, :, i, j] *= 1 + _PERCENT / 100
+            shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
+            levels[i, j] = np.median(shifted, axis=0)
+        return levels
 
 
 def _population(

@@ -12,7 +12,7 @@ import numpy as np
 from ...core.work import Work
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors, IdentifiedModels
-from ..settings import UncertaintySettings
+from ..settings import QuantifySettings
 from .model import OutlierModel, score_outliers, scored_frequencies
 from .recorded import Recorded
 from .score import OutlierScore
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 def score_population(
-    models: IdentifiedModels, settings: UncertaintySettings, work: Work | None = None
+    models: IdentifiedModels, settings: QuantifySettings, work: Work | None = None
 ) -> tuple[dict[str, OutlierModel], list[dict[str, Any]]]:
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
@@ -46,7 +46,7 @@ def score_population(
 
 
 def score_condition(
-    factors: EpisodeFactors, models: ModelSet, settings: UncertaintySettings
+    factors: EpisodeFactors, models: ModelSet, settings: QuantifySettings
 ) -> tuple[OutlierModel, list[int]]:
     """Score all units in one condition; with every unit's number of samples."""
     freqs = scored_frequencies(models.frequencies(settings.n_freqs))
@@ -66,10 +66,8 @@ def score_condition(
     )
     known = {score.unit: score for score in outliers.scores}
     scores = [known.get(unit) or outliers.score(unit, G) for unit, G in zip(ids, responses, strict=True)]
-    by_nominal = np.full((len(outliers.nominal_ids), len(ids)), np.nan)
-    by_nominal[:, well] = outliers.by_nominal_db
     qualified = tuple(recorded.qualified(*pair) for pair in zip(scores, evidence, strict=True))
-    return replace(outliers, scores=qualified, by_nominal_db=by_nominal), [data.n_samples for data in evidence]
+    return replace(outliers, scores=qualified), [data.n_samples for data in evidence]
 
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
@@ -81,9 +79,7 @@ def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: fl
         "threshold": score.threshold_db,
         "outlier": score.outlier,
     }
-    row |= {
-        key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "agreement")
-    }
+    row |= {key: getattr(score, key) for key in ("freq_hz", "entry", "excess_db", "lowest_db", "highest_db")}
     row |= {"status": score.status, "detectable": score.detectable_percent}
     row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
     needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}

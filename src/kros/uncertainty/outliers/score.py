@@ -56,8 +56,6 @@ class OutlierScore:
         inlier.
     lowest_db, highest_db : float, dB
         Range of the excess over all choices of one nominal unit.
-    agreement : float
-        Share of those nominals under which the unit is beyond the threshold that the others' scores then make.
     status : Status
     detectable_db : float, dB
         What the excess would have to be for the unit to be flagged; infinite where nothing could be.
@@ -91,12 +89,11 @@ class OutlierScore:
     excess_db: float
     lowest_db: float
     highest_db: float
-    agreement: float
-    status: Status
-    detectable_db: float
-    detectable_percent: float
-    detectable_hz: float | None
-    detectable_entry: tuple[int, int]
+    status: Status = Status.CANNOT_TELL
+    detectable_db: float = float("inf")
+    detectable_percent: float = float("inf")
+    detectable_hz: float | None = None
+    detectable_entry: tuple[int, int] = (0, 0)
     more_data: float = 1.0
 
     @classmethod

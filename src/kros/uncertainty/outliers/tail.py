@@ -1,4 +1,4 @@
-r"""What one further level may exceed the levels of others by: decibels of distances, or of innovations.
+r"""What one further level may exceed the levels of others by, and the search for units that do.
 
 Distances of good units are taken to fall off no slower than a power, so that levels have an exponential tail of unknown
 scale. The spacings of the levels ``x_1 >= x_2 >= ... >= x_n`` of n others estimate the scale, each weighted as if the
@@ -13,19 +13,24 @@ simulation
     P(x > x_1 + t b) = rate        t = (n - 1) ((rate (n + 1))^(-1 / (n - 1)) - 1)
 
 Levels of lighter tails (normal, bounded, of two suppliers) exceed this less often than `rate`. From a rate of 1 / (n +
-1) on the bound is the largest level.
+1) on the bound is the largest level. The search takes units out one at a time, from levels in dB (unit, frequency).
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from .score import FEWEST_UNITS
+
 Array = npt.NDArray[Any]
+Flags = npt.NDArray[np.bool_]
 
 LEAST_SCORES = 3
+_ROUNDING_DB = 1e-8  # levels are rounded to a tenth of that
 
 
 def prediction_bound(scores: Array, rate: float) -> Array:
@@ -56,3 +61,51 @@ def scales_without_one(levels: Array) -> Array:
 
 def _scale(count: int, total: Array, least: Array, largest: Array) -> Array:
     return np.asarray(np.maximum(total - count * least + largest - least, 0.0) / (count - 1))
+
+
+def excesses(peaks: Array, inliers: Flags) -> Array:
+    """Return what largest levels (..., unit) exceed those of all inliers but the unit itself by; NaN is no level."""
+    known = np.where(inliers & np.isfinite(peaks), peaks, -np.inf)
+    second, first = np.moveaxis(np.sort(known, axis=-1)[..., -2:], -1, 0)
+    largest = np.arange(peaks.shape[-1]) == known.argmax(axis=-1)[..., None]
+    return np.asarray(peaks - np.where(largest, second[..., None], first[..., None]))
+
+
+def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
+    """Return every unit's excess over the inliers, itself left out, and how far that is beyond their bound."""
+    known, count = levels[inliers], int(inliers.sum())
+    if count < 2:
+        return np.zeros(len(levels)), np.full(len(levels), -np.inf)
+    value, bound = excesses(levels.max(axis=1), inliers), np.full(len(levels), np.inf)
+    bound[~inliers] = factor(count, rate) * scale(known).mean()
+    if count > 2:
+        bound[inliers] = factor(count - 1, rate) * scales_without_one(known).mean(axis=1)
+    return value, value - np.maximum(bound, _ROUNDING_DB)
+
+
+@dataclass(frozen=True, eq=False)
+class Separation:
+    """Inliers and outliers."""
+
+    inliers: Flags  # (unit,)
+    margin_db: (
+        Array  # (unit,), dB: beyond the bound when the unit went out, or in the last step; minus infinity unknown
+    )
+    threshold_db: float  # dB: what the largest excess of the inliers would have to exceed
+
+
+def separate(levels: Array, rate: float) -> Separation:
+    """Take units out while the largest excess is beyond the bound of the others, up to a third of them."""
+    n = len(levels)
+    inliers, margin = np.ones(n, bool), np.full(n, -np.inf)
+    if n < FEWEST_UNITS:
+        return Separation(inliers, margin, np.inf)
+    each = rate / (1 + n * rate)  # in expectation all steps together flag n * rate
+    while True:
+        value, beyond = margins(levels, inliers, each)
+        top = int(np.argmax(np.where(inliers, value, -np.inf)))
+        threshold = float(value[top] - beyond[top])
+        margin[inliers] = value[inliers] - threshold
+        if n - inliers.sum() >= n // 3 or not beyond[top] > 0:
+            return Separation(inliers, margin, threshold)
+        inliers[top] = False

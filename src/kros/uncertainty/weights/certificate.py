@@ -53,12 +53,11 @@ class Certificate:
     method: Method
     peak: float
     freq_hz: float
-    margin: float  # by level sets no frequency exceeds ``(1 + margin) * peak``; NaN on a grid
 
     @property
     def bound(self) -> float:
         """What no ratio exceeds, by level sets; the largest one that was evaluated, on a grid."""
-        return self.peak * (1 + self.margin) if self.method is Method.LEVEL_SETS else self.peak
+        return self.peak * (1 + _MARGIN) if self.method is Method.LEVEL_SETS else self.peak
 
 
 def certify(
@@ -73,15 +72,15 @@ def certify(
     freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
     pencils = [] if systems is None or peak <= 0 else systems.ratios(left, right)
     if not pencils or not _trusted(pencils, freqs_hz, known, left.dt):
-        return Certificate(Method.GRID, peak, freq, float("nan"))
+        return Certificate(Method.GRID, peak, freq)
     for _ in range(_LEVELS):
         points = np.unique(np.concatenate([_candidates(p, peak * (1 + _MARGIN), left.dt) for p in pencils]))
         values = ratio(points).max(axis=0)
         top = int(values.argmax())
         if values[top] <= peak * (1 + _MARGIN):
-            return Certificate(Method.LEVEL_SETS, peak, freq, _MARGIN)
+            return Certificate(Method.LEVEL_SETS, peak, freq)
         peak, freq = float(values[top]), float(points[top])
-    return Certificate(Method.GRID, peak, freq, float("nan"))
+    return Certificate(Method.GRID, peak, freq)
 
 
 def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, float]:

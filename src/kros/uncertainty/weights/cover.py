@@ -12,20 +12,17 @@ maximum over units and singular values is smoothed by a Schatten norm of order 2
 
 whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at
 once with q rising to 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the
-optimum finite where residuals are triangular, and picks the smooth one where it is not unique; a stronger pull gives
-covers that are easier to fit (`weights`).
+optimum finite where residuals are triangular, and picks the smooth one where it is not unique.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import Enum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.settings import member
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 
 Array = npt.NDArray[Any]
@@ -38,13 +35,6 @@ _PULL = 1e-3
 _REACH = 2.0  # largest Newton step, nepers
 _DIFFERENCE = 1e-5
 _TINY = 1e-300
-
-
-class Structure(str, Enum):
-    """Which entries of the weights are free."""
-
-    DIAGONAL = "diagonal"
-    ENTRYWISE = "entrywise"
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,16 +71,11 @@ class Cover:
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
 
 
-def as_structure(structure: Structure | str) -> Structure:
-    """Return the structure of a name, or raise a `ConfigError`."""
-    return member(Structure, structure, "Weight structure")
-
-
-def optimal_cover(E: Array, pull: float = _PULL) -> Cover:
+def optimal_cover(E: Array) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
     first = entries_first(E)
     p = first.shape[0]
-    x = _descend(first, sigma_max_first(first).max(axis=0), p, pull)
+    x = _descend(first, sigma_max_first(first).max(axis=0), p)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
@@ -108,7 +93,7 @@ def _scaled_left(first: Array, left: Array, right: Array) -> Array:
     return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
 
 
-def _descend(first: Array, size: Array, p: int, pull: float) -> Array:
+def _descend(first: Array, size: Array, p: int) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
@@ -121,8 +106,8 @@ def _descend(first: Array, size: Array, p: int, pull: float) -> Array:
     x = np.zeros((n, len(chosen)))
     for power in _SQUARINGS:
         for _ in range(_NEWTON):
-            x, moved = _newton(_Smooth(E, p, power, pull), x)
-            if moved < 1e-3:
+            x, moved = _newton(_Smooth(E, p, power), x)
+            if moved < 1e-9:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
 
@@ -140,7 +125,6 @@ class _Smooth:
     E: Array
     p: int
     squarings: int
-    pull: float
 
     def cost(self, x: Array) -> tuple[Array, Array]:
         """Return the cost, shape (frequency,), and its gradient, shape of x."""
@@ -162,11 +146,11 @@ class _Smooth:
             x[:p].mean(axis=0)
             + np.log(top)
             + np.log(total) / (2 * q)
-            + self.pull / 2 * (x**2).sum(axis=0)
+            + _PULL / 2 * (x**2).sum(axis=0)
             + x[p:].mean(axis=0)
         )
         gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
-        return cost, gradient + self.pull * x
+        return cost, gradient + _PULL * x
 
 
 def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:

@@ -100,11 +100,6 @@ class Descriptor:
         F = np.diag(np.concatenate([np.ones(2 * n), zero(min(p, m))]))
         return Descriptor(F, A, B, C, zero((m, p)))
 
-    def entry(self, row: int, column: int) -> Descriptor:
-        """Return one entry."""
-        rows, columns = [row], [column]
-        return Descriptor(self.F, self.A, self.B[:, columns], self.C[rows], self.D[np.ix_(rows, columns)])
-
     def crossings(self, gamma: float) -> Array:
         r"""Return the s at which a singular value may equal gamma.
 
@@ -153,15 +148,13 @@ class ResidualSystems:
     form: Form
     nominal: StateSpace
     units: StateSpace
-    entry: tuple[int, int] | None = None  # row and column of the residual where that entry alone is bounded
     remainder: bool = False  # what the form leaves out is bounded in place of the residual
 
     def __iter__(self) -> Iterator[Descriptor]:
         G = Descriptor.of(self.nominal)
         for k in range(self.units.batch_shape[0]):
             Gp = Descriptor.of(self.units[k])
-            system = _remainder(self.form, G, Gp) if self.remainder else _residual(self.form, G, Gp)
-            yield system if self.entry is None else system.entry(*self.entry)
+            yield _remainder(self.form, G, Gp) if self.remainder else _residual(self.form, G, Gp)
 
     def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
         """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""

@@ -95,7 +95,7 @@ def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
         try:
             start = np.roots([float(c) for c in powers])
             settled = mpmath.polyroots(powers, maxsteps=60, extraprec=200, roots_init=start.tolist())
-        except (mpmath.NoConvergence, np.linalg.LinAlgError, ZeroDivisionError) as error:
+        except (mpmath.mp.NoConvergence, np.linalg.LinAlgError, ZeroDivisionError) as error:
             raise KrosError(
                 f"Spectral factor: the roots of a polynomial of degree {order} did not settle; try another order."
             ) from error

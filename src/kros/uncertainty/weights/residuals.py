@@ -31,14 +31,13 @@ class Residuals:
     systems: tuple[StateSpace, StateSpace] | None = None  # nominal and units, discrete, whose modes are looked at
     proven: bool = True  # whether the systems have these residuals at all frequencies
     remainder: bool = False
-    entry: tuple[int, int] | None = None  # the one that is looked at
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def of(self, rows: Array) -> Residuals:
         """Return those of some units."""
-        return replace(self, rows=self.rows[rows])
+        return self if len(rows) == len(self) else replace(self, rows=self.rows[rows])
 
     def blocks(self, size: int) -> Iterator[Array]:
         """Yield positions of units, so many at a time."""
@@ -58,11 +57,7 @@ class Residuals:
 
     def _of(self, G: Array, freqs_hz: Array, rows: Array) -> Array:
         Gp = self.units(freqs_hz, self.rows[rows])
-        E = completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
-        if self.entry is None:
-            return E
-        i, j = self.entry
-        return E[..., i : i + 1, j : j + 1]
+        return completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
 
     @cached_property
     def realised(self) -> ResidualSystems | None:
@@ -70,17 +65,19 @@ class Residuals:
         if self.systems is None:
             return None
         nominal, units = self.systems
-        return ResidualSystems(self.form, nominal, units[self.rows], self.entry, self.remainder)
+        return ResidualSystems(self.form, nominal, units[self.rows], self.remainder)
 
     def modes_hz(self, grid_hz: Array) -> Array:
         """Return frequencies around modes that a grid from DC to Nyquist passes over; none of responses alone."""
         if self.realised is None:
             return np.zeros(0)
-        return replace(self.realised, entry=None, remainder=False).modes_hz(grid_hz)
+        return replace(self.realised, remainder=False).modes_hz(grid_hz)
 
     def deciding(self, freqs_hz: Array, block: int) -> Array:
-        """Return the units that are the largest at some frequency, by singular value or by an entry."""
+        """Return the units that are the largest at some frequency, by singular value or by an entry; all if few."""
         best: tuple[Array, Array] | None = None
+        if len(self) <= block:
+            return np.arange(len(self))
         for rows in self.blocks(block):
             E = self.of(rows).at(freqs_hz)
             entries = np.moveaxis(np.abs(E).reshape(*E.shape[:2], -1), 2, 0)

@@ -42,19 +42,6 @@ class Sections:
     width: Array  # (section,): y; of no effect in sections of first order
 
     @classmethod
-    def spread(cls, corners: Sequence[Array], orders: Sequence[int], width: float) -> Sections:
-        """Return magnitudes of one: a pole on a zero section at every corner, the last single for odd orders."""
-        rows = [
-            (entry, sign, 2 * (i + 1) <= order, x)
-            for entry, (values, order) in enumerate(zip(corners, orders, strict=True))
-            for i, x in enumerate(values)
-            for sign in (1.0, -1.0)
-        ]
-        entry, sign, pair, corner = np.array(rows).reshape(-1, 4).T
-        widths = np.full(len(rows), width)
-        return cls(np.zeros(len(corners)), entry.astype(int), sign, pair.astype(bool), corner, widths)
-
-    @classmethod
     def of_roots(cls, level: float, zeros: Sequence[complex], poles: Sequence[complex]) -> Sections:
         """Return the magnitude with equally many zeros and poles in w, and its log at DC."""
         sides = [(sign, *row) for sign, roots in ((1.0, zeros), (-1.0, poles)) for row in _paired(roots)]
@@ -81,15 +68,18 @@ class Sections:
         """Entry of every parameter: levels, corners, widths of pairs."""
         return np.concatenate([np.arange(len(self.level)), self.entry, self.entry[self.pair]])
 
+    @property
+    def parameters(self) -> Array:
+        """Return levels, corners and widths of pairs."""
+        return np.concatenate([self.level, self.corner, self.width[self.pair]])
+
     def logs(self, tau: Array) -> Array:
         """Return log magnitudes, nepers, shape (entry, frequency)."""
         total = np.repeat(self.level[:, None], len(tau), axis=1)
-        np.add.at(total, self.entry, self._section_logs(tau))
-        return total
-
-    def _section_logs(self, tau: Array) -> Array:
         u, q = self._variables(tau)
-        return np.where(self.pair[:, None], np.log(q) + 2 * np.log1p(u), np.log1p(u)) * (self.sign / 2)[:, None]
+        logs = np.where(self.pair[:, None], np.log(q) + 2 * np.log1p(u), np.log1p(u))
+        np.add.at(total, self.entry, logs * (self.sign / 2)[:, None])
+        return total
 
     def slopes(self, tau: Array) -> Array:
         """Return derivatives of the owner's log magnitude, shape (parameter, frequency)."""
@@ -113,44 +103,6 @@ class Sections:
         level = self.level.copy()
         level[entries] += by
         return replace(self, level=level)
-
-    def with_pairs(self, entries: Array, corners: Array, width: float) -> Sections:
-        """Return the same magnitudes with a pair of zeros and one of poles on each other in some entries."""
-        twice = np.repeat(np.arange(len(entries)), 2)
-        return Sections(
-            self.level,
-            np.concatenate([self.entry, np.asarray(entries)[twice]]),
-            np.concatenate([self.sign, np.tile([1.0, -1.0], len(entries))]),
-            np.concatenate([self.pair, np.ones(len(twice), bool)]),
-            np.concatenate([self.corner, np.asarray(corners)[twice]]),
-            np.concatenate([self.width, np.full(len(twice), width)]),
-        )
-
-    def weakest(self, entry: int, tau: Array) -> Dipole | None:
-        """Return the pole and the zero section of an entry that cancel best, None where there are none of one order."""
-        rows = np.flatnonzero(self.entry == entry)
-        zeros, poles = rows[self.sign[rows] > 0], rows[self.sign[rows] < 0]
-        logs = self._section_logs(tau)
-        both = logs[zeros][:, None] + logs[poles]
-        span = np.where(self.pair[zeros][:, None] == self.pair[poles], np.ptp(both, axis=2), np.inf)
-        if not np.isfinite(span).any():
-            return None
-        i, j = np.unravel_index(int(span.argmin()), span.shape)
-        middle = float(both[i, j].max() + both[i, j].min()) / 2
-        return Dipole(entry, int(zeros[i]), int(poles[j]), float(span[i, j]), middle)
-
-    def without(self, dipole: Dipole) -> Sections:
-        """Return the magnitudes without a pole and a zero section that nearly cancel."""
-        rows = np.setdiff1d(np.arange(len(self.entry)), [dipole.zero, dipole.pole])
-        level = self.level.copy()
-        level[dipole.entry] += dipole.middle
-        return Sections(level, self.entry[rows], self.sign[rows], self.pair[rows], self.corner[rows], self.width[rows])
-
-    def halved(self, dipole: Dipole) -> Sections:
-        """Return the magnitudes with sections of first order in place of two of second order."""
-        pair = self.pair.copy()
-        pair[[dipole.zero, dipole.pole]] = False
-        return replace(self, pair=pair)
 
     def systems(self, sample_period_s: float) -> list[StateSpace]:
         """Return the systems of the entries."""
@@ -187,17 +139,6 @@ class Sections:
     def _variables(self, tau: Array) -> tuple[Array, Array]:
         u = np.minimum(tau, _FAR) * np.exp(-self.corner)[:, None]
         return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _TINY)
-
-
-@dataclass(frozen=True)
-class Dipole:
-    """A zero and a pole section that nearly cancel: range and middle of the log magnitude of both, nepers."""
-
-    entry: int
-    zero: int
-    pole: int
-    span: float
-    middle: float
 
 
 def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError
-from ...core.linalg import adjoint
+from ..core.errors import DimensionError
+from ..core.linalg import adjoint
 
 Array = npt.NDArray[Any]
 BANDS = 96
@@ -55,16 +55,11 @@ class BandEnergies:
         object.__setattr__(self, "energy", energy)
 
     @classmethod
-    def of(
-        cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike, samples: npt.ArrayLike | None = None
-    ) -> BandEnergies:
+    def of(cls, signal: Array, lengths: npt.ArrayLike, edges: npt.ArrayLike) -> BandEnergies:
         """Return energies (batch, b, n, n) of the episodes of a signal (n_samples, batch, n)."""
         signal, lengths, edges = np.asarray(signal, dtype=float), np.asarray(lengths, dtype=int), check_edges(edges)
-        if (
-            signal.ndim != 3
-            or lengths.shape != signal.shape[1:2]
-            or not ((lengths > 0) & (lengths <= len(signal))).all()
-        ):
+        fits = signal.ndim == 3 and lengths.shape == signal.shape[1:2]
+        if not fits or not ((lengths > 0) & (lengths <= len(signal))).all():
             raise DimensionError(
                 f"Band energies: {signal.shape} should be (n_samples, batch, n) with lengths between one and "
                 f"n_samples, found {lengths}."
@@ -74,32 +69,13 @@ class BandEnergies:
                 "Band energies: the signal contains NaN or infinity; look at the recordings and the model."
             )
         alone = np.where((np.arange(len(signal))[:, None] < lengths)[..., None], signal, 0.0)
-        return cls(
-            edges,
-            np.array([*_energies(alone, edges)])
-            / np.asarray(lengths if samples is None else samples, dtype=float)[:, None, None, None],
-        )
+        return cls(edges, np.array([*_energies(alone, edges)]) / lengths[:, None, None, None])
 
     def of_units(self, units: Sequence[str]) -> BandEnergies:
         """Return the mean over the episodes of every unit, units in order of appearance."""
         names = list(dict.fromkeys(units))
         member = np.array([[unit == name for unit in units] for name in names], dtype=float)
         return replace(self, energy=np.einsum("ue,ebij->ubij", member / member.sum(axis=1, keepdims=True), self.energy))
-
-    def scaled(self, size: npt.ArrayLike) -> BandEnergies:
-        """Return the energies of the signals divided by sizes of their channels, shape (n,)."""
-        size = np.asarray(size, dtype=float)
-        return replace(self, energy=self.energy / np.outer(size, size))
-
-    def cover(self) -> BandEnergies:
-        """Return energies that are no smaller than those of any episode or unit, in every band and direction."""
-        n = self.energy.shape[-1]
-        return replace(self, energy=cover(self.energy.reshape(-1, len(self.edges) - 1, n, n)))
-
-    @property
-    def mean_square(self) -> Array:
-        """Mean square of every channel, shape (..., n)."""
-        return np.asarray(np.einsum("...bii->...i", self.energy).real)
 
 
 def band_edges(n_samples: int, bands: int = BANDS) -> Array:
@@ -111,16 +87,11 @@ def band_edges(n_samples: int, bands: int = BANDS) -> Array:
 
 def check_edges(edges: npt.ArrayLike) -> Array:
     """Return edges as an array, or say why they make no bands."""
-    found = np.asarray(edges, dtype=float)
-    if (
-        found.ndim != 1
-        or len(found) < 2
-        or found[0] != 0
-        or not np.isclose(found[-1], np.pi, rtol=1e-12)
-        or not (np.diff(found) > 0).all()
-    ):
-        raise DimensionError(f"Bands: edges should increase from 0 to pi rad per sample, found {found}.")
-    return found
+    values = np.asarray(edges, dtype=float)
+    whole = values.ndim == 1 and len(values) > 1 and values[0] == 0 and np.isclose(values[-1], np.pi, rtol=1e-12)
+    if not whole or not (np.diff(values) > 0).all():
+        raise DimensionError(f"Bands: edges should increase from 0 to pi rad per sample, found {values}.")
+    return values
 
 
 def cover(energies: Array, weight: Array | None = None) -> Array:
@@ -142,8 +113,8 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
     grown, added = _touching(M, E), _touching(M + lacking[:, None, None] * np.eye(n), E)
     # Before it converges the symmetric part of M may be indefinite: no multiple of it covers then.
     smaller = (np.einsum("bii->b", grown - added).real < 0) & (np.linalg.eigvalsh(M)[..., 0] > 0)
-    found = back @ (np.where(smaller[:, None, None], grown, added) * size) @ back
-    return np.asarray((found + adjoint(found)) / 2 * outer)
+    covers = back @ (np.where(smaller[:, None, None], grown, added) * size) @ back
+    return np.asarray((covers + adjoint(covers)) / 2 * outer)
 
 
 def _least(E: Array) -> Array:
@@ -186,9 +157,8 @@ def _energies(signals: Array, edges: Array) -> Iterator[Array]:
         some = signals[:, start : start + many]
         size = np.sqrt(np.sum(some**2, axis=0))
         size[size == 0] = 1.0
-        for total, outer in zip(
-            _integrals(_lags(some / size), edges), size[:, :, None] * size[:, None, :], strict=True
-        ):
+        outers = size[:, :, None] * size[:, None, :]
+        for total, outer in zip(_integrals(_lags(some / size), edges), outers, strict=True):
             energy = np.diff(total, axis=0) / np.pi
             values, vectors = np.linalg.eigh(energy)
             positive = (vectors * np.maximum(values, 0.0)[:, None, :]) @ adjoint(vectors)

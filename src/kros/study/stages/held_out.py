@@ -1,0 +1,172 @@
+"""What observers, baselines and models do on held-out episodes: errors, and trajectories for figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.errors import KrosError
+from ...data import EpisodeBatch
+from ...data.population import EpisodeKey, Population
+from ...design.baselines import Baseline
+from ...evaluate import TrueErrors, true_errors
+from ...evaluate.errors import ErrorSummary, summarise_all
+from ...evaluate.sensor import as_shown
+from ...identify import ModelSet, free_run
+from ...observer import Observer, run_observers
+from ...observer.sensor import Sensors
+from .disturbed import Trial
+
+Array = npt.NDArray[np.float64]
+Run = Callable[[EpisodeBatch], Iterable[Array]]
+SIDE_BY_SIDE = 32  # episodes
+_NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What one observer, baseline or model did."""
+
+    summary: ErrorSummary
+    shown: list[Array]
+    true: TrueErrors | None = None
+    facts: Mapping[str, Any] = field(default_factory=dict)
+    estimated: tuple[int, ...] | None = None  # states; all by default
+    disturbed: Array | None = None
+
+    @classmethod
+    def joined(cls, parts: Sequence[Outcome], order: Sequence[int]) -> Outcome:
+        """Join outcomes of episodes; `order` is that in which pieces are displayed."""
+        pieces, true = [piece for part in parts for piece in part.shown], [p.true for p in parts if p.true is not None]
+        summary = ErrorSummary.joined([part.summary for part in parts])
+        return cls(summary, [pieces[i] for i in order], TrueErrors.joined(true) if true else None)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Held-out episodes as the sensor shows them, with lifting parameters by unit; `shown` are displayed."""
+
+    population: Population
+    keys: tuple[EpisodeKey, ...]
+    parameters: Mapping[str, dict[str, float]]
+    shown: tuple[int, ...] = ()
+    sensor: Sensors = field(default_factory=dict)
+
+    def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
+        """Run observers that `disturbed.alike` puts together."""
+        first = observers[0]
+
+        def run(batch: EpisodeBatch) -> Iterator[Array]:
+            y, values = batch.measurements(first.measured), first.own(batch.parameters)
+            count = max(1, _NUMBERS // batch.states.size)  # estimates of all of them may fill a memory
+            groups = (observers[i : i + count] for i in range(0, len(observers), count))
+            return (run_observers(group, y, batch.inputs, values) for group in groups)
+
+        return self.outcomes(run)
+
+    def baseline(
+        self, make: Callable[[], Baseline], limits: tuple[Array, Array], trial: Trial | None = None
+    ) -> Outcome | str:
+        """Make a baseline and run it, on disturbed episodes too; return the reason where it cannot be made."""
+        try:
+            baseline = replace(make(), limits=limits)
+        except KrosError as error:
+            return str(error)
+        (outcome,) = self.outcomes(lambda batch: [baseline.run(batch, batch.parameters)[None]])
+        disturbed = None if trial is None else trial.errors_of_baseline(baseline)
+        return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
+
+    def models(self, models: ModelSet) -> Outcome:
+        """Run every unit's model freely from the true first state, with delays from the first recorded ones."""
+
+        def run(batch: EpisodeBatch) -> list[Array]:
+            rows = [models.index(k.unit) for k in batch.keys]
+            values = batch.parameters if models.lifting.parameters else {}
+            first, inputs = batch.first_states(models.lifting.history), np.swapaxes(batch.inputs, 0, 1)
+            states = free_run(models.A[rows], models.B[rows], models.lifting, values, first, inputs)
+            return [np.swapaxes(states, 0, 1)[None]]
+
+        (outcome,) = replace(self, sensor={}).outcomes(run, truths=False)
+        return outcome
+
+    def outcomes(self, run: Run, truths: bool = True) -> list[Outcome]:
+        """Return the outcomes of estimates, (estimate, n_samples, batch, n or more), some episodes after others."""
+        blocks, order = [], list[int]()
+        for start in range(0, len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
+            batch = self._read(self.keys[start : start + SIDE_BY_SIDE], truths)
+            shown = [i for i in self.shown if start <= i < start + len(batch.keys)]
+            order += shown
+            rows = [i - start for i in shown]
+            blocks.append([one for estimates in run(batch) for one in self._of_block(estimates, batch, rows)])
+        places = [order.index(i) for i in self.shown]
+        return [Outcome.joined(parts, places) for parts in zip(*blocks, strict=True)]
+
+    def _read(self, keys: Sequence[EpisodeKey], truths: bool) -> EpisodeBatch:
+        batch = EpisodeBatch.read(self.population, keys, parameters=self.parameters, truths=truths)
+        batch = as_shown(batch, self.sensor, self.population.states)
+        states = np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
+        return replace(batch, states=states)
+
+    def _of_block(self, estimates: Array, batch: EpisodeBatch, rows: Sequence[int]) -> list[Outcome]:
+        n, lengths, dt = len(self.population.states), batch.lengths, self.population.sample_period_s
+        outcomes = []
+        for summary, estimate in zip(summarise_all(estimates, batch.states, lengths, dt), estimates, strict=True):
+            shown = [estimate[: lengths[i], i, :n].copy() for i in rows]
+            outcomes.append(Outcome(summary, shown, self.true(estimate[..., :n], batch)))
+        return outcomes
+
+    def true(self, signals: Array, batch: EpisodeBatch) -> TrueErrors | None:
+        """Return the errors of signals against the true states; None where recordings do not hold them."""
+        if batch.truths is None:
+            return None
+        dt, states = self.population.sample_period_s, self.population.true_states
+        return true_errors(signals, batch.truths, states, batch.lengths, dt)
+
+    @property
+    def groups(self) -> dict[tuple[str, str], list[int]]:
+        """Places of the episodes of every unit and condition."""
+        groups: dict[tuple[str, str], list[int]] = {}
+        for i, key in enumerate(self.keys):
+            groups.setdefault((key.unit, key.condition), []).append(i)
+        return groups
+
+    def rows(
+        self, name: str, outcome: Outcome, roles: Mapping[str, str], band: tuple[float, float] | None
+    ) -> list[dict[str, Any]]:
+        """Return a row for every unit, condition and estimated channel: means over the unit's episodes."""
+        summary, states = outcome.summary, self.population.states
+        power, rows = None if band is None else summary.band_power(band), list[dict[str, Any]]()
+        for (unit, condition), places in self.groups.items():
+            for j in range(len(states)) if outcome.estimated is None else sorted(outcome.estimated):
+                row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
+                row |= {"channel": states[j], "rms": summary.rms[places, j].mean()}
+                row["error_percent"] = summary.percent[places, j].mean()
+                for part in ("start", "rest"):
+                    row[f"{part}_error_percent"] = getattr(summary, f"{part}_percent")[places, j].mean()
+                row |= {} if power is None else {"gearbox_band_power": power[places, j].mean()}
+                rows.append(row | _true_entry(outcome.true, places, j))
+        return rows
+
+    def recorded_rows(self, roles: Mapping[str, str]) -> dict[str, list[dict[str, Any]]]:
+        """Return the errors of the recorded states themselves against the true ones, where recordings hold them."""
+        rows: list[dict[str, Any]] = []
+        for (unit, condition), places in self.groups.items() if self.population.truths else ():
+            batch = EpisodeBatch.read(self.population, [self.keys[i] for i in places], truths=True)
+            true = self.true(batch.states, batch)
+            for j in self.population.true_states:
+                row = {"unit": unit, "role": roles[unit], "condition": condition}
+                row |= {"channel": self.population.states[j]}
+                rows.append(row | _true_entry(true, range(len(places)), j))
+        return {"recorded": rows} if rows else {}
+
+
+def _true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) -> dict[str, float]:
+    """Return errors and lag against a true state, mean over episodes; empty where it is not recorded."""
+    if true is None or state not in true.states:
+        return {}
+    at = true.states.index(state)
+    return {f"true_{what}": float(v[episodes, at].mean()) for what, v in vars(true).items() if what != "states"}

@@ -1,1 +1,0 @@
-"""Uncertainty where an observer feels it: left coprime factors, as signals."""

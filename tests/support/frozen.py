@@ -1,0 +1,56 @@
+"""The linear response of the error to what drove it, slopes at rest, beside the error and what the certificate allows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kros.data import EpisodeBatch
+from kros.loops import recursion
+from kros.observer import Observer, ReliftCertificate
+from kros.observer.certificate.course import course
+from kros.observer.certificate.error import ErrorSystem
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """Root mean squares of one episode, signals divided by their sizes."""
+
+    frozen: float
+    error: float
+    bound: float
+
+    @property
+    def holds(self) -> bool:
+        """Whether the error is within the bound, rounding aside."""
+        return self.error <= self.bound * (1 + 1e-6)
+
+
+def frozen_response(system: ErrorSystem, w: Array, first: Array) -> Array:
+    """Return the scaled error with slopes at rest."""
+    plant = system.moved()
+    start = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
+    drive = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))
+    drive[:-1] = w @ plant.B[:, : w.shape[2]].T
+    return np.asarray(recursion(plant.A, drive, start) @ system.C.T)
+
+
+def compared(
+    certificate: ReliftCertificate, observer: Observer, batch: EpisodeBatch, estimates: Array | None = None
+) -> list[Row]:
+    """Compare responses, errors and bounds, episode by episode."""
+    seen, lengths, scales = course(observer, batch, estimates), batch.lengths, certificate.scales
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
+    w[np.isnan(w)] = 0.0
+    inside = np.arange(len(seen.error))[:, None] < lengths
+    z = frozen_response(certificate.system(observer), w, seen.first)
+    energy = [
+        np.sum(np.where(inside[: len(s), :, None], s, 0.0) ** 2, axis=(0, 2)) for s in (z, seen.error / scales.error, w)
+    ]
+    energy[2] = certificate.gain**2 * energy[2] + certificate.initial_energy(seen.first)
+    return [Row(*row) for row in np.sqrt(np.array(energy) / lengths).T]

@@ -48,7 +48,7 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     fine = replace(design, bank=design.bank.fine)
     A, B, S = fine.bank.system()
     weights = design.bank.refined(readout.coefficients).T
-    X, w = fine.sample
+    X, w = fine.sample()
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]

@@ -9,7 +9,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...identify.kinds import kind_of
+from ...identify.model_set import kind_of
 from ...observer import EstimatorSettings, Recordings, identify_estimator
 from ...observer.sensor import Sensor, sides
 from ...synthesis import Status, Synthesis

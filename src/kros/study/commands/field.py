@@ -18,7 +18,7 @@ from ...data.prepare import with_gaps
 from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
-from ...identify.calibrate import segments_of
+from ...identify.calibration import segments_of
 from ...observer import Observer, run_with_status, track_parameter
 from ...observer.screen import Bits, SampleStatus, sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation

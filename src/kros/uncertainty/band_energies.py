@@ -42,7 +42,7 @@ class BandEnergies:
         edges, energy = check_edges(self.edges), np.asarray(self.energy, dtype=complex)
         if energy.ndim < 3 or energy.shape[-3] != len(edges) - 1 or energy.shape[-1] != energy.shape[-2]:
             raise DimensionError(
-                f"Band energies: needs (..., {len(edges) - 1}, n, n) for as many bands, found {energy.shape}."
+                f"Band energies: needs (..., {len(edges) - 1}, n, n) for these bands, found {energy.shape}."
             )
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "energy", energy)
@@ -58,9 +58,7 @@ class BandEnergies:
                 f"n_samples, found {lengths}."
             )
         if not np.isfinite(signal).all():
-            raise DimensionError(
-                "Band energies: the signal contains NaN or infinity; look at the recordings and the model."
-            )
+            raise DimensionError("Band energies: the signal has NaN or infinity; look at the recordings and the model.")
         alone = np.where((np.arange(len(signal))[:, None] < lengths)[..., None], signal, 0.0)
         return cls(edges, np.array([*_energies(alone, edges)]) / lengths[:, None, None, None])
 

@@ -52,9 +52,7 @@ class Options:
         """Check options by name, order and tolerance."""
         unknown = sorted(set(options) - set(cls.__dataclass_fields__))
         if unknown:
-            raise ConfigError(
-                f"Quantify: unknown {', '.join(unknown)}; known are {', '.join(cls.__dataclass_fields__)}."
-            )
+            raise ConfigError(f"Quantify: unknown {', '.join(unknown)}; known: {', '.join(cls.__dataclass_fields__)}.")
         read = cls(**options)
         if not (isinstance(read.max_order, int | np.integer) and read.max_order >= 0 and read.tolerance_db >= 0):
             raise ConfigError(
@@ -97,7 +95,7 @@ def bound_responses(
     freqs = check_grid(freqs_hz, dt or None)
     if G.shape[1] != len(freqs):
         raise DimensionError(
-            f"Quantify: responses at {G.shape[1]} frequencies need as many in freqs_hz, found {len(freqs)}."
+            f"Quantify: responses at {G.shape[1]} frequencies need as many freqs_hz, found {len(freqs)}."
         )
     ids, nominal = check_ids(options.unit_ids, len(G)), options.nominal
     given = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
@@ -116,10 +114,8 @@ def bound_responses(
     residuals = Residuals(form, lambda at_hz: _between(freqs, base[None], at_hz)[0], units_at, np.arange(len(ids)))
     bound = _bound(residuals, freqs, dt or BilinearAxis.over(freqs), options)
     fields = _fields(ids, index, freqs, scales, choices, bound)
-    certificate, unresolved = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(
-        nominal_response=chosen, sample_period_s=dt, certificate=certificate, unresolved_hz=unresolved, **fields
-    )
+    fields["certificate"], fields["unresolved_hz"] = _certificate(freqs, fields["bounds"][form])
+    return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, **fields)
 
 
 def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:

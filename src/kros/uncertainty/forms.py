@@ -232,7 +232,7 @@ def check_responses(responses: npt.ArrayLike) -> Array:
     G = np.asarray(responses)
     if G.ndim != 4 or 0 in G.shape:
         raise DimensionError(
-            f"Responses: need the axes (unit, frequency, output, input), none of them empty; found shape {G.shape}."
+            f"Responses: needs axes (unit, frequency, output, input), none empty; found shape {G.shape}."
         )
     return G
 

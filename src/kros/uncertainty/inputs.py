@@ -79,7 +79,7 @@ def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
     index = best if nominal is None else nominal
     if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
         raise ConfigError(
-            f"Quantify: nominal {index!r} is out of range; give a name, a system, or a whole number below {len(names)}."
+            f"Quantify: nominal {index!r} is out of range; give a name, a system, or a row below {len(names)}."
         )
     return int(index)
 
@@ -88,9 +88,7 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     """Return ranges as an array, ones by default, or say what is wrong with them."""
     scale = np.ones(size) if values is None else np.asarray(values, float)
     if scale.shape != (size,) or not (np.isfinite(scale) & (scale > 0)).all():
-        raise DimensionError(
-            f"Uncertainty: {side}_scale needs {size} positive numbers, found {np.array2string(scale, threshold=10)}."
-        )
+        raise DimensionError(f"Uncertainty: {side}_scale needs {size} positive numbers, found {scale[:9]}.")
     return scale
 
 
@@ -148,14 +146,12 @@ def _padded(system: StateSpace, n_states: int) -> StateSpace:
 def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
     """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
     if response.shape != shape:
-        raise DimensionError(
-            f"Quantify: the response of {name!r} should have the shape {shape}, found {response.shape}."
-        )
+        raise DimensionError(f"Quantify: the response of {name!r} should have shape {shape}, found {response.shape}.")
     finite = np.isfinite(response).all(axis=(1, 2))
     if not finite.all():
         at = freqs[int(np.argmin(finite))]
         raise DataError(
-            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave it or the frequency out."
+            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave one of both out."
         )
 
 
@@ -169,7 +165,7 @@ def read_response_data(
         name = f"response {k}" if k < len(data) else "the nominal"
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
             raise DimensionError(
-                f"Quantify: {name} has other frequencies than the first response; interpolate or measure on one grid."
+                f"Quantify: {name} has other frequencies than the first response; interpolate to one grid."
             )
         if other.dt != first.dt or other.frdata.shape != first.frdata.shape:
             raise DimensionError(
@@ -179,9 +175,7 @@ def read_response_data(
     if freqs_hz is not None:
         raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
     if first.dt is True:
-        raise DimensionError(
-            "Quantify: the sampling period of the responses is not known (dt = True); give it in seconds."
-        )
+        raise DimensionError("Quantify: the responses have no sampling period (dt = True); give it in seconds.")
     options["sample_period_s"] = float(first.dt or 0.0)
     responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in [*data, *beside]])
     if beside:

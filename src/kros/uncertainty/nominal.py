@@ -86,9 +86,7 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     form, G = as_form(form), check_responses(responses)
     broken = ~np.isfinite(G).all(axis=(1, 2, 3))
     if broken.any():
-        raise DimensionError(
-            f"Nominal: responses of units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out."
-        )
+        raise DimensionError(f"Nominal: units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out.")
     count, n_freqs = G.shape[:2]
     step, plants = max(1, SET.at_once // n_freqs), _Plants.of(form, G)
 
@@ -103,9 +101,8 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
         sizes = np.concatenate([nominal.sigma(plants.at(slice(k, k + step))) for k in range(0, count, step)])
         return sizes.max(axis=0), sizes.argmax(axis=0)
 
-    index, largest, scores, evaluated = smallest_largest(
-        (count, n_freqs), _central(G), bound, against, lambda sizes: sizes.max(axis=-1)
-    )
+    best = smallest_largest((count, n_freqs), _central(G), bound, against, lambda sizes: sizes.max(axis=-1))
+    index, largest, scores, evaluated = best
     with np.errstate(divide="ignore"):
         return NominalChoice(form, index, largest, 20 * np.log10(scores), evaluated)
 

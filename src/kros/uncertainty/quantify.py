@@ -237,9 +237,7 @@ def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) 
         responses = models.scaled_responses(models.frequencies(settings.n_freqs), units)
         return units[choose_nominal(responses, settings.form).index]
     if settings.nominal not in units:
-        raise IdentificationError(
-            f"Quantify: nominal {settings.nominal!r} is not among the units {', '.join(units)}; name one of them."
-        )
+        raise IdentificationError(f"Quantify: nominal {settings.nominal!r} is not among the units {', '.join(units)}.")
     return settings.nominal
 
 

@@ -36,9 +36,7 @@ class QuantifySettings(UncertaintySettings):
     )
     max_order: int = Field(4, ge=1, le=8, description="largest order of an entry of a weight")
     tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")
-    false_alarm_rate: float = Field(
-        1e-2, gt=0, lt=1, description="probability with which a unit like the others is flagged"
-    )
+    false_alarm_rate: float = Field(1e-2, gt=0, lt=1, description="probability that a unit like the others is flagged")
 
 
 class FitSettings(Settings):
@@ -61,9 +59,7 @@ class FitSettings(Settings):
     damping: float = Field(1e-2, gt=0, description="of the first step at a temperature")
     trials: int = Field(8, ge=1, description="of a step, each with eight times the damping")
     deficit: float = Field(1.02, gt=1, description="ratio up to which a weight is lifted; beyond it is fitted again")
-    block: int = Field(
-        200, ge=2, description="units at once: of more, those that decide are fitted and all are checked"
-    )
+    block: int = Field(200, ge=2, description="units at once: of more, those that decide are fitted, all are checked")
 
 
 @dataclass(frozen=True)

@@ -84,9 +84,7 @@ def unit_residuals(
     """Return residuals of units, whose responses have the shape (frequency, p, m), beside weights or a cover."""
     unit_ids, inside = tuple(responses), np.array([unit not in outside for unit in responses])
     if not inside.any():
-        raise DimensionError(
-            f"Residuals of units: needs at least one unit that is covered, found {', '.join(unit_ids)}."
-        )
+        raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
     sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)

@@ -334,9 +334,8 @@ def from_pykoop(
         channels = [*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs))]
     episodes: dict[EpisodeKey, Any] = {}
     for unit, x in arrays.items():
-        rows = _rows_of(
-            EpisodeKey(unit, DEFAULT_CONDITION, _episode(v, row, unit)) for row, v in enumerate(x[:, 0].tolist())
-        )
+        names = [_episode(value, row, unit) for row, value in enumerate(x[:, 0].tolist())]
+        rows = _rows_of(EpisodeKey(unit, DEFAULT_CONDITION, name) for name in names)
         episodes |= {key: x[at, 1:] for key, at in rows.items()}
     return from_arrays(episodes, channels, sample_period_s)
 

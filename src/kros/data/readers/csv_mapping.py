@@ -41,9 +41,7 @@ class UnitMapping(Settings):
     """``[[unit]]``: one of several units in the same file."""
 
     suffix: str = Field("", description="appended to the unit's id from the path")
-    columns: dict[str, Column] = Field(
-        {}, description="column by name of channel, where it is not that of `[[channel]]`"
-    )
+    columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
 class CsvMapping(Settings):
@@ -73,7 +71,7 @@ class CsvMapping(Settings):
         "alone takes any of them",
     )
     pieces: int = Field(
-        1, ge=1, le=100_000, description="a file is cut into so many episodes of equal length, `<episode>.1` and so on"
+        1, ge=1, le=100_000, description="a file is cut into episodes of equal length, `<episode>.1` ..."
     )
     prepare: tuple[dict[str, Any] | Step, ...] = Field((), description="preparation steps of this mapping")
     metadata: dict[str, Any] = Field({}, description="facts about the batch, for example `{gear_ratio = 100}`")

@@ -77,9 +77,7 @@ class CompiledObserver:
         """
         folder, compiler = Path(folder), compiler or find_compiler()
         if compiler is None:
-            raise ConfigError(
-                f"Compiling {folder}: no C compiler is on the PATH, tried {', '.join(COMPILERS)}; install one."
-            )
+            raise ConfigError(f"Compiling {folder}: there is no C compiler, tried {', '.join(COMPILERS)}; install one.")
         manifest = json.loads((folder / "manifest.json").read_text())
         sizes = {"q": len(manifest["measured"]), "m": len(manifest["inputs"]), "n": len(manifest["states"])}
         name = manifest["name"]

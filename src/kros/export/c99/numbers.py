@@ -65,9 +65,7 @@ class Source:
     ) -> Source:
         """Look at an observer; refuse what it cannot give."""
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
-            raise ConfigError(
-                f"Export: load torque needs the states {', '.join(missing)}, found {', '.join(observer.recorded)}."
-            )
+            raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         realised = Realised.of(observer)
         observer = realised.observer
         loop = None if track is None else PhaseLockedLoop(observer, track, 1)

@@ -44,12 +44,8 @@ FIGURES: dict[str, Row] = {
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
     "load_torque": Row("Load torque", "disturbed:load_torque", "The nearer to the declared load, the better."),
     "robustness": Row("Disturbed measurements", "disturbed:robustness", "A line rises where the observer fails."),
-    "outlier_scores": Row(
-        "Outlier scores", "outliers:scores", "The higher a unit, the more it differs from all others."
-    ),
-    "outlier_residuals": Row(
-        "Highest score", "uncertainty:outlier_residuals", "The unit differs where red leaves black."
-    ),
+    "outlier_scores": Row("Outlier scores", "outliers:scores", "The higher a unit, the more it differs."),
+    "outlier_residuals": Row("Highest score", "uncertainty:outlier_residuals", "It differs where red leaves black."),
 }
 
 

@@ -96,9 +96,7 @@ def models(facts: Facts) -> Section | None:
         for what in ("median", "worst"):
             values = [entry.get(channel, {}).get(what) for entry in errors.values()]
             columns.append(Column(f"{what} (%)", values, words(channel), best=True))
-    caption = (
-        "Simulation of held-out episodes from their first state, error in percent of the largest value, over units"
-    )
+    caption = "Simulation of held-out episodes from their first state, error in percent of the largest value"
     return Section("models", "Models", [text], tables=[build(caption, columns)], figure="free_run")
 
 

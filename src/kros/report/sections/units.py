@@ -71,11 +71,9 @@ def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list
     """Return scores and detectable changes in every condition."""
     keys = {"(dB)": "score", "detectable change of gain (%)": "detectable"}
     return [
-        Column(
-            f"{condition_label(c)} {title}".strip(), [scores.get((u, c), {}).get(key) for u in names], "outlier score"
-        )
+        Column(f"{condition_label(c)} {t}".strip(), [scores.get((u, c), {}).get(k) for u in names], "outlier score")
         for c in dict.fromkeys(c for _, c in scores)
-        for title, key in keys.items()
+        for t, k in keys.items()
     ]
 
 

@@ -120,9 +120,7 @@ class OutlierModel:
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < 2:
-            raise DataError(
-                f"Scoring unit {unit}: {len(rows)} others are left to compare with, two are needed; record more units."
-            )
+            raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
         G = np.asarray(response)
         if G.shape != self.responses.shape[1:]:
             raise DimensionError(

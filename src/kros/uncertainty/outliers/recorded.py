@@ -65,11 +65,9 @@ class Recorded:
         """Take the units of models from the factors of all training episodes of a condition."""
         f, units = factors.factor, {}
         for unit in models.unit_ids:
-            own = factors.rows_of(unit)
-            factor = Factor(f.R[own], f.peak[own], f.n_samples[own])
-            units[unit] = Evidence.of(
-                factor, models, {k: float(v[models.index(unit)]) for k, v in models.parameters.items()}
-            )
+            rows, at = factors.rows_of(unit), models.index(unit)
+            factor = Factor(f.R[rows], f.peak[rows], f.n_samples[rows])
+            units[unit] = Evidence.of(factor, models, {k: float(v[at]) for k, v in models.parameters.items()})
         return cls(models, units, freqs_hz)
 
     @cached_property
@@ -79,14 +77,11 @@ class Recorded:
 
     def response(self, evidence: Sequence[Evidence]) -> Array:
         """Return responses of estimates, shape (estimate, frequency, n, m)."""
-        joined = [
-            combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R * np.sqrt(self.usual / e.n_samples)
-            for e in evidence
-        ]
-        found = self.models.fit(np.stack(joined))
-        return replace(self.models, unit_ids=tuple(map(str, range(len(joined)))), A=found.A, B=found.B).responses(
-            self.freqs_hz
-        )
+        factors = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R for e in evidence]
+        sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
+        fitted = self.models.fit(np.stack(factors) * sizes[:, None, None])
+        names = tuple(map(str, range(len(factors))))
+        return replace(self.models, unit_ids=names, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
 
     def halves(self) -> tuple[Array, Array] | None:
         """Return the responses of all units from every second episode, and from the others."""
@@ -115,9 +110,8 @@ class Recorded:
 
     def same_recordings(self, factor: Factor) -> set[str]:
         """Return units of the study that have an episode in common with some, by their factors."""
-        return {
-            unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in range(len(factor.R)))
-        }
+        rows = range(len(factor.R))
+        return {unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in rows)}
 
 
 def _marks(factor: Factor, first: int, count: int) -> list[tuple[float, ...]]:

@@ -87,9 +87,7 @@ class Separation:
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)
-    margin_db: (
-        Array  # (unit,), dB: beyond the bound when the unit went out, or in the last step; minus infinity unknown
-    )
+    margin_db: Array  # (unit,), dB: beyond the bound when the unit went out, or at last; minus infinity unknown
     threshold_db: float  # dB: what the largest excess of the inliers would have to exceed
 
 

@@ -72,9 +72,8 @@ class BilinearAxis:
         inverse = np.linalg.inv(rate * eye - system.A)
         scale = np.sqrt(2 * rate)
         A, through = inverse @ (rate * eye + system.A), system.C @ inverse @ system.B
-        return StateSpace(
-            A, scale * (inverse @ system.B), scale * (system.C @ inverse), system.D + through, self.period_s
-        )
+        B, C = scale * (inverse @ system.B), scale * (system.C @ inverse)
+        return StateSpace(A, B, C, system.D + through, self.period_s)
 
 
 def beyond(freqs_hz: Array) -> Array:

@@ -208,7 +208,7 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     values = np.asarray(magnitude, float)
     if values.shape != freqs.shape:
         raise DimensionError(
-            f"Magnitude fit: needs one magnitude for each of {len(freqs)} frequencies, found shape {values.shape}."
+            f"Magnitude fit: needs a magnitude at each of {len(freqs)} frequencies, found {values.shape}."
         )
     valid = np.isfinite(values) & (values >= 0)
     if not valid.all():

@@ -53,9 +53,8 @@ class RationalMagnitude:
                 f"Spectral factor: the squared magnitude is not positive and finite, {ends} at DC and Nyquist, zero or "
                 f"infinite at tau = {bad}; try another order."
             )
-        zeros, poles = (
-            [-np.sqrt(-complex(r)) for r in roots(c, self.knots)] for c in (self.numerator, self.denominator)
-        )
+        sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
+        zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in sides)
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
         if not (distance > MAGNITUDE.inside).all():
             raise KrosError(
@@ -94,6 +93,6 @@ def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
             settled = mpmath.polyroots(powers, maxsteps=60, extraprec=200, roots_init=start.tolist())
         except (mpmath.mp.NoConvergence, np.linalg.LinAlgError, ZeroDivisionError) as error:
             raise KrosError(
-                f"Spectral factor: the roots of a polynomial of degree {order} did not settle; try another order."
+                f"Spectral factor: roots of a polynomial of degree {order} did not settle; try another."
             ) from error
         return [complex(r * unit) for r in settled]

@@ -252,14 +252,7 @@ def test_results_of_the_short_way_are_plotted(demo, metrics) -> None:
     uncertain = package.quantify(models, n_freqs=50, max_order=1)
     design = package.synthesize(uncertain, "kalman_tuned", methods=())
     before = dict(matplotlib.rcParams)
-    for result in (
-        motors,
-        models,
-        uncertain,
-        next(iter(uncertain.sets.values())),
-        design,
-        RunResult(demo, metrics),
-    ):
+    for result in (motors, models, uncertain, next(iter(uncertain.sets.values())), design, RunResult(demo, metrics)):
         figure = plot(result)
         assert isinstance(figure, Figure)
         assert figure.axes

@@ -15,17 +15,7 @@ from pyarrow import parquet
 
 from kros.core import limits
 from kros.core.errors import ConfigError, DataError
-from kros.data import (
-    Channel,
-    EpisodeKey,
-    Role,
-    from_arrays,
-    from_pykoop,
-    prepare,
-    read,
-    steps,
-    write_parquet,
-)
+from kros.data import Channel, EpisodeKey, Role, from_arrays, from_pykoop, prepare, read, steps, write_parquet
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
 from kros.data.readers.parquet import read_parquet

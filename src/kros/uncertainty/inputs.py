@@ -33,10 +33,8 @@ def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
     """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
     ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
     if len(ids) != count or len(set(ids)) != count:
-        raise DimensionError(
-            f"Quantify: needs one id for each of {count} units, all different, found {len(ids)} "
-            f"({', '.join(ids[:5])} ...)."
-        )
+        problem = f"Quantify: needs one id for each of {count} units, all different"
+        raise DimensionError(f"{problem}, found {len(ids)} ({', '.join(ids[:5])} ...).")
     if count < 2:
         needs = f"uncertainty of a population needs at least two units, found {count} ({', '.join(ids)})"
         raise DataError(f"Quantify: {needs}; record more units.")
@@ -54,19 +52,15 @@ def stack_systems(models: Any) -> StateSpace:
         systems = [StateSpace.of(system) for system in models]
         kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(kinds) != 1:
-            raise DimensionError(
-                f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}; identify them alike, "
-                "and give at least two."
-            )
+            problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
+            raise DimensionError(f"{problem}; identify them alike, and give at least two.")
         n_states = max(s.n_states for s in systems)
         systems = [_padded(s, n_states) for s in systems]
         A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
         models = StateSpace(A, B, C, D, systems[0].dt)
     if len(models.batch_shape) != 1:
-        raise DimensionError(
-            f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}; "
-            "stack the units."
-        )
+        problem = f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}"
+        raise DimensionError(f"{problem}; stack the units.")
     return models
 
 
@@ -103,10 +97,8 @@ def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
     """Raise an error when a nominal that is no unit is not one stable system like the units."""
     kinds = [(s.n_outputs, s.n_inputs, s.dt) for s in (candidate, system)]
     if candidate.batch_shape or kinds[0] != kinds[1]:
-        raise DimensionError(
-            f"Quantify: the nominal should be one system with (outputs, inputs, sampling period) {kinds[1]}, found "
-            f"{kinds[0]} in a batch of {candidate.batch_shape}."
-        )
+        problem = f"Quantify: the nominal should be one system with (outputs, inputs, sampling period) {kinds[1]}"
+        raise DimensionError(f"{problem}, found {kinds[0]} in a batch of {candidate.batch_shape}.")
     _check_stable(candidate[None], ("the nominal",))
 
 
@@ -126,10 +118,8 @@ def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     worst = f"largest real part of a pole {poles.real.max():.6g}"
     if system.dt > 0:
         worst = f"spectral radius {np.abs(poles).max():.6f}"
-    raise DataError(
-        f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all); "
-        "identify with more regularisation or leave it out."
-    )
+    problem = f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all)"
+    raise DataError(f"{problem}; identify with more regularisation or leave it out.")
 
 
 def _padded(system: StateSpace, n_states: int) -> StateSpace:

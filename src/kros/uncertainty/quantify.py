@@ -210,10 +210,8 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     first = models.models()
     units = [u for u in models.facts.pooled if u in first.unit_ids]
     if len(units) < 2:
-        raise IdentificationError(
-            f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed; "
-            "record more units in the condition that feeds synthesis."
-        )
+        problem = f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed"
+        raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     nominal = choose_unit(first, units, settings)
     options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]

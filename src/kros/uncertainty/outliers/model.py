@@ -370,10 +370,8 @@ def _population(
         )
     G = check_responses(np.asarray(listed))
     if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
-        raise DataError(
-            "Outlier scores: need at least three units, one id each, and one frequency for each response; found "
-            f"{len(G)} units, {len(ids)} ids, {freqs.size} frequencies for {G.shape[1]}."
-        )
+        problem = "Outlier scores: need at least three units, one id each, and one frequency for each response"
+        raise DataError(f"{problem}; found {len(G)} units, {len(ids)} ids, {freqs.size} frequencies for {G.shape[1]}.")
     if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
         raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
     _require_finite(G, ids, freqs)

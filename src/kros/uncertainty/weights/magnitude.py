@@ -126,10 +126,8 @@ def fit_magnitude(
         if order is None and best.within_tolerance:
             break
     if best is None:
-        raise KrosError(
-            f"Magnitude fit: no system of order up to {highest} fits {len(freqs)} points; raise the order or smooth "
-            "the data."
-        )
+        problem = f"Magnitude fit: no system of order up to {highest} fits {len(freqs)} points"
+        raise KrosError(f"{problem}; raise the order or smooth the data.")
     return best
 
 
@@ -213,8 +211,6 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     valid = np.isfinite(values) & (values >= 0)
     if not valid.all():
         where = int(np.argmin(valid))
-        raise DataError(
-            f"Magnitude fit: magnitudes should be finite and not negative, found {values[where]} at {freqs[where]} Hz; "
-            "look at the responses."
-        )
+        problem = "Magnitude fit: magnitudes should be finite and not negative"
+        raise DataError(f"{problem}, found {values[where]} at {freqs[where]} Hz; look at the responses.")
     return np.maximum(values, MAGNITUDE.floor * values.max())

@@ -94,10 +94,8 @@ class UncertainModels:
         for place, outliers in self.outliers.items():
             outliers.save(folder / "outliers" / place)
         write_json(folder / "outliers" / "scores.json", {"schema": 1, "rows": self.scores})
-        content = {name: getattr(self, name) for name in _FACTS} | {
-            "kinds": list(self.sets),
-            "outliers": list(self.outliers),
-        }
+        content = {name: getattr(self, name) for name in _FACTS}
+        content |= {"kinds": list(self.sets), "outliers": list(self.outliers)}
         save_artifact(folder / "uncertainty", _KIND, content)
 
     @classmethod

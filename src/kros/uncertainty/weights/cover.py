@@ -96,7 +96,8 @@ def _descend(first: Array, size: Array, p: int) -> Array:
     count = max(COVER.frequencies, COVER.entries // (first.shape[0] * first.shape[1]))
     chosen = alive[np.unique(np.linspace(0, len(alive) - 1, count).round().astype(int))]
     E = first[..., chosen] / size[chosen]
-    E = E[:, :, _largest(sigma_max_first(E))]
+    leading = np.argsort(-sigma_max_first(E), axis=0)[: COVER.units]  # all others are covered by the scale
+    E = E[:, :, np.unique(leading)]
     x = np.zeros((n, len(chosen)))
     for power in COVER.squarings:
         for _ in range(COVER.newton):
@@ -104,12 +105,6 @@ def _descend(first: Array, size: Array, p: int) -> Array:
             if moved < COVER.settled:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
-
-
-def _largest(sizes: Array) -> Array:
-    """Indices of the units that are among the largest residuals anywhere; the others are covered by the scale."""
-    order = np.argsort(-sizes, axis=0)[: COVER.units]
-    return np.unique(order)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +119,8 @@ class _Smooth:
         """Return the cost, shape (frequency,), and its gradient, shape of x."""
         p, m = self.p, len(x) - self.p
         M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
-        top = np.sqrt(
-            squared(M).sum(axis=(0, 1)).max(axis=0)
-        )  # no smaller than the largest singular value, and at most four times
+        # no smaller than the largest singular value, and at most four times
+        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
         M = M / top
         wide = p <= m
         power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
@@ -136,13 +130,8 @@ class _Smooth:
         marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
         total = marginal.sum(axis=(0, 1))
         q = 2**self.squarings + 1
-        cost = (
-            x[:p].mean(axis=0)
-            + np.log(top)
-            + np.log(total) / (2 * q)
-            + COVER.pull / 2 * (x**2).sum(axis=0)
-            + x[p:].mean(axis=0)
-        )
+        pull = COVER.pull / 2 * (x**2).sum(axis=0)
+        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + pull + x[p:].mean(axis=0)
         gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
         return cost, gradient + COVER.pull * x
 

@@ -164,11 +164,9 @@ class ResidualSystems:
     def modes_hz(self, grid_hz: Array) -> Array:
         """Return frequencies in and around every mode of residuals and plants."""
         dt = self.nominal.dt
-        plants = [
-            Descriptor.of(self.nominal),
-            *(Descriptor.of(self.units[k]) for k in range(self.units.batch_shape[0])),
-        ]
-        modes = np.concatenate([system.poles() for system in (*self, *plants)]).astype(complex)
+        plants = (self.nominal, *(self.units[k] for k in range(self.units.batch_shape[0])))
+        systems = (*self, *map(Descriptor.of, plants))
+        modes = np.concatenate([system.poles() for system in systems]).astype(complex)
         light = modes[(modes.imag > 0) & (np.abs(modes.real) <= PROOF.light * np.abs(modes))]
         at_hz = np.arctan(light.imag) / (np.pi * dt)
         width = np.abs(light.real) / (1 + light.imag**2) / (np.pi * dt)

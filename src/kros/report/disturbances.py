@@ -82,7 +82,5 @@ def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str
 def doublings(facts: Facts) -> dict[str, dict[Kind, str]]:
     """Return by observer and kind the severity at which its error doubles in the condition of the models."""
     tried, measured = curves(facts.get("robustness", []), facts.study["identify_on"]), facts.measured
-    return {
-        name: {kind: doubling(kind, lines[kind], measured) for kind in AXES if kind in lines}
-        for name, lines in tried.items()
-    }
+    pairs = {name: [(kind, lines[kind]) for kind in AXES if kind in lines] for name, lines in tried.items()}
+    return {name: {kind: doubling(kind, of, measured) for kind, of in lines} for name, lines in pairs.items()}

@@ -185,23 +185,16 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     """Tell whether an additive remainder is needed, and warn."""
     unknown = int(np.isnan(ratio).sum())
     if unknown:
-        _LOG.warning(
-            "Uncertainty form %s: near singular (condition above 1e12) for %d of %d units and frequencies; the "
-            "misfit is unknown there.",
-            form.value,
-            unknown,
-            ratio.size,
-        )
+        text = "Uncertainty form %s: near singular for %d of %d units and frequencies; the misfit is unknown there."
+        _LOG.warning(text, form.value, unknown, ratio.size)
     largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
     if largest <= SET.exact and not unknown:
         return False
-    _LOG.log(
-        logging.WARNING if largest > SET.warned else logging.INFO,
-        "Uncertainty form %s cannot represent up to %.3g of a unit's response; the difference is covered by an "
-        "additive term. The additive form needs none.",
-        form.value,
-        largest,
+    text = (
+        "Uncertainty form %s cannot represent up to %.3g of a unit's response; an additive term covers the difference."
     )
+    level = logging.WARNING if largest > SET.warned else logging.INFO
+    _LOG.log(level, f"{text} The additive form needs none.", form.value, largest)
     return True
 
 

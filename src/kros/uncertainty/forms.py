@@ -172,12 +172,8 @@ def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals:
     form, G = as_form(form), check_responses(responses)
     rows = range(len(G)) if nominals is None else nominals
     others = (np.delete(G, j, axis=0) for j in rows)
-    return np.array(
-        [
-            sigma_max(residual(form, G[j], Gp, paper=paper)).max(axis=0, initial=0.0)
-            for j, Gp in zip(rows, others, strict=True)
-        ]
-    )
+    sizes = (sigma_max(residual(form, G[j], Gp, paper=paper)) for j, Gp in zip(rows, others, strict=True))
+    return np.array([size.max(axis=0, initial=0.0) for size in sizes])
 
 
 def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None = None) -> Array:

@@ -186,14 +186,8 @@ class UncertainModel(Uncertainty):
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
         if content["remainder"] is not None:
             facts["remainder"], facts["remainder_cover"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
-        return cls(
-            nominal_system=_unpack_system("nominal", arrays, dt),
-            bounds={form: arrays[f"bound_{form.value}"] for form in nominals},
-            nominals=nominals,
-            cover=cover,
-            weight=weight,
-            **facts,
-        )
+        facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
+        return cls(nominal_system=_unpack_system("nominal", arrays, dt), cover=cover, weight=weight, **facts)
 
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")

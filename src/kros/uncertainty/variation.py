@@ -97,12 +97,8 @@ class VariationAndNoise:
         content, arrays = load_artifact(Path(folder), "variation_and_noise")
         axes = {"freqs_hz": "f", "residual": "uf", "total": "f", "noise": "f"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
-        return cls(
-            form=Form(content["form"]),
-            unit_ids=tuple(content["unit_ids"]),
-            nominal=content["nominal"],
-            **{name: arrays[name] for name in _ARRAYS},
-        )
+        facts = {name: arrays[name] for name in _ARRAYS} | {"nominal": content["nominal"]}
+        return cls(form=Form(content["form"]), unit_ids=tuple(content["unit_ids"]), **facts)
 
 
 def variation_and_noise(

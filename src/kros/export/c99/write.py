@@ -117,14 +117,8 @@ def c_files(
         "golden": _golden(observer, source, track, _TOLERANCE[precision]),
     }
     context["state_bytes"] = _state_bytes(context)
-    texts = {
-        f"{name}.h": "observer.h",
-        f"{name}.c": "observer.c",
-        f"{name}_selftest.c": "selftest.c",
-        "example_main.c": "example_main.c",
-        "CMakeLists.txt": "CMakeLists.txt",
-        "README.md": "README.md",
-    }
+    texts = {f"{name}.h": "observer.h", f"{name}.c": "observer.c", f"{name}_selftest.c": "selftest.c"}
+    texts |= {file: file for file in ("example_main.c", "CMakeLists.txt", "README.md")}
     manifest = _manifest(observer, context) | ({} if track is None else {"tracked": track})
     return rendered("kros.export.c99", texts, context) | {"manifest.json": json_bytes(manifest).decode()}
 

@@ -49,14 +49,8 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
     for score in model.scores:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
-        axes.plot(
-            [place, place],
-            [score.lowest_db + shift, score.highest_db + shift],
-            color=tone.light,
-            lw=3.5,
-            alpha=0.3,
-            solid_capstyle="butt",
-        )
+        ends = [score.lowest_db + shift, score.highest_db + shift]
+        axes.plot([place, place], ends, color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
         (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:

@@ -41,7 +41,7 @@ def write_figures(run: Path, out: Path, progress: Progress | None = None) -> lis
     out : Path
         Folder for the files; created where it is missing.
     progress : Progress, optional
-        Told of every figure.
+        Shows how many figures are done.
 
     Returns
     -------

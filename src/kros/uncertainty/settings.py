@@ -93,6 +93,10 @@ class MagnitudeRule:
     exceeded: float = 1e-10  # rounding of rows of size one
     across: float = 1e-11  # rounding of their changes
     real: float = 1e-12  # relative imaginary part up to which a root is real
+    real_section: float = 1e-9  # the same of sections
+    far: float = 1e30  # tau at Nyquist
+    damping: float = 3e-3  # least, of a pair of zeros or poles
+    widest: float = 40.0  # y of a pair: two real ones 17 decades apart
     inside: float = 1e-13  # least distance of poles and zeros from the unit circle
     digits: int = 30  # of the arithmetic of roots, which spread over twice as many decades as frequencies
 

@@ -21,13 +21,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, gain
+from ..settings import MAGNITUDE
 
 Array = npt.NDArray[Any]
 
-_FAR = 1e30  # tau at Nyquist
-_NARROW, _WIDE = np.log(4 * 3e-3**2), 40.0  # y: a damping of 0.003, and two real ones 17 decades apart
 _TINY = np.finfo(float).tiny
-_REAL = 1e-9  # relative imaginary part below which a root is real: rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +92,7 @@ class Sections:
         """Return sections with all parameters moved, corners kept within ends."""
         n, k = len(self.level), len(self.corner)
         width = self.width.copy()
-        width[self.pair] = np.clip(width[self.pair] + step[n + k :], _NARROW, _WIDE)
+        width[self.pair] = np.clip(width[self.pair] + step[n + k :], np.log(4 * MAGNITUDE.damping**2), MAGNITUDE.widest)
         corner = np.clip(self.corner + step[n : n + k], *ends)
         return replace(self, level=self.level + step[:n], corner=corner, width=width)
 
@@ -137,14 +135,14 @@ class Sections:
         return roots
 
     def _variables(self, tau: Array) -> tuple[Array, Array]:
-        u = np.minimum(tau, _FAR) * np.exp(-self.corner)[:, None]
+        u = np.minimum(tau, MAGNITUDE.far) * np.exp(-self.corner)[:, None]
         return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _TINY)
 
 
 def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:
     """Return sections (pair, x, y) of roots: complex pairs, real ones with their neighbours."""
-    real = sorted(-r.real for r in roots if abs(r.imag) <= _REAL * abs(r))
-    upper = [r for r in roots if r.imag > _REAL * abs(r)]
+    real = sorted(-r.real for r in roots if abs(r.imag) <= MAGNITUDE.real_section * abs(r))
+    upper = [r for r in roots if r.imag > MAGNITUDE.real_section * abs(r)]
     rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in upper]
     if len(real) % 2:
         rows.append((False, 2 * np.log(real.pop(len(real) // 2)), 0.0))

@@ -109,6 +109,15 @@ class Screened:
         y, u, at = self.y[:, members], self.u[:, members], (slice(None), members)
         return Screened(y, u, self.status[at], self.starts[at], self.complete[at], held)
 
+    def rows(self, part: slice) -> Screened:
+        """Return some samples of all members."""
+        return Screened(self.y[part], self.u[part], self.status[part], self.starts[part], self.complete[part], self.held)
+
+    def after(self, before: Screened) -> Screened:
+        """Return the samples behind earlier ones."""
+        names = ("y", "u", "status", "starts", "complete")
+        return Screened(*(np.concatenate([getattr(part, name) for part in (before, self)]) for name in names), self.held)
+
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
     """Refuse measurements and inputs that do not fit together, or to an observer."""
@@ -212,11 +221,11 @@ def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
     return screened(observer, y, u).status
 
 
-def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike) -> Screened:
-    """Return a batch of samples as an observer takes them."""
+def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
+    """Return a batch of samples as an observer takes them; `held` is known before the first."""
     y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
     require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
-    return Screen.of(observer).take(y, u)
+    return Screen.of(observer).take(y, u, held)
 
 
 def _bit(wrong: Flags, bit: SampleStatus) -> Bits:

@@ -109,7 +109,10 @@ def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch
     y[100:170], y[340:] = np.sin(np.arange(70))[:, None, None], 0.5  # where nothing is missing
     if kind == "history":
         lifting = Lifting(("x", "v"), ("x[-2]*v", "tanh(v)"), (), ("u",), ("v*u[-1]",))
-        A_l, B_l = np.vstack([np.hstack([0.9 * np.eye(2), [[0.1, 0.05], [0.02, 0.1]]]), np.zeros((2, 4))]), np.ones((4, 2))
+        A_l, B_l = (
+            np.vstack([np.hstack([0.9 * np.eye(2), [[0.1, 0.05], [0.02, 0.1]]]), np.zeros((2, 4))]),
+            np.ones((4, 2)),
+        )
         K_l = StateSpace(K.A, K.B, np.vstack([K.C, [[0.0], [0.0]]]), np.vstack([K.D, [[0.0], [0.0]]]), DT)
         o = Observer("h", lifting, A_l, 0.01 * B_l, (0,), ("u",), K_l, Injection.STATE, DT, runtime=Runtime(delay))
     elif kind == "bank":

@@ -22,8 +22,9 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import IntFlag
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -111,12 +112,15 @@ class Screened:
 
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
-        return Screened(self.y[part], self.u[part], self.status[part], self.starts[part], self.complete[part], self.held)
+        return Screened(
+            self.y[part], self.u[part], self.status[part], self.starts[part], self.complete[part], self.held
+        )
 
     def after(self, before: Screened) -> Screened:
         """Return the samples behind earlier ones."""
         names = ("y", "u", "status", "starts", "complete")
-        return Screened(*(np.concatenate([getattr(part, name) for part in (before, self)]) for name in names), self.held)
+        both: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in (before, self)]) for name in names}
+        return replace(self, **both)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:

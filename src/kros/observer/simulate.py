@@ -359,7 +359,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
     course.leave(samples)
     if d:
         _predict(observer, x, earlier, pending, samples, values)
-    return Stepped(*(part[lead:] for part in (x, nu, status, starts, moving, followed)))
+    return Stepped(x[lead:], nu[lead:], status[lead:], starts[lead:], moving[lead:], followed[lead:])
 
 
 def _pending(starts: Flags, delay: int, since: npt.ArrayLike = -1) -> Whole:
@@ -393,9 +393,7 @@ class Compiled:
     restarted: Flags  # (observer, batch): whether a machine left its bounds, from where on it stands still
 
 
-def _compiled(
-    loops: Library, courses: Sequence[Course], samples: Screened, innovations: bool = False
-) -> Compiled:
+def _compiled(loops: Library, courses: Sequence[Course], samples: Screened, innovations: bool = False) -> Compiled:
     """Run observers of one model on in the compiled loop; those that leave their bounds stay where they were."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay

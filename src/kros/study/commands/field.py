@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +22,7 @@ from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibrate import segments_of
-from ...observer import Observer, run_with_status, track_parameter
+from ...observer import Course, Observer, run_with_status, track_parameter
 from ...observer.screen import Bits, SampleStatus, sample_status
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
@@ -30,7 +33,7 @@ log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
 DEPLOYED = ("observers", "deployed.json")
-_BATCH, _SAMPLES = 64, 200_000  # episodes at a time, and their samples
+_BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
@@ -214,55 +217,103 @@ class FieldRecordings:
 
     def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
-        chosen, seen = list[EpisodeKey](), 0
+        chosen, values = dict[EpisodeKey, Array](), self.values[unit]
         for key in self.population.keys(unit)[:_BATCH]:
-            if seen < samples:
-                chosen, seen = [*chosen, key], seen + len(self.population.read(key))
-        values = self.values[unit]
-        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, samples)
+            if sum(map(len, chosen.values())) < samples:
+                chosen[key] = next(self.population.blocks(key, samples))
+        arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
         coarse = least_innovation(*signals, np.arange(phases) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
-    def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
+    @cached_property
+    def _parameters(self) -> Values:
+        return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
+
+    def batches(self, keys: tuple[EpisodeKey, ...]) -> Iterator[Arriving]:
         """Read episodes, long ones one by one, so that memory does not grow with their number."""
-        keys = keys or self.population.episodes
-        values = {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
         start, count = 0, 1
         while start < len(keys):
-            batch = arriving(self.observer, self.population, keys[start : start + count], values)
+            episodes = {key: self.population.read(key) for key in keys[start : start + count]}
+            batch = arriving(self.observer, self.population, episodes, self._parameters)
             start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
             yield batch
 
-    def estimates(self, arrived: Arriving) -> tuple[Array, Array | None, Bits]:
-        """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
-        observer, n, units = self.observer, len(self.observer.recorded), arrived.batch.units
-        estimates, status = np.empty((*arrived.y.shape[:2], n)), sample_status(observer, arrived.y, arrived.u)
-        rows = [i for i, unit in enumerate(units) if unit in self.followed]
-        others = [i for i in range(len(units)) if i not in rows]
-        if others:
-            parameters = arrived.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, arrived.y[:, others], arrived.u[:, others], parameters)
-            estimates[:, others] = x[..., :n]
-        if self.name is None:
-            return estimates, None, status
-        followed = np.tile(arrived.batch.parameters[self.name], (len(arrived.y), 1))
-        if rows:
-            parameters = arrived.parameters(observer, rows)
-            tracked = track_parameter(observer, arrived.y[:, rows], arrived.u[:, rows], parameters, self.name)
-            estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
-            status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
-        return estimates, followed, status
+    def estimates(self) -> Iterator[Estimated]:
+        """Run the observer over all episodes: short ones side by side, long ones in blocks."""
+        short: dict[EpisodeKey, Array] = {}
+        for key in self.population.episodes:
+            blocks = self.population.blocks(key, _BLOCK)
+            first, second = next(blocks), next(blocks, None)
+            longest = max(len(first), *map(len, short.values()), 0)
+            if short and (second is not None or len(short) == _BATCH or (len(short) + 1) * longest > _SAMPLES):
+                yield from self._together(short)
+                short = {}
+            if second is None:
+                short[key] = first
+            else:
+                yield from self._in_blocks(key, chain((first, second), blocks))
+        if short:
+            yield from self._together(short)
 
-    def count_status(self, arrived: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
-        """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
-        status = sample_status(self.observer, arrived.y, arrived.u) if status is None else status
-        for i, (unit, length) in enumerate(zip(arrived.batch.units, arrived.batch.lengths, strict=True)):
-            of_unit = counts.setdefault(unit, {})
-            for bit in SampleStatus:
-                if number := int(np.count_nonzero(status[:length, i] & bit)):
-                    of_unit[str(bit.name)] = of_unit.get(str(bit.name), 0) + number
+    def _together(self, episodes: Mapping[EpisodeKey, Array]) -> Iterator[Estimated]:
+        """Run over whole episodes side by side."""
+        arrived, parts = arriving(self.observer, self.population, episodes, self._parameters), dict[int, Estimated]()
+        for followed in (False, True):
+            rows = [i for i, key in enumerate(episodes) if (key.unit in self.followed) is followed]
+            if not rows:
+                continue
+            signals = self.observer, arrived.y[:, rows], arrived.u[:, rows], arrived.parameters(self.observer, rows)
+            if followed:
+                run = track_parameter(*signals, str(self.name))
+                restarted = np.where(run.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
+                x, status, values = run.estimates, sample_status(*signals[:3]) | restarted, run.values
+            else:
+                (x, status), values = run_with_status(*signals), None
+            for j, i in enumerate(rows):
+                key, some = arrived.batch.keys[i], np.s_[: arrived.batch.lengths[i], j]
+                parts[i] = self._estimated(key, 0, x[some], status[some], None if values is None else values[some])
+        yield from (parts[i] for i in sorted(parts))
+
+    def _in_blocks(self, key: EpisodeKey, blocks: Iterable[Array]) -> Iterator[Estimated]:
+        """Run over one episode, block by block, each behind the samples that late measurements are read from."""
+        observer, own = self.observer, self.observer.own(self._parameters[key.unit])
+        loop = PhaseLockedLoop(observer, str(self.name), 1) if key.unit in self.followed else None
+        course, start = Course(observer, 1, own, loop), 0
+        late, before = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0)), None
+        for block in blocks:
+            lead = 0 if before is None else len(before)
+            values = block if before is None else np.concatenate([before, block])
+            arrived = arriving(observer, self.population, {key: values}, self._parameters)
+            run = course.take(arrived.y[lead:], arrived.u[lead:])
+            followed = None if loop is None else run.followed[:, 0]
+            yield self._estimated(key, start, run.estimates[:, 0], run.status[:, 0], followed)
+            start, before = start + len(block), values[max(0, len(values) - late) :]
+
+    def _estimated(self, key: EpisodeKey, start: int, x: Array, status: Bits, followed: Array | None) -> Estimated:
+        columns = x[:, : len(self.observer.recorded)]
+        if self.name is not None:
+            known = self._parameters[key.unit][self.name] if followed is None else followed
+            columns = np.column_stack([columns, np.broadcast_to(known, len(columns))])
+        return Estimated(key, start, columns, status)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimated:
+    """Estimates of an episode, or of a block of it that starts at a sample."""
+
+    key: EpisodeKey
+    start: int
+    columns: Array  # (n_samples, n), and the parameter that is followed, where there is one
+    status: Bits  # (n_samples,)
+
+
+def count_status(counts: dict[str, int], status: Bits) -> None:
+    """Add to the samples that are missing, invalid, beyond limits, or restart the observer."""
+    for bit in SampleStatus:
+        if number := int(np.count_nonzero(status & bit)):
+            counts[str(bit.name)] = counts.get(str(bit.name), 0) + number
 
 
 def _trackable(observer: Observer, name: str) -> bool:

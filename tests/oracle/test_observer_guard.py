@@ -8,7 +8,8 @@ import pytest
 from kros.core import StateSpace
 from kros.export import CompiledObserver, export_c
 from kros.lifting import Lifting
-from kros.observer import Course, FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
+from kros.observer import FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
+from kros.observer.simulate import Course
 from kros.synthesis import Injection
 
 DT, SETTLE, BOUND = 0.01, 4, np.array([3.0, 5.0])

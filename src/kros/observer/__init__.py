@@ -27,11 +27,10 @@ from .running import Estimate, RunningObserver
 from .runtime import Guard, Runtime, Seen
 from .screen import SampleStatus, sample_status
 from .sensor import Sensor
-from .simulate import Course, run_observer, run_observers, run_with_status
+from .simulate import run_observer, run_observers, run_with_status
 from .tracking import Tracked, track_parameter
 
 __all__ = [
-    "Course",
     "Estimate",
     "EstimatorSettings",
     "ExtendedKalman",

@@ -140,7 +140,7 @@ class Gaps:
         x[:, self.measured] = np.where(missing, expected, y)
 
     def apart(self, x: Array, y: Array) -> Array:
-        """Return the next offset from the fallback, after states (batch, n) and what is known of measurements, (batch, q)."""
+        """Return the next offset from the fallback, after states (batch, n) and measurements, (batch, q)."""
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = y
         return np.asarray(self.bank.forget * (last - x[:, self.fallback]))

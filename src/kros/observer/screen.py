@@ -22,9 +22,8 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from enum import IntFlag
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -39,8 +38,7 @@ Whole = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _ANY = np.finfo(float).max
-
-
+_SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start
 
 
@@ -112,15 +110,14 @@ class Screened:
 
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
-        return Screened(
-            self.y[part], self.u[part], self.status[part], self.starts[part], self.complete[part], self.held
-        )
+        y, u, status, starts, complete = (getattr(self, name)[part] for name in _SIGNALS)
+        return Screened(y, u, status, starts, complete, self.held)
 
     def after(self, before: Screened) -> Screened:
         """Return the samples behind earlier ones."""
-        names = ("y", "u", "status", "starts", "complete")
-        both: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in (before, self)]) for name in names}
-        return replace(self, **both)
+        both = (np.concatenate([getattr(before, name), getattr(self, name)]) for name in _SIGNALS)
+        y, u, status, starts, complete = both
+        return Screened(y, u, status, starts, complete, self.held)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:

@@ -257,27 +257,7 @@ class Restarts:
 
 
 class Course:
-    """An observer on its way through recordings that come in blocks: all that a block leaves for the next one.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    batch : int
-        Machines side by side.
-    parameters : mapping of str to array_like, shape (batch,), optional
-    loop : Loop, optional
-        Makes a parameter follow.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Course, Observer
-    >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
-    >>> course = Course(observer)
-    >>> [course.take(np.full((2, 1, 1), y), np.zeros((2, 1, 1))).estimates.ravel().tolist() for y in (4.0, np.nan)]
-    [[4.0, 2.0], [1.0, 0.5]]
-    """
+    """An observer on its way through recordings that come in blocks: all that a block leaves for the next one."""
 
     def __init__(
         self, observer: ObserverData, batch: int = 1, parameters: Parameters | None = None, loop: Loop | None = None
@@ -363,7 +343,7 @@ def stepped(course: Course, samples: Screened) -> Stepped:
 
 
 def _pending(starts: Flags, delay: int, since: npt.ArrayLike = -1) -> Whole:
-    """Samples between a state and the row that it is recorded in, shape (n_samples, batch); `since` before the first."""
+    """Samples between a state and the row that it is recorded in, (n_samples, batch); `since` before the first."""
     row, first = np.arange(len(starts))[:, None], np.broadcast_to(-1 - np.asarray(since), (1, starts.shape[1]))
     begun = np.maximum.accumulate(np.where(starts, row, first), axis=0)
     return np.minimum(row - np.concatenate([first, begun[:-1]]), delay)

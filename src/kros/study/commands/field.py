@@ -22,8 +22,9 @@ from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibrate import segments_of
-from ...observer import Course, Observer, run_with_status, track_parameter
+from ...observer import Observer, run_with_status, track_parameter
 from ...observer.screen import Bits, SampleStatus, sample_status
+from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
 from ..engine.store import Store

@@ -24,11 +24,9 @@ class Arriving:
     y: Array
     u: Array
 
-    def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
-        """Return the lifting parameters of some episodes."""
-        return {
-            name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()
-        }
+    def parameters(self, observer: Observer) -> dict[str, npt.ArrayLike]:
+        """Return the lifting parameters of all episodes."""
+        return observer.own(self.batch.parameters)
 
 
 def arriving(

@@ -141,7 +141,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
             status = sample_status(observer, arrived.y, arrived.u)
             count_status(counts, np.where(np.arange(len(status))[:, None] < arrived.batch.lengths, status, 0))
             if monitor is not None:
-                values = arrived.parameters(observer, list(range(len(arrived.batch.keys))))
+                values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
                 judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
         level = highest_level(monitor, judged, condition)

@@ -42,10 +42,10 @@ def estimate_recordings(
         counts: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
             factors = recorded_factors(recordings.observer, recordings.observer.recorded)
-            for part in recordings.estimates():
-                part.columns[:, : len(factors)] /= factors
-                write(part.key, part.start, part.columns)
-                count_status(counts.setdefault(part.key.unit, {}), part.status)
+            for key, start, columns, status in recordings.estimates():
+                columns[:, : len(factors)] /= factors
+                write(key, start, columns)
+                count_status(counts.setdefault(key.unit, {}), status)
     count = len(recordings.population.episodes)
     return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
 

@@ -22,8 +22,8 @@ from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibrate import segments_of
-from ...observer import Observer, run_with_status, track_parameter
-from ...observer.screen import Bits, SampleStatus, sample_status
+from ...observer import Observer
+from ...observer.screen import Bits, SampleStatus
 from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
@@ -33,6 +33,8 @@ from ..stages.read import ARRAYS
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
+# Episode, first sample, columns of estimates and of the parameter that is followed, bits: of an episode or a block of it
+Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
 _BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer
 
@@ -247,67 +249,36 @@ class FieldRecordings:
         for key in self.population.episodes:
             blocks = self.population.blocks(key, _BLOCK)
             first, second = next(blocks), next(blocks, None)
-            longest = max(len(first), *map(len, short.values()), 0)
-            if short and (second is not None or len(short) == _BATCH or (len(short) + 1) * longest > _SAMPLES):
-                yield from self._together(short)
+            full = (len(short) + 1) * max(len(first), *map(len, short.values()), 0) > _SAMPLES or len(short) == _BATCH
+            others = any((key.unit in self.followed) != (other.unit in self.followed) for other in short)
+            if short and (second is not None or full or others):
+                yield from self._run(tuple(short), [list(short.values())])
                 short = {}
             if second is None:
                 short[key] = first
             else:
-                yield from self._in_blocks(key, chain((first, second), blocks))
+                yield from self._run((key,), ([block] for block in chain((first, second), blocks)))
         if short:
-            yield from self._together(short)
+            yield from self._run(tuple(short), [list(short.values())])
 
-    def _together(self, episodes: Mapping[EpisodeKey, Array]) -> Iterator[Estimated]:
-        """Run over whole episodes side by side."""
-        arrived, parts = arriving(self.observer, self.population, episodes, self._parameters), dict[int, Estimated]()
-        for followed in (False, True):
-            rows = [i for i, key in enumerate(episodes) if (key.unit in self.followed) is followed]
-            if not rows:
-                continue
-            signals = self.observer, arrived.y[:, rows], arrived.u[:, rows], arrived.parameters(self.observer, rows)
-            if followed:
-                run = track_parameter(*signals, str(self.name))
-                restarted = np.where(run.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
-                x, status, values = run.estimates, sample_status(*signals[:3]) | restarted, run.values
-            else:
-                (x, status), values = run_with_status(*signals), None
-            for j, i in enumerate(rows):
-                key, some = arrived.batch.keys[i], np.s_[: arrived.batch.lengths[i], j]
-                parts[i] = self._estimated(key, 0, x[some], status[some], None if values is None else values[some])
-        yield from (parts[i] for i in sorted(parts))
-
-    def _in_blocks(self, key: EpisodeKey, blocks: Iterable[Array]) -> Iterator[Estimated]:
-        """Run over one episode, block by block, each behind the samples that late measurements are read from."""
-        observer, own = self.observer, self.observer.own(self._parameters[key.unit])
-        loop = PhaseLockedLoop(observer, str(self.name), 1) if key.unit in self.followed else None
-        course, start = Course(observer, 1, own, loop), 0
-        late, before = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0)), None
+    def _run(self, keys: tuple[EpisodeKey, ...], blocks: Iterable[list[Array]]) -> Iterator[Estimated]:
+        """Run over episodes, block by block, each behind the samples that late measurements are read from."""
+        observer, n, start, course = self.observer, len(self.observer.recorded), 0, None
+        loop = PhaseLockedLoop(observer, str(self.name), len(keys)) if keys[0].unit in self.followed else None
+        late = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0))
+        before = [np.empty((0, len(self.population.channels)))] * len(keys)
         for block in blocks:
-            lead = 0 if before is None else len(before)
-            values = block if before is None else np.concatenate([before, block])
-            arrived = arriving(observer, self.population, {key: values}, self._parameters)
+            values, lead = [np.concatenate(pair) for pair in zip(before, block, strict=True)], len(before[0])
+            arrived = arriving(observer, self.population, dict(zip(keys, values, strict=True)), self._parameters)
+            course = course or Course(observer, len(keys), arrived.parameters(observer), loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
-            followed = None if loop is None else run.followed[:, 0]
-            yield self._estimated(key, start, run.estimates[:, 0], run.status[:, 0], followed)
-            start, before = start + len(block), values[max(0, len(values) - late) :]
-
-    def _estimated(self, key: EpisodeKey, start: int, x: Array, status: Bits, followed: Array | None) -> Estimated:
-        columns = x[:, : len(self.observer.recorded)]
-        if self.name is not None:
-            known = self._parameters[key.unit][self.name] if followed is None else followed
-            columns = np.column_stack([columns, np.broadcast_to(known, len(columns))])
-        return Estimated(key, start, columns, status)
-
-
-@dataclass(frozen=True, eq=False)
-class Estimated:
-    """Estimates of an episode, or of a block of it that starts at a sample."""
-
-    key: EpisodeKey
-    start: int
-    columns: Array  # (n_samples, n), and the parameter that is followed, where there is one
-    status: Bits  # (n_samples,)
+            columns = run.estimates[..., :n]
+            if self.name is not None:
+                known = arrived.batch.parameters[self.name] if loop is None else run.followed
+                columns = np.concatenate([columns, np.broadcast_to(known, columns.shape[:2])[..., None]], axis=-1)
+            for i, key in enumerate(keys):
+                yield key, start, columns[: len(block[i]), i], run.status[: len(block[i]), i]
+            start, before = start + len(block[0]), [part[max(0, len(part) - late) :] for part in values]
 
 
 def count_status(counts: dict[str, int], status: Bits) -> None:

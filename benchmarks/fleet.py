@@ -93,11 +93,13 @@ def simulate(folder: Path, units: int, seconds: float) -> None:
 def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     """Run the stages and return processor time, s, and the largest memory after each, GB."""
     import kros
+    from kros.core.work import Work
     from kros.data.survey import survey
-    from kros.identify.calibrate import calibrate
-    from kros.identify.identify import identify
+    from kros.identify.calibration import calibrate
+    from kros.identify.identified import IdentifiedModels
+    from kros.identify.identify import with_models
     from kros.identify.presets import resolve_lifting, resolve_phase
-    from kros.identify.settings import CalibrationSettings, LiftingSettings
+    from kros.identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
     from kros.uncertainty.outliers.population import score_population
     from kros.uncertainty.quantify import choose_unit, quantify_kind
     from kros.uncertainty.settings import UncertaintySettings
@@ -129,7 +131,8 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     with stage("calibrate"):
         calibration = calibrate(population, facts, spec)
     with stage("identify"):
-        models = identify(population, lifting, facts=facts, calibration=calibration, refine=refine)
+        base = IdentifiedModels(population, facts, lifting, calibration)
+        models = with_models(base, IdentifySettings(refine=refine), Work())
     with stage("outliers"):
         _, scores = score_population(models, settings)
     with stage("nominal"):

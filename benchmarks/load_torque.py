@@ -26,9 +26,8 @@ from kros.evaluate.errors import error_spectrum
 from kros.identify import PhaseSpec
 from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
-from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, load_from_current, load_observer
-from kros.motor_drive.from_current import load_accuracy
-from kros.motor_drive.signals import low_passed, without_level
+from kros.motor_drive import AngleLoad, LoadSettings, TorqueScale, load_observer
+from kros.motor_drive.signals import load_accuracy, low_passed, without_level
 from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
 from kros.observer.residual.models import one_step_rows
 from kros.observer.residual.one_step import one_step_residual
@@ -176,23 +175,15 @@ class Drives:
     def learned(self, kind: str, level_s: float) -> dict[str, Any]:
         """The observer that learned from the known load."""
         lifting = Lifting(self.population.states, FUNCTIONS[kind], ("phase",) if FUNCTIONS[kind] else ())
-        calibration = calibrate_load(
-            lifting,
-            (0,),
-            self.train,
-            self.loads[0],
-            CURRENT,
-            level_s,
-            REAL_HZ,
-            LIMIT,
-        )
-        observer = load_observer(f"{kind}/load", calibration, self.population.inputs)
+        settings = LoadSettings(CURRENT, level_s, REAL_HZ, LIMIT)
+        data = self.train, self.loads[0]
+        observer, left_out = load_observer(f"{kind}/load", lifting, (0,), self.population.inputs, *data, settings)
         estimate = run_observer(observer, self.test.states[..., :1], self.test.inputs, self.parameters(kind, self.test))
         seen = estimate[..., 3]
         limit = np.inf if self.options.unlimited else 1.0
         found = AngleLoad(level_s, self.dt, limit=limit).run(seen, estimate[..., CURRENT], self.test.states[..., 0])
         row = self.judged(f"{kind}, known load, {level_s:g} s", found.load, seen, level_s)
-        row |= {"current": self.current_percent(found.current), "left out": len(calibration.left_out)}
+        row |= {"current": self.current_percent(found.current), "left out": len(left_out)}
         if self.options.certify:
             certificate = relift_certificate(observer)
             row["certified"] = bool(certificate.certified)
@@ -268,8 +259,8 @@ class Drives:
             estimate = run_observer(observer, batch.states[..., :1], batch.inputs, self.parameters(kind, batch))
             errors.append(batch.states[..., CURRENT] - estimate[..., CURRENT])
         loaded = [i for i, k in enumerate(self.train.keys) if k.condition == "load"]
-        scale = calibrate_torque(errors[0][:, loaded], self.loads[0][:, loaded], self.dt)
-        load = load_from_current(errors[1], 0.0, scale)
+        scale = TorqueScale.calibrated(errors[0][:, loaded], self.loads[0][:, loaded], self.dt)
+        load = scale.load(errors[1])
         row = self.judged(f"{kind}, from the recorded current", load, load, None)
         return [
             row

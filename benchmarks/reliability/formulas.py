@@ -22,8 +22,8 @@ from campaign import LONGEST_S, Tally, main
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting
-from kros.lifting.c_code import c_code
 from kros.lifting.families import check_family
+from kros.lifting.program import c_code
 
 DIGITS, NAMES = 60, ("x", "y", "p")
 BOX = {"x": (-1.5, 2.0), "y": (0.3, 1.1), "p": (-0.4, 0.4)}

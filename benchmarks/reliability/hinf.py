@@ -159,9 +159,9 @@ def attained(p: GeneralizedPlant, own: StateSpace, value: float) -> tuple[float,
         for share in LEVELS:
             for K in controllers(easier, share * value):
                 best = min(best, norm(*closed_loop(p, K), p.dt, below=best))
-    for share in () if SLYCOT else (0.7, 0.995):
+    for tolerance in () if SLYCOT else (0.3, 0.005):
         try:
-            best = min(best, norm(*closed_loop(p, hinf(p, gamma=share * value).controller), p.dt))
+            best = min(best, norm(*closed_loop(p, hinf(p, tolerance=tolerance).controller), p.dt))
         except KrosError:
             continue
     return mine, best

@@ -1,4 +1,5 @@
-"""One suite over all families: C computes what NumPy does, derivatives are finite differences, bounds hold every sample."""
+"""One suite over all families: C computes what NumPy does, derivatives are finite differences, bounds hold every
+sample."""
 
 import shutil
 import subprocess
@@ -9,7 +10,7 @@ from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 
 from kros.core.errors import ConfigError
 from kros.lifting import Lifting, radial
-from kros.lifting.c_code import c_code
+from kros.lifting.program import c_code
 
 BOX = {"position": (-1.5, 1.2), "velocity": (0.1, 2.0), "voltage": (-3.0, 3.0)}
 PHASE = (0.2, 0.9)
@@ -42,9 +43,9 @@ def test_c_computes_what_numpy_does(lifting, tmp_path):
         slot = f"row[{lifting.window.names.index(name) if name in STATES else windows.shape[1]}]"
         if name in pointers:
             earlier = [f"row[{lifting.window.names.index(f'{name}[-{d}]')}]" for d in range(pointers[name], 0, -1)]
-            lines.append(
-                f"const double {name}_all[]={{{','.join([*earlier, slot])}}};const double *{name}={name}_all+{pointers[name]};(void){name};"
-            )
+            values = ",".join([*earlier, slot])
+            lines.append(f"const double {name}_all[]={{{values}}};")
+            lines.append(f"const double *{name}={name}_all+{pointers[name]};(void){name};")
         else:
             lines.append(f"const double {name}={slot};(void){name};")
     expressions = [formula.expression for formula in lifting.formulas + lifting.input_formulas]
@@ -52,7 +53,8 @@ def test_c_computes_what_numpy_does(lifting, tmp_path):
     lines += [f'printf("%.17g\\n",(double)({expression}));' for expression in written]
     width = windows.shape[1] + 2
     source = (
-        f"#include <math.h>\n#include <stdio.h>\nint main(void){{double row[{width}];for(;;){{for(int i=0;i<{width};i++)"
+        "#include <math.h>\n#include <stdio.h>\n"
+        f"int main(void){{double row[{width}];for(;;){{for(int i=0;i<{width};i++)"
         f'if(scanf("%lf",row+i)!=1)return 0;const double phase=row[{width - 1}];(void)phase;{"".join(lines)}}}}}\n'
     )
     (tmp_path / "f.c").write_text(source)
@@ -82,7 +84,8 @@ def test_derivatives_are_finite_differences(lifting):
             :, 2:
         ] / (2 * step)
         scale = np.maximum(np.abs(lifting.lift(windows, {"phase": phase})[:, 2:]), 1)
-        # rounding of the difference: eps/step in units of the value; curvature: the fifth harmonic has third derivatives of 500**3
+        # rounding of the difference: eps/step in units of the value; curvature: the fifth harmonic has third
+        # derivatives of 500**3
         tolerance = 1e-9 * scale + 1e-6 * np.abs(slopes[..., j]) + 5e-5
         assert np.all(np.abs(slope - slopes[..., j]) <= tolerance)
 

@@ -1,4 +1,5 @@
-"""Uncertainty of the estimate against repeated experiments on a known system, and against refits on resampled episodes."""
+"""Uncertainty of the estimate against repeated experiments on a known system, and against refits on resampled
+episodes."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from kros.identify import (
     episode_weights,
 )
 from kros.identify.bootstrap import bootstrap_refined, one_step_deviations
-from kros.identify.ranges import Ranges
+from kros.identify.factors import Ranges
 from kros.identify.refine import GaussNewton, Refinement, RefineOptions, refine_population
 from kros.identify.refine.episodes import episode_normals
 from kros.identify.refine.metric import ResponsePrior
@@ -34,7 +35,8 @@ DT = 0.01
 
 
 def data_sets(count: int, episodes: int, samples: int, seed: int) -> np.ndarray:
-    """Factors of [Psi | Theta_plus] of independently simulated data sets, (data set, episode, 5, 5), white process noise."""
+    """Factors of [Psi | Theta_plus] of independently simulated data sets, (data set, episode, 5, 5), white process
+    noise."""
     rng = np.random.default_rng(seed)
     x = np.zeros((samples, count, episodes, 2))
     x[0] = rng.normal(size=x.shape[1:])
@@ -52,7 +54,8 @@ def of(models: ModelSamples) -> np.ndarray:
 def bands(
     models: ModelSamples, freqs: np.ndarray, dt: float, output_scale: Any, input_scale: Any, level: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Quantiles over the draws of sigma_max of the scaled deviation, and of every entry's magnitude: (unit, frequency[, n, m])."""
+    """Quantiles over the draws of sigma_max of the scaled deviation, and of every entry's magnitude: (unit,
+    frequency[, n, m])."""
     off = (
         np.stack([models.responses(row, freqs, dt) for row in range(len(models.unit_ids))])
         - models.estimate.responses(freqs, dt)[:, None]
@@ -63,7 +66,8 @@ def bands(
 
 @pytest.mark.parametrize("alpha", [0.0, 200.0])
 def test_covariance_of_resampled_models_is_that_of_repeated_experiments(alpha: float) -> None:
-    """Units stand for experiments. 1500 of them know a variance to 3.7 percent and a correlation to 0.026 (one standard error)."""
+    """Units stand for experiments. 1500 of them know a variance to 3.7 percent and a correlation to 0.026 (one
+    standard error)."""
     R = data_sets(1500, 12, 60, seed=0)
     models = bootstrap_edmd(R, 2, alpha, episode_weights([12] * 1500, 60, seed=1))
     W = np.concatenate([models.samples.A, models.samples.B], axis=-1).reshape(1500, 60, -1)
@@ -77,7 +81,8 @@ def test_covariance_of_resampled_models_is_that_of_repeated_experiments(alpha: f
 
 
 def test_bands_hold_the_truth_as_often_as_they_say() -> None:
-    """800 experiments know a share of 0.9 to 0.011. Thirty episodes know a variance to 26 percent, which costs the band some of its
+    """800 experiments know a share of 0.9 to 0.011. Thirty episodes know a variance to 26 percent, which costs the
+    band some of its
     coverage (Student's t with 29 degrees of freedom: 0.89), and the quantile of 200 draws about as much."""
     R = data_sets(800, 30, 30, seed=2)
     models = bootstrap_edmd(R, 2, 0.0, episode_weights([30] * 800, 200, seed=3))
@@ -96,7 +101,8 @@ def test_bands_hold_the_truth_as_often_as_they_say() -> None:
 
 
 def test_one_gauss_newton_step_is_exact_where_the_cost_is_quadratic() -> None:
-    """Ridge regression as a cost of episodes plus a prior: a step on weighted episodes is the weighted solution itself."""
+    """Ridge regression as a cost of episodes plus a prior: a step on weighted episodes is the weighted solution
+    itself."""
     rng = np.random.default_rng(4)
     J, y = rng.normal(size=(3, 5, 20, 4)), rng.normal(size=(3, 5, 20))  # unit, episode, sample, parameter
     weights = episode_weights([5, 5, 5], 7, seed=5)
@@ -115,7 +121,7 @@ def test_one_gauss_newton_step_is_exact_where_the_cost_is_quadratic() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
-# ------------------------------------------------------------------------------------- refined models of simulated drives
+# refined models of simulated drives
 
 STATES = ("position", "velocity", "current")
 KOOPMAN = Lifting(STATES, ("sin(100*position + phase)",), ("phase",))
@@ -125,7 +131,8 @@ EPISODES = 5
 
 @pytest.fixture(scope="module")
 def drives() -> tuple[KoopmanMatrices, Refinement, Factor, np.ndarray, RefinementProblem]:
-    """Refined models of three drives, their per-episode factors and normal equations, and the problem that they solve, divided by ranges."""
+    """Refined models of three drives, their per-episode factors and normal equations, and the problem that they solve,
+    divided by ranges."""
     simulated = HarmonicDrivePopulation(n_units=3, n_episodes=EPISODES, seconds=4.0, conditions=("noload",)).simulate()
     population, phase = simulated.population, {"phase": simulated.truth.phase_rad}
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
@@ -150,7 +157,8 @@ def drives() -> tuple[KoopmanMatrices, Refinement, Factor, np.ndarray, Refinemen
 
 
 def settle(evaluate: Callable[[np.ndarray], np.ndarray], V: np.ndarray) -> np.ndarray:
-    """Gauss-Newton steps from near a minimum until the gradient is gone: a search that watches the cost stops at its rounding before."""
+    """Gauss-Newton steps from near a minimum until the gradient is gone: a search that watches the cost stops at its
+    rounding before."""
     for _ in range(40):
         matrix = evaluate(V)
         scale = 1 / np.sqrt(np.diagonal(matrix[:, :-1, :-1], axis1=1, axis2=2))
@@ -165,7 +173,8 @@ def whitened(models: KoopmanMatrices, T: np.ndarray) -> np.ndarray:
 
 
 def test_one_step_is_the_derivative_of_the_refit(drives: tuple) -> None:
-    """Weights that differ from one by up to 0.06: models and refits agree but for what Gauss-Newton leaves out of the curvature."""
+    """Weights that differ from one by up to 0.06: models and refits agree but for what Gauss-Newton leaves out of the
+    curvature."""
     models, refinement, factors, normal, problem = drives
     T, information = refinement.whitening, refinement.information
     counts = np.array([[2.0, 1, 2, 0, 0], [0, 3, 0, 1, 1], [1, 0, 2, 2, 0]])

@@ -95,7 +95,8 @@ def test_residual_covariance_equals_the_residuals():
 
 @pytest.mark.parametrize("seed", range(4))
 def test_smallest_alpha_is_that_of_a_search_over_all_models_of_all_units(seed):
-    """One regularisation after the other, from above, and then halved, each by QR of the regularised data; units turn unstable at their own."""
+    """One regularisation after the other, from above, and then halved, each by QR of the regularised data; units turn
+    unstable at their own."""
     rng = np.random.default_rng(seed)
     factors = []
     for n in (2, 3):
@@ -113,11 +114,6 @@ def test_smallest_alpha_is_that_of_a_search_over_all_models_of_all_units(seed):
     for _ in range(40):
         low, high = (low, (low + high) / 2) if stable((low + high) / 2) else ((low + high) / 2, high)
     assert smallest_stabilising_alpha(factors, 1e-3) == pytest.approx(10**high, rel=1e-6)
-
-
-def test_no_regularisation_where_none_is_needed():
-    factor = lifted_R([simulate(9)], model=Lifting(("position", "velocity")))
-    assert smallest_stabilising_alpha([(factor.R, 2)]) == 0.0
 
 
 def test_dependent_columns_are_named():

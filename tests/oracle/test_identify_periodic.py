@@ -17,7 +17,8 @@ CHANNELS = (
 
 
 def gears(ratio: float, size: float, units: int = 3, noise: float = 1e-3, travel: float = 6.0) -> Population:
-    """An axis with damping and a ripple ``size * sin(ratio * angle + phase)`` of its rate, every unit with a phase of its own."""
+    """An axis with damping and a ripple ``size * sin(ratio * angle + phase)`` of its rate, every unit with a phase of
+    its own."""
     episodes = {}
     for unit in range(units):
         rng = np.random.default_rng([unit, 7])

@@ -1,4 +1,5 @@
-"""Refinement against systems whose matrices are known, and sensitivities against finite differences of an independent free run."""
+"""Refinement against systems whose matrices are known, and sensitivities against finite differences of an independent
+free run."""
 
 from __future__ import annotations
 

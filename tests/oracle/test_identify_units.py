@@ -12,8 +12,7 @@ from kros.data.checks import check_episode, is_constant
 from kros.data.prepare import scale_population
 from kros.identify import Factor, PhaseSpec, combine, edmd, smallest_stabilising_alpha
 from kros.identify.calibration import find_segments
-from kros.identify.factors import lifted_factor, reduce_episode, require_excitation
-from kros.identify.ranges import Ranges
+from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation
 from kros.identify.refine import GaussNewton, RefineOptions, refine_population
 from kros.lifting import Lifting
 from kros.plants import DcMotorPopulation, HarmonicDrivePopulation

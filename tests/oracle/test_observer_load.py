@@ -10,9 +10,8 @@ from load_baselines import ripple_power
 
 from kros.core.errors import DataError, DimensionError
 from kros.lifting import Lifting
-from kros.motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
-from kros.motor_drive.from_current import load_accuracy
-from kros.motor_drive.signals import without_level
+from kros.motor_drive import AngleLoad, LoadSettings, TorqueScale, known_load, load_observer
+from kros.motor_drive.signals import load_accuracy, without_level
 from kros.observer import ReliftScales, run_observer
 from kros.observer.estimator.certificate import filter_certificate
 from kros.plants import HarmonicDrivePopulation
@@ -39,12 +38,12 @@ def test_the_torque_constant_from_one_known_load() -> None:
     """An error of the current that is the torque over 40 N m, with a bias: both are found exactly, and the torque with them."""
     torque = 8.0 * np.sin(np.pi * TIME)
     error = torque / 40.0 + 0.01
-    scale = calibrate_torque(error, torque, DT)
+    scale = TorqueScale.calibrated(error, torque, DT)
     assert scale.torque_constant == pytest.approx(40.0, rel=1e-9)
     assert scale.residual_percent < 1e-6
-    np.testing.assert_allclose(load_from_current(error + 0.3, 0.3, scale), torque, atol=1e-3)
+    np.testing.assert_allclose(scale.load(error), torque, atol=1e-3)
     with pytest.raises(DataError, match="check signs"):
-        calibrate_torque(-error, torque, DT)
+        TorqueScale.calibrated(-error, torque, DT)
 
 
 def test_the_level_of_an_angle_fixed_load_comes_back() -> None:
@@ -99,10 +98,10 @@ def drives() -> SimpleNamespace:
 
     known, others = read(train), read(test)
     lifting = Lifting(population.states, ("sin(100*position + phase)",), ("phase",))
-    calibration = calibrate_load(lifting, (0,), known.batch, known.load, 2, corner_hz=20.0)
-    observer = load_observer("koopman/load", calibration, population.inputs)
+    settings = LoadSettings(current=2, corner_hz=20.0)
+    observer, _ = load_observer("koopman/load", lifting, (0,), population.inputs, known.batch, known.load, settings)
     estimate = run_observer(observer, others.x[..., :1], others.u, others.phase)
-    leveled = AngleLoad(calibration.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
+    leveled = AngleLoad(settings.level_s, DT).run(estimate[..., 3], estimate[..., 2], others.x[..., 0])
     return SimpleNamespace(known=known, others=others, observer=observer, estimate=estimate, leveled=leveled)
 
 
@@ -132,11 +131,12 @@ def test_the_load_observer_is_certified_as_it_runs(drives: SimpleNamespace) -> N
 
 def test_calibration_says_what_it_misses(drives: SimpleNamespace) -> None:
     known, lifting = drives.known, Lifting(("position", "velocity", "current"))
+    batch = batch_of(known.x, known.u, DT)
     with pytest.raises(DataError, match="with and without load"):
-        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), 0 * known.load)
+        load_observer("load", lifting, (0,), ("u",), batch, 0 * known.load)
     with pytest.raises(DataError, match="come to the current's limit"):
-        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), known.load, current=2, limit=0.1)
+        load_observer("load", lifting, (0,), ("u",), batch, known.load, LoadSettings(current=2, limit=0.1))
     with pytest.raises(DimensionError, match="agree"):
-        calibrate_load(lifting, (0,), batch_of(known.x, known.u, DT), known.load[:-1])
+        load_observer("load", lifting, (0,), ("u",), batch, known.load[:-1])
     with pytest.raises(DataError, match="0 of"):
         load_accuracy(known.load, 0 * known.load, DT)

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from kros.plants import DcMotorPopulation
-from kros.plants.dc_motor import CURRENT_LIMIT_A, SAMPLE_PERIOD_S
+from kros.plants.dc_motor import DcMotorTruth
 
 
 def motors(units=3, **settings):
@@ -36,7 +36,7 @@ def test_without_coulomb_friction_small_voltages_give_the_linear_response():
             for p in (truth.resistance, truth.inductance, truth.torque_constant, truth.inertia, truth.viscous)
         )
         A = np.array([[0, 1, 0, 0], [0, -b / J, k / J, 0], [0, -k / L, -R / L, 1 / L], [0, 0, 0, 0]])
-        step, x = expm(A * SAMPLE_PERIOD_S), np.zeros(4)
+        step, x = expm(A * DcMotorTruth.sample_period_s), np.zeros(4)
         for n, v in enumerate(voltage[0]):
             assert np.all(np.abs(found[:, u, 0, n] - x[:3]) < 1e-4 * np.abs(found[:, u]).max(axis=(1, 2)))
             x[3] = v
@@ -63,14 +63,14 @@ def test_with_friction_it_agrees_with_a_general_integrator():
         def rhs(_, s, v=v):
             return [s[1], (k * s[2] - b * s[1] - c * np.tanh(s[1])) / J, (v - R * s[2] - k * s[1]) / L]
 
-        x = solve_ivp(rhs, (0, SAMPLE_PERIOD_S), x, rtol=1e-9, atol=1e-12).y[:, -1]
+        x = solve_ivp(rhs, (0, DcMotorTruth.sample_period_s), x, rtol=1e-9, atol=1e-12).y[:, -1]
 
 
 def test_the_amplifier_limits_the_current_and_nothing_else_exceeds_it():
     truth = motors()
     found = truth.respond(np.repeat([12.0, -12.0], 300)[None])
-    assert np.abs(found[2]).max() == CURRENT_LIMIT_A
-    assert np.all(found[2, :, 0, 305] == -CURRENT_LIMIT_A)  # 24 V across 1 ohm would be 24 A
+    assert np.abs(found[2]).max() == DcMotorTruth.current_limit_a
+    assert np.all(found[2, :, 0, 305] == -DcMotorTruth.current_limit_a)  # 24 V across 1 ohm would be 24 A
 
 
 def test_the_outlier_loses_more_of_its_voltage_to_friction():

@@ -1,15 +1,16 @@
-"""All six forms: the interconnection is the perturbed plant, the bound holds for every perturbation and is close to the worst one found."""
+"""All six forms: the interconnection is the perturbed plant, the bound holds for every perturbation and is close to
+the worst one found."""
 
 import numpy as np
 import pytest
 from members import perturbed
 
 from kros.core import StateSpace, block_diagonal, gain, hinf_norm
-from kros.synthesis import Injection, ObserverProblem, check_units, worst_case_h2
+from kros.synthesis import Injection, ObserverProblem, worst_case_h2
 from kros.synthesis.problem.plants import generalized_plant
 from kros.synthesis.problem.uncertainty_location import LOCATIONS
 from kros.synthesis.worst_case.certificate import certify, density
-from kros.synthesis.worst_case.unit_check import unit_error
+from kros.synthesis.worst_case.unit_check import unit_error, unit_ratios
 from kros.uncertainty import Form, rebuild, residual
 
 DT, N, M = 0.05, 3, 2
@@ -128,7 +129,8 @@ def test_interconnection_is_the_perturbed_plant(form, injection):
 
 @pytest.mark.parametrize("form", Form)
 def test_plant_is_minimal(form):
-    """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer) are gone."""
+    """Controllable and observable; the copies of the plant that a naive interconnection has (two, and the observer)
+    are gone."""
     case = problem(form, 1)
     system = generalized_plant(case).open_loop()
     n = system.n_states
@@ -146,7 +148,8 @@ def contraction(x, b, a):
 
 
 def worst_found(rng, T, N_, M_, norm="fro", noise=None, starts=15, steps=40):
-    """Search over perturbations with orthonormal rows or columns: to the polar factor of the gradient, from many random starts, best kept."""
+    """Search over perturbations with orthonormal rows or columns: to the polar factor of the gradient, from many
+    random starts, best kept."""
     b, a = T.shape[1], M_.shape[0]
     noise = np.zeros((len(T), 0)) if noise is None else noise
     best = 0.0
@@ -202,7 +205,8 @@ def test_designs_of_every_form_are_certified(form):
 
 
 def test_performance_weight_with_states():
-    """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is crossed."""
+    """The H2 controller of the whole plant beats the predictor, which is blind to past errors, and no bound is
+    crossed."""
     base = problem(Form.INPUT_MULTIPLICATIVE, 6, "diagonal", remainder=False)
     slow = block_diagonal(
         [StateSpace(np.array([[0.97]]), np.array([[1.0]]), np.array([[0.2]]), np.array([[0.05]]), DT)] * N
@@ -238,10 +242,7 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
         nominal, np.eye(2)[:1], gain(size * np.eye(2), DT), gain(np.eye(2), DT), [1, 1], [1, 1], [1e-3], form=form
     )
     K = worst_case_h2(case, fit=Constant).controller
-    table = check_units(case, K, units, ["a", "b", "c", "d"])
-    assert table.holds
-    assert np.all(table.density_ratio <= 1)
-    assert [row["unit"] for row in table.rows()] == ["a", "b", "c", "d"]
+    assert all(np.all(ratio <= 1) and len(ratio) == 4 for ratio in unit_ratios(case, K, units))
     k = 2
     response = units[k].frequency_response(freqs) - nominal.frequency_response(freqs)
     S = case.error_system(K).frequency_response(freqs)[..., 2:4]
@@ -249,4 +250,4 @@ def test_units_that_make_the_weights_are_below_the_bounds(form):
     small = ObserverProblem(
         nominal, case.C, gain(1e-3 * size * np.eye(2), DT), case.W_R, [1, 1], [1, 1], [1e-3], form=form
     )
-    assert not check_units(small, K, units).holds  # the check can fail
+    assert unit_ratios(small, K, units)[0].max() > 1  # the check can fail

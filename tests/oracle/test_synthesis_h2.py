@@ -98,7 +98,8 @@ def test_lqg_scalar_closed_form():
 
 
 def test_an_impulse_response_of_forty_taps_reaches_the_same_optimum():
-    # A stable plant: T(Q) = P11 + P12 Q P21 is affine in a FIR Q, so least squares over its taps tends to the optimum from above.
+    # A stable plant: T(Q) = P11 + P12 Q P21 is affine in a FIR Q, so least squares over its taps tends to the optimum
+    # from above.
     rng = np.random.default_rng(5)
     plant = random_plant(rng, 3, 1.0, d22=False)
     A = plant.A * (0.4 / np.abs(np.linalg.eigvals(plant.A)).max())

@@ -1,12 +1,14 @@
-"""H-infinity synthesis against published optima, closed forms, coprime-factor theory and a slow linear matrix inequality."""
+"""H-infinity synthesis against published optima, closed forms, coprime-factor theory and a slow linear matrix
+inequality."""
 
 import cvxpy as cp
 import numpy as np
 import pytest
 from scipy.linalg import null_space, solve_continuous_are, solve_discrete_are
 
-from kros.core import StateSpace, SynthesisError, h2_norm, hinf_norm
+from kros.core import StateSpace, hinf_norm
 from kros.synthesis import GeneralizedPlant, Status, h2, hinf
+from kros.synthesis.riccati.hinf_level import Frame
 
 
 def partition(A, B, C, D, n_y, n_u, dt):
@@ -100,32 +102,6 @@ def slicot_sb10fd():
     return partition(CONTINUOUS_A, CONTINUOUS_B, CONTINUOUS_C, D, 2, 2, 0.0), K
 
 
-def slicot_sb10hd():
-    """Example of the SLICOT routine SB10HD (continuous H2), with its controller."""
-    D = [[0, 0, 0, -4, -1], [0, 0, 0, 1, 0], [0, 0, 0, 0, 1], [3, 1, 0, 1, -3], [-2, 0, 1, 7, 1]]
-    K = {
-        "A": [
-            [88.0015, -145.7298, -46.2424, 82.2168, -45.2996, -31.1407],
-            [25.7489, -31.4642, -12.4198, 9.4625, -3.5182, 2.7056],
-            [54.3008, -102.4013, -41.4968, 50.8412, -20.1286, -26.7191],
-            [108.1006, -198.0785, -45.4333, 70.3962, -25.8591, -37.2741],
-            [-115.8900, 226.1843, 47.2549, -47.8435, -12.5004, 34.7474],
-            [59.0362, -101.8471, -20.1052, 36.7834, -16.1063, -26.4309],
-        ],
-        "B": [
-            [3.7345, 3.4758],
-            [-0.3020, 0.6530],
-            [3.4735, 4.0499],
-            [4.3198, 7.2755],
-            [-3.9424, -10.5942],
-            [2.1784, 2.5048],
-        ],
-        "C": [[-2.3346, 3.2556, 0.7150, -0.9724, 0.6962, 0.4074], [7.6899, -8.4558, -2.9642, 7.0365, -4.2844, 0.1390]],
-        "D": np.zeros((2, 2)),
-    }
-    return partition(CONTINUOUS_A, CONTINUOUS_B, CONTINUOUS_C, D, 2, 2, 0.0), K
-
-
 def scherer(C1, D12):
     """Example 7 of Scherer, Gahinet and Chilali, IEEE Trans. Automatic Control 42 (1997) 907."""
     n_z = len(C1)
@@ -136,7 +112,8 @@ def scherer(C1, D12):
 
 
 def coprime(A, B, C, dt):
-    """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z = (y, u)."""
+    """Robust stabilisation of normalised coprime factors as a four-block problem: w1 at the input, w2 at the output, z
+    = (y, u)."""
     n, m, p = len(A), B.shape[1], C.shape[0]
     return GeneralizedPlant(
         A,
@@ -153,24 +130,14 @@ def coprime(A, B, C, dt):
 
 
 def random_plant(rng, n, dt):
-    A = rng.standard_normal((n, n))
-    n_w, n_u, n_z, n_y = 3, int(rng.integers(1, 3)), 3, int(rng.integers(1, 3))
-    return GeneralizedPlant(
-        A,
-        rng.standard_normal((n, n_w)),
-        rng.standard_normal((n, n_u)),
-        rng.standard_normal((n_z, n)),
-        rng.standard_normal((n_y, n)),
-        rng.standard_normal((n_z, n_w)),
-        rng.standard_normal((n_z, n_u)),
-        rng.standard_normal((n_y, n_w)),
-        0.1 * rng.standard_normal((n_y, n_u)),
-        dt,
-    )
+    A, n_w, n_u, n_z, n_y = rng.standard_normal((n, n)), 3, int(rng.integers(1, 3)), 3, int(rng.integers(1, 3))
+    shapes = ((n, n_w), (n, n_u), (n_z, n), (n_y, n), (n_z, n_w), (n_z, n_u), (n_y, n_w))
+    return GeneralizedPlant(A, *(rng.standard_normal(s) for s in shapes), 0.1 * rng.standard_normal((n_y, n_u)), dt)
 
 
 def slow_optimum(p):
-    """Optimum by the projected bounded-real inequalities (Gahinet and Apkarian, 1994), solved by an interior-point method."""
+    """Optimum by the projected bounded-real inequalities (Gahinet and Apkarian, 1994), solved by an interior-point
+    method."""
     n, n_w, _, n_z, _ = p.sizes
     R, S, gamma = cp.Variable((n, n), symmetric=True), cp.Variable((n, n), symmetric=True), cp.Variable()
 
@@ -200,29 +167,20 @@ def test_slicot_discrete_level():
     found = hinf(plant)
     assert found.status is Status.OPTIMAL
     assert found.hinf_norm == pytest.approx(111.294, abs=1e-3)
-    assert hinf(plant, gamma=111.294).hinf_norm <= 111.294
-    with pytest.raises(SynthesisError, match=r"gamma = 111\.29 is out of reach"):
-        hinf(plant, gamma=111.29)
 
 
 def test_slicot_continuous_controller():
     plant, published = slicot_sb10fd()
-    found = hinf(plant, gamma=15.0)
-    assert found.hinf_norm < 15
-    assert pytest.approx(published.D, abs=5e-5) == found.controller.D
+    frame = Frame.of(plant)
+    central = frame.controller(*frame.halves(15.0), 15.0)
+    assert hinf_norm(plant.close(central)) < 15
+    assert pytest.approx(published.D, abs=5e-5) == central.D
     # The states are other ones; transfer functions compare. Four printed decimals of A leave about 1e-4 of its size.
     freqs = np.array([0.01, 0.1, 0.5, 1.0, 3.0, 10.0])
-    error = found.controller.frequency_response(freqs) - published.frequency_response(freqs)
+    error = central.frequency_response(freqs) - published.frequency_response(freqs)
     size = np.linalg.norm(published.frequency_response(freqs), 2, axis=(-2, -1)).max()
     assert np.linalg.norm(error, 2, axis=(-2, -1)).max() < 2e-3 * size
-    assert hinf_norm(plant.close(published)) == pytest.approx(found.hinf_norm, rel=2e-3)
-
-
-def test_slicot_continuous_h2_controller():
-    plant, expected = slicot_sb10hd()
-    found = h2(plant).controller
-    for name in "ABCD":
-        assert getattr(found, name) == pytest.approx(np.array(expected[name]), abs=6e-5)  # four decimals are printed
+    assert hinf_norm(plant.close(published)) == pytest.approx(hinf_norm(plant.close(central)), rel=2e-3)
 
 
 def test_scherer_example():
@@ -241,18 +199,6 @@ def test_zhou_doyle_glover_h2_example():
     assert hinf(plant).hinf_norm < hinf_norm(plant.close(found.controller))
 
 
-def test_matlab_h2syn_example():
-    # Documentation of h2syn: closed-loop poles, four decimals; the observer Riccati equation alone gives half of them.
-    A = [[5, 6, -6], [6, 0, 5], [-6, 5, 4]]
-    B = [[0, 4, 0, 0], [1, 1, -2, -2], [4, 0, 0, -3]]
-    C = [[-6, 0, 8], [0, 5, 0], [-2, 1, -4], [4, -6, -5], [0, -15, 7]]
-    D = [[0, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 0], [0, 0, 3, 6], [8, 0, -7, 0]]
-    plant = partition(A, B, C, D, 2, 1, 0.0)
-    poles = np.sort_complex(plant.close(h2(plant).controller).poles())
-    expected = [-31.6236, -12.6460 - 3.8045j, -12.6460 + 3.8045j, -9.6073, -9.2393, -8.6939]
-    assert poles == pytest.approx(np.array(expected), abs=1e-4)
-
-
 def test_octave_example_whose_optimum_is_zero():
     # One-block problem with a minimum-phase plant: T = 0 is reached, K = -1 / (s + 3) (Octave's hinfsyn).
     found = hinf(partition([[-1]], [[1, 1]], [[1], [1]], [[0, 1], [1, 0]], 1, 1, 0.0))
@@ -260,17 +206,6 @@ def test_octave_example_whose_optimum_is_zero():
     assert found.status is Status.OPTIMAL
     K = found.controller.frequency_response([0.0, 1.0]).ravel()
     assert pytest.approx(-1 / (2j * np.pi * np.array([0.0, 1.0]) + 3), abs=1e-6) == K
-
-
-@pytest.mark.parametrize(("pole", "zero"), [(1.0, 2.0), (3.0, 0.1), (0.5, 5.0)])
-def test_interpolation_with_one_point(pole, zero):
-    # T = W + (s - a)/(s + a) K with W = 1 / (s + pole): the optimum is |W(a)| (Nevanlinna-Pick with one point), discrete by z = e^s alike.
-    # Theta u has states of its own: (s - a)/(s + a) = 1 - 2a/(s + a).
-    A, B1, B2 = np.diag([-pole, -zero]), [[1.0], [0.0]], [[0.0], [1.0]]
-    plant = GeneralizedPlant(A, B1, B2, [[1.0, -2 * zero]], [[0.0, 0.0]], [[0.0]], [[1.0]], [[1.0]], [[0.0]], 0.0)
-    found = hinf(plant)
-    assert found.hinf_norm == pytest.approx(1 / (zero + pole), rel=2e-5)
-    assert found.lower_bound <= 1 / (zero + pole) * (1 + 1e-9)
 
 
 @pytest.mark.parametrize(("pole", "zero"), [(0.5, 2.0), (-0.5, 1.25), (0.9, -3.0)])
@@ -296,7 +231,8 @@ def test_scalar_output_feedback_closed_form(a):
 
 @pytest.mark.parametrize("dt", [0.0, 1e-3])
 def test_normalised_coprime_factors(dt):
-    # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order and size.
+    # Glover and McFarlane (1989): the optimum is sqrt(1 + rho(X Z)) with the two LQG Riccati solutions, for any order
+    # and size.
     rng = np.random.default_rng(7)
     solve = solve_discrete_are if dt > 0 else solve_continuous_are
     for _ in range(15):
@@ -327,48 +263,21 @@ def test_slow_inequality_finds_the_same_optimum(dt):
 
 
 def test_static_optimum_is_parrotts():
-    empty = np.zeros
-    plant = GeneralizedPlant(
-        empty((0, 0)),
-        empty((0, 2)),
-        empty((0, 1)),
-        empty((2, 0)),
-        empty((1, 0)),
-        [[1, 2], [3, 4]],
-        [[0], [1]],
-        [[0, 1]],
-        [[0.5]],
-        1.0,
-    )
+    empty = (np.zeros(shape) for shape in ((0, 0), (0, 2), (0, 1), (2, 0), (1, 0)))
+    plant = GeneralizedPlant(*empty, [[1, 2], [3, 4]], [[0], [1]], [[0, 1]], [[0.5]], 1.0)
     found = hinf(plant)
     assert found.hinf_norm == pytest.approx(np.sqrt(10), rel=2e-5)  # the larger of the first row and the first column
     assert found.controller.n_states == 0
     assert found.status is Status.OPTIMAL
 
 
-def test_plants_without_controls_or_measurements():
-    a, one, none = [[0.5]], [[1.0]], np.zeros
-    assert hinf(
-        GeneralizedPlant(a, one, none((1, 0)), one, one, [[0.0]], none((1, 0)), one, none((1, 0)), 1.0)
-    ).hinf_norm == pytest.approx(2.0)
-    deaf = GeneralizedPlant(a, one, one, one, none((0, 1)), [[0.0]], one, none((0, 1)), none((0, 1)), 1.0)
-    assert hinf(deaf, gamma=2.1).hinf_norm == pytest.approx(2.0)
-    with pytest.raises(SynthesisError, match="out of reach; the best that was reached is 2,"):
-        hinf(deaf, gamma=1.9)
-
-
 @pytest.mark.parametrize("dt", [0.0, 1.0])
-def test_levels_between_optimum_and_h2(dt):
-    rng = np.random.default_rng(4)
-    plant = random_plant(rng, 4, dt)
+def test_a_wide_tolerance_gives_a_norm_within_it(dt):
+    plant = random_plant(np.random.default_rng(4), 4, dt)
     best = hinf(plant)
-    for factor in (1.01, 1.3, 3.0):
-        found = hinf(plant, gamma=factor * best.hinf_norm)
-        assert best.lower_bound <= found.hinf_norm <= factor * best.hinf_norm
-        assert found.status is Status.CERTIFIED
-        assert found.lower_bound <= best.hinf_norm
-    with pytest.raises(SynthesisError, match="out of reach"):
-        hinf(plant, gamma=0.99 * best.lower_bound)
+    found = hinf(plant, tolerance=0.3)
+    assert best.lower_bound <= found.hinf_norm <= 1.3 * found.lower_bound * (1 + 2e-6)
+    assert found.lower_bound <= best.hinf_norm
     assert np.isfinite(best.spectral_radius)
     assert best.spectral_radius < (1 if dt > 0 else 0)
 
@@ -390,44 +299,10 @@ def test_lightly_damped_open_loop_where_a_grid_fails(gap, angle):
     )
 
 
-def test_slycot_agrees_on_random_plants():
-    slycot = pytest.importorskip("slycot")
-    rng = np.random.default_rng(5)
-    for _ in range(50):
-        for dt, routine in ((0.0, slycot.sb10fd), (1.0, slycot.sb10dd)):
-            plant = random_plant(rng, int(rng.integers(1, 7)), dt)
-            found, (n, n_w, n_u, n_z, n_y) = hinf(plant), plant.sizes
-            s = plant.open_loop()
-
-            def reached(level, routine=routine, plant=plant, s=s, sizes=(n, n_w + n_u, n_z + n_y, n_u, n_y)):
-                try:
-                    out = routine(*sizes, level, s.A, s.B, s.C, s.D, 1e-12)
-                except ArithmeticError:
-                    return False
-                K = StateSpace(*[x for x in out if np.ndim(x) == 2][:4], plant.dt)
-                return hinf_norm(plant.close(K)) <= level * (1 + 1e-6)
-
-            assert reached(found.hinf_norm * 1.001)
-            assert not reached(found.lower_bound * 0.999)
-
-
-def test_slycot_h2_agrees_on_random_plants():
-    slycot = pytest.importorskip("slycot")
-    rng = np.random.default_rng(6)
-    for _ in range(50):
-        p = random_plant(rng, int(rng.integers(1, 7)), 0.0)
-        plant = GeneralizedPlant(p.A, p.B1, p.B2, p.C1, p.C2, 0 * p.D11, p.D12, p.D21, p.D22, 0.0)
-        n, n_w, n_u, n_z, n_y = plant.sizes
-        s = plant.open_loop()
-        A, B, C, *_ = slycot.sb10hd(n, n_w + n_u, n_z + n_y, n_u, n_y, s.A, s.B, s.C, s.D)
-        assert h2(plant).h2_norm == pytest.approx(
-            h2_norm(plant.close(StateSpace(A, B, C, np.zeros((n_u, n_y)), 0.0))), rel=1e-6
-        )
-
-
 @pytest.mark.parametrize("seed", [1, 2, 11])
 def test_bounds_hold_in_all_coordinates(seed):
-    """Slow poles that disturbances hardly reach, in units of measure of many sizes: no bound lies above what another frame attains."""
+    """Slow poles that disturbances hardly reach, in units of measure of many sizes: no bound lies above what another
+    frame attains."""
     rng = np.random.default_rng(seed)
     n, faint = 10, 1e-6
     A = np.diag(np.concatenate([[1 - 1e-6, 1 - 1e-6, 1 - 1e-5], rng.uniform(-0.9, 0.99, n - 3)]))

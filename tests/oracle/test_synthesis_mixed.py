@@ -1,7 +1,7 @@
-"""Mixed synthesis: the inequalities against Riccati optima and recomputed norms, on general plants and on drive-like observers."""
+"""Mixed synthesis: the inequalities against Riccati optima and recomputed norms, on general plants and on drive-like
+observers."""
 
 import re
-import time
 from dataclasses import replace
 
 import cvxpy as cp
@@ -13,8 +13,8 @@ from scipy.linalg import expm
 from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
 from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
-from kros.synthesis.mixed_norms.candidates import by_inequalities, scaled, verify
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities, balance
+from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, verify
 from kros.synthesis.problem.plants import mixed_plant
 from kros.synthesis.reduction import truncate
 from kros.synthesis.worst_case.certificate import certify
@@ -90,7 +90,7 @@ def test_inactive_constraint_gives_the_riccati_optimum():
         assert found.h2_norm == pytest.approx(optimum.h2_norm, rel=1e-9)
         assert found.gap_percent == pytest.approx(0, abs=1e-6)
         # The inequalities come close to it too, but for the margin of the Lyapunov matrix.
-        (by_lmi,) = by_inequalities(plant, 1.0, (1.0,), 8, time.perf_counter() + 60)
+        by_lmi = by_inequalities(plant, 1.0, 8, 60.0)
         assert optimum.h2_norm * (1 - 1e-9) <= by_lmi.h2_norm <= optimum.h2_norm * 1.01
 
 
@@ -118,7 +118,8 @@ def by_clarabel(inequalities):
     return cp.Problem(cp.Minimize(inequalities.objective() @ x), constraints).solve(solver="CLARABEL")
 
 
-# Seed, states, gamma, and the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program, computed once).
+# Seed, states, gamma, and the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program,
+# computed once).
 SMALL = [
     (0, 2, 0.0822, 1.636558),
     (1, 3, 0.076, 0.1355849),
@@ -226,7 +227,8 @@ def test_truncation_error_is_within_its_bound():
 
 
 def fixed_at(c, share):
-    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it below c."""
+    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it
+    below c."""
     b = 0.5
     A, B1, C1 = np.diag([0.9, b]), np.zeros((2, 3)), np.zeros((3, 2))
     B1[0, 0] = C1[0, 0] = 1.0

@@ -1,4 +1,5 @@
-"""Order reduction: balancing against closed forms, the loop's Gramians against Lyapunov equations, the loss against the certificate."""
+"""Order reduction: balancing against closed forms, the loop's Gramians against Lyapunov equations, the loss against
+the certificate."""
 
 from dataclasses import replace
 

@@ -43,7 +43,8 @@ def performance(M, bandwidth, A):
 
 
 def test_mixed_sensitivity_of_the_disturbance_process():
-    """S. Skogestad, I. Postlethwaite, *Multivariable Feedback Control*, 2nd edition, example 2.17, design 1: min ||(w_P S, K S)||_inf."""
+    """S. Skogestad, I. Postlethwaite, *Multivariable Feedback Control*, 2nd edition, example 2.17, design 1: min
+    ||(w_P S, K S)||_inf."""
     G, W = siso(200.0, 10.0, 0.05, 0.05), performance(1.5, 10.0, 1e-4)
     n, k = G.n_states, W.n_states
     plant = GeneralizedPlant(

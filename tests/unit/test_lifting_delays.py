@@ -163,16 +163,6 @@ def test_batched_and_single_observers_equal_the_equations(injection, order):
         np.testing.assert_allclose(stepped, x[3:], rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
-def test_the_observer_file_holds_delays_and_input_functions(tmp_path, injection):
-    o = observer(injection)
-    o.save(tmp_path / "o.json")
-    again = Observer.load(tmp_path / "o.json")
-    assert (again.lifting, again.inputs) == (DELAYED, INPUTS)
-    y, u = np.random.default_rng(5).normal(size=(20, 2, 1)), np.random.default_rng(6).normal(size=(20, 2, 2))
-    np.testing.assert_array_equal(run_observer(again, y, u), run_observer(o, y, u))
-
-
 def test_free_runs_start_from_the_first_recorded_samples():
     rng = np.random.default_rng(8)
     channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]

@@ -79,12 +79,6 @@ def test_separation_rebuilds_the_lifting_for_any_phase():
     np.testing.assert_allclose(rebuilt, lifting.lift(x, {"phase": phase})[:, 2:], atol=1e-12)
 
 
-def test_a_parameter_inside_another_function_does_not_separate():
-    lifting = Lifting(("position",), ("tanh(position*phase)",), ("phase",))
-    with pytest.raises(ConfigError, match="must enter as factors or as phases"):
-        _ = lifting.separation
-
-
 def test_bad_liftings_are_refused():
     with pytest.raises(ConfigError, match="depends on no state"):
         Lifting(("position",), ("3 + phase",), ("phase",))

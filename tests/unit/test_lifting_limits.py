@@ -1,4 +1,5 @@
-"""Formulas that would take for ever, or are not finite, are refused before they do; slopes know where a function jumps."""
+"""Formulas that would take for ever, or are not finite, are refused before they do; slopes know where a function
+jumps."""
 
 import numpy as np
 import pytest

@@ -47,7 +47,7 @@ REFUSED = {
     ),
     "can be predicted": (SynthesisError, lambda: problem(tone(0.0))),
     "can be predicte.": (SynthesisError, lambda: problem(tone(0.1))),
-    "nothing to shape": (SynthesisError, lambda: problem(np.zeros((1, 65, 2, 2), complex))),
+    "zero or not finite": (SynthesisError, lambda: problem(np.zeros((1, 65, 2, 2), complex))),
     r"spectra \(unit, f, n, n\)": (DimensionError, lambda: problem(np.ones((65, 2, 2), complex))),
     r"\(f, n, n\)": (DimensionError, lambda: shaping_filter(np.ones((65, 2, 3), complex), Basis(), DT)),
     "not detectable": (SynthesisError, lambda: problem(WHITE, np.diag([0.5, 1.2]))),

@@ -1,4 +1,4 @@
-"""The observer problem of an uncertain model: everything is taken over, and what does not belong together is refused."""
+"""The observer problem of an uncertain model: nothing is lost, and what does not belong together is refused."""
 
 from dataclasses import replace
 

@@ -125,6 +125,13 @@ metrics.json.
 Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
 for any pattern of losses, and the report's figure of lost measurements.
     kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
+Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known load,
+with LoadSettings.
+    kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load
+The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.
+    kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
+Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
+    kros.synthesis.UnitCheck kros.synthesis.check_units
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

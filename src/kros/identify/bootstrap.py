@@ -3,14 +3,10 @@
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
     per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
 
-Samples of one episode depend on each other, episodes do not, so whole episodes are drawn. Of E episodes E - 1 are drawn
-with replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of
-the variance, too little with few episodes (Rao and Wu, *Resampling Inference with Complex Survey Data*, J. Am. Stat.
-Assoc. 83, 1988).
-
-What is resampled is what was random from episode to episode. The prior, its centre, `alpha` and the calibrated
-parameters stay as they are, and so does a bias that all episodes share (regularisation, least squares on noisy or
-closed-loop recordings): no resampling sees it.
+Whole episodes are drawn, since samples of one episode depend on each other. Of E episodes E - 1 are drawn with
+replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the
+variance (Rao and Wu, J. Am. Stat. Assoc. 83, 1988). The prior, its centre, `alpha` and the calibrated parameters stay
+as they are; a bias that all episodes share is not seen.
 
 Symbols
 -------
@@ -21,35 +17,26 @@ V : parameters, [A B] = V T^T
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DataError
 from ..core.linalg import qr_triangle
 from .edmd import KoopmanMatrices, edmd
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 16_000_000  # numbers in memory
 
 
 @dataclass(frozen=True, eq=False)
 class ModelSamples:
     """Models of resampled episodes around an estimate.
 
-    Parameters
-    ----------
-    unit_ids : tuple of str
-    estimate : KoopmanMatrices
-        A (unit, n, n) and B (unit, n, m).
-    samples : KoopmanMatrices
-        A (unit, draw, n, n) and B (unit, draw, n, m).
-    linear : bool
-        The samples are first-order steps: they have the right spread, but what follows from them nonlinearly, such as a
-        response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
+    Samples that are `linear` are first-order steps: they have the right spread, but what follows from them nonlinearly,
+    such as a response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
 
     Examples
     --------
@@ -57,18 +44,14 @@ class ModelSamples:
     >>> from kros.identify import KoopmanMatrices, ModelSamples
     >>> estimate = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
     >>> draws = KoopmanMatrices(np.array([0.89, 0.9, 0.91]).reshape(1, 3, 1, 1), np.ones((1, 3, 1, 1)))
-    >>> ModelSamples(("a",), estimate, draws).standard_error().A.round(3).item()
+    >>> ModelSamples(("a",), estimate, draws).samples.A.std(axis=1, ddof=1).round(3).item()
     0.01
     """
 
     unit_ids: tuple[str, ...]
-    estimate: KoopmanMatrices
-    samples: KoopmanMatrices
+    estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
+    samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
     linear: bool = False
-
-    def standard_error(self) -> KoopmanMatrices:
-        """Return the standard deviation of every entry of A and B over the samples."""
-        return KoopmanMatrices(self.samples.A.std(axis=1, ddof=1), self.samples.B.std(axis=1, ddof=1))
 
     def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
         """Return frequency responses of one unit's samples, shape (draw, frequency, n, m).
@@ -87,24 +70,9 @@ class ModelSamples:
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
     """Draw episodes with replacement, E - 1 of E, and return how much each counts.
 
-    Parameters
-    ----------
-    n_episodes : sequence of int
-        Episodes of every unit, at least two.
-    draws : int
-        At least two.
-    seed : int
-        A unit's draws depend on the seed and its row alone.
-
-    Returns
-    -------
-    ndarray, shape (unit, draw, max(n_episodes))
-        Zero where a unit has fewer episodes; each draw sums to the unit's number of episodes.
-
-    Raises
-    ------
-    DataError
-        With fewer than two episodes or draws.
+    The result has the shape (unit, draw, max(n_episodes)), zero where a unit has fewer episodes; each draw sums to the
+    unit's number of episodes. A unit's draws depend on the seed and its row alone. With fewer than two episodes or
+    draws a DataError is raised.
 
     Examples
     --------
@@ -140,16 +108,9 @@ def bootstrap_edmd(
     weights : ndarray, shape (unit, draw, episode)
         See `episode_weights`.
     unit_ids : sequence of str, optional
-        Numbers by default.
-
-    Returns
-    -------
-    ModelSamples
 
     Raises
     ------
-    DimensionError
-        When factors and weights do not fit together.
     IdentificationError
         When the episodes drawn leave a column dependent and `alpha` is zero.
 
@@ -166,32 +127,24 @@ def bootstrap_edmd(
     (2, 20, 3, 3)
     """
     units, episodes, width, _ = R.shape
-    _require_shape("weights", weights, (units, weights.shape[1], episodes))
-    p, draws = width - n_lifted, weights.shape[1]
-    W = np.empty((units, draws, n_lifted, p))
-    for row in range(units):
-        for part in _parts(draws, episodes * width * width):
-            stacked = (np.sqrt(weights[row, part])[..., None, None] * R[row]).reshape(-1, episodes * width, width)
-            model = edmd(qr_triangle(stacked), n_lifted, alpha)
-            W[row, part] = np.concatenate([model.A, model.B], axis=-1)
-    whole = edmd(qr_triangle(R.reshape(units, episodes * width, width)), n_lifted, alpha)
+    models = []
+    for draw in [np.ones((units, episodes)), *np.swapaxes(weights, 0, 1)]:
+        stacked = (np.sqrt(draw)[..., None, None] * R).reshape(units, episodes * width, width)
+        models.append(edmd(qr_triangle(stacked), n_lifted, alpha))
+    drawn = KoopmanMatrices(*(np.stack([getattr(m, name) for m in models[1:]], axis=1) for name in ("A", "B")))
     ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
-    return ModelSamples(ids, whole, KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:]))
+    return ModelSamples(ids, models[0], drawn)
 
 
 def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
     """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P)."""
-    units, episodes, P = normal.shape[0], normal.shape[1], normal.shape[-1] - 1
-    _require_shape("information", information, (units, P, P))
-    _require_shape("weights", weights, (units, weights.shape[1], episodes))
-    deviations = np.empty((units, weights.shape[1], P))
-    for row in range(units):
-        size = np.sqrt(np.maximum(np.diagonal(information[row]), np.finfo(float).tiny))
-        for part in _parts(weights.shape[1], 4 * P * P):
-            change = np.tensordot(weights[row, part] - 1, normal[row, :, :-1], axes=1)  # (draw, P, P + 1)
-            H = (information[row] + change[..., :-1]) / (size[:, None] * size)
-            deviations[row, part] = _solve(H, change[..., -1] / size) / size
-    return deviations
+    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), np.finfo(float).tiny))
+    deviations = []
+    for draw in np.swapaxes(weights, 0, 1):
+        change = np.einsum("ue,ueij->uij", draw - 1, normal[:, :, :-1])  # (unit, P, P + 1)
+        H = (information + change[..., :-1]) / (size[:, :, None] * size[:, None])
+        deviations.append(_solve(H, change[..., -1] / size) / size)
+    return np.stack(deviations, axis=1)
 
 
 def bootstrap_refined(
@@ -216,16 +169,3 @@ def _solve(H: Array, g: Array) -> Array:
     along = np.einsum("...ji,...j->...i", vectors, g)
     along = np.divide(along, values, out=np.zeros_like(along), where=known)
     return np.asarray(np.einsum("...ij,...j->...i", vectors, along))
-
-
-def _parts(count: int, size: int) -> Iterator[slice]:
-    """Slices of a range whose items hold `size` numbers each."""
-    step = max(1, _AT_ONCE // size)
-    return (slice(start, start + step) for start in range(0, count, step))
-
-
-def _require_shape(name: str, values: Array, shape: tuple[int, ...]) -> None:
-    if values.shape != shape:
-        raise DimensionError(
-            f"Bootstrap: needs {name} of shape {shape}, found {values.shape}; pass those of the same units."
-        )

@@ -32,9 +32,7 @@ Array = npt.NDArray[np.float64]
 class AlphaSearch:
     """How one Tikhonov coefficient is searched for all models of a population."""
 
-    per_decade: int = (
-        10  # values, from where every model is stable downwards: the stabilising set need not be an interval
-    )
+    per_decade: int = 10  # values, from where every model is stable downwards
     decades: int = 14  # below the largest squared singular value of the data, which double precision resolves
     bisections: int = 30  # between the last two values, which leave 1e-10 of the coefficient
     factor: float = 4.0  # how far alpha is above the smallest coefficient that stabilises every model, at least
@@ -136,10 +134,9 @@ def residual_covariance(R: Array, n_lifted: int, matrices: KoopmanMatrices, n_sa
 def smallest_stabilising_alpha(
     factors: list[tuple[Array, int]], margin: float = 0.0, search: AlphaSearch | None = None
 ) -> float:
-    """Find the infimum of the interval ``[alpha, inf)`` on which every model of every unit is stable.
+    """Return the infimum of the interval ``[alpha, inf)`` on which every model of every unit is stable.
 
-    The stabilising set need not be an interval, so the search comes down from above until a model is unstable, then
-    bisects between the last two values.
+    The stabilising set need not be an interval: the search goes down until a model is unstable, then bisects.
 
     Parameters
     ----------

@@ -10,6 +10,10 @@ Symbols
 x, u : states (n_samples, n) and inputs (n_samples, m)
 g, v : parameter-free functions, sigma(w; q) = M(q) g(w) and gamma(u, w; q) = N(q) v(u, w) (see `lifting.Separation`)
 R    : upper triangular factor, (n_columns, n_columns)
+
+Everything is identified in channels divided by their ranges (`Ranges`), so that units of measure change nothing. With
+the ranges of the lifted states and of the inputs as diagonal matrices X and U, ``z = X^-1 x``, ``A_z = X^-1 A X`` and
+``B_z = X^-1 B U``. Only a regularisation, a threshold or a penalty sees the difference.
 """
 
 from __future__ import annotations
@@ -17,6 +21,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +30,7 @@ from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
-from .edmd import relative_pivots
+from .edmd import KoopmanMatrices, edmd, relative_pivots
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -35,15 +40,6 @@ _BLOCK_ROWS = 1024  # a block of this many rows stays in cache
 @dataclass(frozen=True, eq=False)
 class Factor:
     """Reduced data of one or more episodes, or a batch of such reductions.
-
-    Parameters
-    ----------
-    R : ndarray, shape (..., n_columns, n_columns)
-    peak : ndarray, shape (..., n + n_basis + m + n_input_basis)
-        Largest magnitude of every column at k.
-    n_samples : ndarray, shape (...)
-    input_range : ndarray, shape (..., 2, m), optional
-        Smallest and largest value of every recorded input.
 
     Examples
     --------
@@ -55,10 +51,10 @@ class Factor:
     ((2, 2), 147)
     """
 
-    R: Array
-    peak: Array
-    n_samples: npt.NDArray[np.int64]
-    input_range: Array | None = None
+    R: Array  # (..., n_columns, n_columns)
+    peak: Array  # (..., n + n_basis + m + n_input_basis), largest magnitude of every column at k
+    n_samples: npt.NDArray[np.int64]  # (...)
+    input_range: Array | None = None  # (..., 2, m), smallest and largest value of every recorded input
 
     @classmethod
     def stack(cls, factors: Sequence[Factor]) -> Factor:
@@ -96,15 +92,10 @@ def triangular(rows: Array) -> Array:
 def combine(factors: Factor) -> Factor:
     """Combine a batch of factors over its last batch axis, shape (..., episode, n, n) to (..., n, n).
 
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.identify import combine, episode_factors
-    >>> from kros.lifting import Lifting
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
-    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
-    >>> combine(episode_factors(motors, keys, Lifting(motors.states))).R.shape[0]
-    2
+    >>> rows = np.random.default_rng(0).normal(size=(3, 49, 2))  # three episodes of [x, u]
+    >>> parts = Factor(np.linalg.qr(rows, mode="r"), np.abs(rows).max(axis=1), np.full(3, 49))
+    >>> combine(parts).R.shape, int(combine(parts).n_samples)
+    ((2, 2), 147)
     """
     *batch, episodes, width, _ = factors.R.shape
     stacked = factors.R.reshape(*batch, episodes * width, width)
@@ -121,24 +112,8 @@ def episode_factors(
 ) -> Factor:
     """Return factors of [Psi | Theta_plus] of every episode, for leaving episodes out and for drawing them again.
 
-    Parameters
-    ----------
-    population : Population
-    keys : mapping of str to sequence of EpisodeKey
-        Episodes of every unit.
-    lifting : Lifting
-    parameters : mapping of str to array_like, shape (unit,), optional
-        The lifting's parameters, in the order of `keys`.
-
-    Returns
-    -------
-    Factor
-        Batch (unit, episode) in the order of `keys`; zero where a unit has fewer episodes than others.
-
-    Raises
-    ------
-    DataError
-        When there are no episodes at all.
+    The batch is (unit, episode) in the order of `keys`, zero where a unit has fewer episodes than others; `parameters`
+    of the lifting have the shape (unit,). Without any episode a DataError is raised.
 
     Examples
     --------
@@ -224,3 +199,52 @@ def require_independent(factor: Factor, names: Sequence[str], units: Sequence[st
             f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
             f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
         )
+
+
+@dataclass(frozen=True, eq=False)
+class Ranges:
+    """Ranges of a model's channels."""
+
+    outputs: Array  # (n_lifted,)
+    inputs: Array  # (m,)
+
+    @classmethod
+    def of(cls, factor: Factor, n_lifted: int, rows: Any = slice(None)) -> Ranges:
+        """Return the largest magnitudes in the training of some units; one for a channel that is always zero."""
+        peak = factor.peak[rows].max(axis=0)
+        peak = np.where(peak > 0, peak, 1.0)
+        return cls(peak[:n_lifted], peak[n_lifted:])
+
+    @property
+    def inverse(self) -> Ranges:
+        """Ranges that lead back."""
+        return Ranges(1 / self.outputs, 1 / self.inputs)
+
+    def sizes(self, lifting: Lifting, recorded: tuple[str, ...]) -> dict[str, float]:
+        """Return the ranges by name: of states, lifted functions, recorded inputs and functions of these."""
+        names = (*lifting.names, *recorded, *lifting.input_functions)
+        return dict(zip(names, np.concatenate([self.outputs, self.inputs]).tolist(), strict=True))
+
+    def normalise(self, models: KoopmanMatrices) -> KoopmanMatrices:
+        """Return models of channels divided by the ranges, batched."""
+        x, u = self.outputs, self.inputs
+        return KoopmanMatrices(models.A * x / x[:, None], models.B * u / x[:, None])
+
+    def restore(self, models: KoopmanMatrices) -> KoopmanMatrices:
+        """Return models of the channels as recorded from those of channels divided by the ranges."""
+        return self.inverse.normalise(models)
+
+    def triangles(self, R: Array) -> Array:
+        """Return factors of ``[Psi | Theta_plus]`` of channels divided by the ranges."""
+        return np.asarray(R / np.concatenate([self.outputs, self.inputs, self.outputs]))
+
+    def factor(self, factor: Factor) -> Factor:
+        """Return the same with what else a factor holds."""
+        ends = factor.input_range
+        peak = factor.peak / np.concatenate([self.outputs, self.inputs])
+        ends = None if ends is None else ends / self.inputs[: ends.shape[-1]]
+        return replace(factor, R=self.triangles(factor.R), peak=peak, input_range=ends)
+
+    def edmd(self, R: Array, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices:
+        """Return EDMD models of recorded channels whose regularisation acts on channels divided by the ranges."""
+        return self.restore(edmd(self.triangles(R), len(self.outputs), alpha))

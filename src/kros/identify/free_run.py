@@ -25,8 +25,7 @@ def free_run(
 
     Parameters
     ----------
-    A : ndarray, shape (batch, n, n) or (n, n)
-    B : ndarray, shape (batch, n, m) or (n, m)
+    A, B : ndarray, shapes (batch, n, n) and (batch, n, m), or without the batch
         With input functions, m counts them.
     lifting : Lifting
     parameters : mapping of str to array_like, shape (batch,)
@@ -43,10 +42,8 @@ def free_run(
 
     Raises
     ------
-    DimensionError
-        When shapes do not fit together.
-    DataError
-        When there are fewer samples than the history needs.
+    DimensionError, DataError
+        When shapes do not fit together, or there are fewer samples than the history needs.
 
     Examples
     --------

@@ -19,8 +19,7 @@ from ..data.survey import RecordingFacts
 from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
-from .kinds import KINDS, kinds_for
-from .model_set import ModelSet
+from .model_set import KINDS, ModelSet, kinds_for
 from .refine.model import Refinement
 
 Array = npt.NDArray[np.float64]
@@ -90,25 +89,6 @@ _ARRAYS = ("R", "peak", "n_samples")
 class IdentifiedModels:
     """What `kros.identify` returns.
 
-    Parameters
-    ----------
-    population : Population
-        The recordings that were used.
-    facts : RecordingFacts
-        What is known about them, with the split into training and test.
-    lifting : Lifting
-        Of the Koopman models.
-    calibration : PhaseCalibration or None
-        Of the lifting's parameter, where it has one.
-    kinds : tuple of str
-        Kinds of models; the one that others follow comes first.
-    sets : mapping of str to ModelSet
-        By `place`: kind, and condition where it is not that of synthesis.
-    factors : mapping of str to EpisodeFactors
-        By condition.
-    refined : mapping of str to Refinement
-        What the refinement brought beside the models, by kind.
-
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -119,14 +99,14 @@ class IdentifiedModels:
     (('linear_edmd',), ('default',), True)
     """
 
-    population: Population
-    facts: RecordingFacts
-    lifting: Lifting
-    calibration: PhaseCalibration | None = None
-    kinds: tuple[str, ...] = ()
-    sets: Mapping[str, ModelSet] = field(default_factory=dict)
-    factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)
-    refined: Mapping[str, Refinement] = field(default_factory=dict)
+    population: Population  # the recordings
+    facts: RecordingFacts  # of the recordings, with the split into training and test
+    lifting: Lifting  # of the Koopman models
+    calibration: PhaseCalibration | None = None  # of the lifting's parameter, where it has one
+    kinds: tuple[str, ...] = ()  # of models; the one that others follow comes first
+    sets: Mapping[str, ModelSet] = field(default_factory=dict)  # by `place`
+    factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)  # by condition
+    refined: Mapping[str, Refinement] = field(default_factory=dict)  # by kind
 
     def __repr__(self) -> str:
         kinds, facts = ", ".join(self.kinds), self.facts

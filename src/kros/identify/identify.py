@@ -24,22 +24,12 @@ from ..core.work import Work
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
-from .calibrate import calibrate
-from .calibration import PhaseCalibration
+from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
-from .factors import (
-    Factor,
-    combine,
-    lifted_factor,
-    reduce_episode,
-    require_excitation,
-    require_independent,
-)
+from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation, require_independent
 from .identified import EpisodeFactors, IdentifiedModels
-from .kinds import ModelKind, kinds_for
-from .model_set import ModelSet
+from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
-from .ranges import Ranges
 from .refine import Refinement, RefineOptions, refine_population
 from .refine.metric import peak_residual_db
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
@@ -58,7 +48,6 @@ def identify(
     test: Iterable[str] | None = None,
     on_nan: str = "error",
     calibration: PhaseCalibration | CalibrationSettings | Mapping[str, Any] | None = None,
-    facts: RecordingFacts | None = None,
     work: Work | None = None,
     **settings: Any,
 ) -> IdentifiedModels:
@@ -78,8 +67,6 @@ def identify(
         What is done with episodes that hold NaN or infinity.
     calibration : mapping or PhaseCalibration, optional
         How the lifting's parameter ``phase`` is calibrated, as ``[calibrate]`` of a study, or its known values.
-    facts : RecordingFacts, optional
-        Of a `survey` that was made already.
     work : Work, optional
         Where it runs.
     **settings
@@ -106,9 +93,8 @@ def identify(
     remedy = "read recordings with kros.read, or make a population of arrays with kros.from_arrays"
     require_kind(population, Population, "Identify", remedy)
     chosen, work = IdentifySettings.of(settings, "Identify"), work or Work()
-    if facts is None:
-        check_usable(population, test, identify_on, single_allowed=True)
-        population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
+    check_usable(population, test, identify_on, single_allowed=True)
+    population, facts = survey(population, work, test=test, identify_on=identify_on, on_nan=on_nan)
     known = calibration if isinstance(calibration, PhaseCalibration) else None
     declared = CalibrationSettings.of({} if known is not None else calibration or {}, "Calibrate")
     if not isinstance(lifting, Lifting):
@@ -116,16 +102,20 @@ def identify(
     spec = resolve_phase(declared, population, lifting) if known is None else None
     if spec is not None:
         known = calibrate(population, facts, spec, work)
-    base = IdentifiedModels(population, facts, lifting, known)
+    return with_models(IdentifiedModels(population, facts, lifting, known), chosen, work)
+
+
+def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) -> IdentifiedModels:
+    """Return surveyed recordings, with a known lifting and its calibration, with their models."""
     _check_conditions(base)
-    begun = {c: _begin(base, c, chosen, work) for c in base.conditions}  # refined while others are identified
+    begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
     sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, Refinement]()
     for condition, (recorded, models, refining) in begun.items():
         better, refinements = refining()
         factors[condition] = recorded
         sets |= {base.place(m.name, condition): m for m in (*models, *better)}
         refined |= refinements
-    refined_kinds = tuple(kind.name for kind in kinds_for(lifting, refined=True)) if chosen.refine else ()
+    refined_kinds = tuple(kind.name for kind in kinds_for(base.lifting, refined=True)) if settings.refine else ()
     return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
 
 
@@ -134,17 +124,13 @@ def _check_conditions(base: IdentifiedModels) -> None:
     facts = base.facts
     if facts.identify_on not in base.conditions:
         raise IdentificationError(
-            f"Identifying in condition {facts.identify_on!r}: none of the units recorded in it could be calibrated; "
-            "set data.identify_on to another one."
+            f"Identifying in condition {facts.identify_on!r}: none of its units could be calibrated; set "
+            "data.identify_on to another one."
         )
     elsewhere = [u for u in facts.pooled if not facts.keys("train", u, facts.identify_on)]
     if elsewhere:
-        log.warning(
-            "Units %s were not recorded in condition %r, which feeds synthesis: they take no part in it, and are not "
-            "compared with the others. Where conditions stand for units, give all the same one.",
-            ", ".join(elsewhere),
-            facts.identify_on,
-        )
+        text = "Units %s were not recorded in condition %r, which feeds synthesis, and take no part in it"
+        log.warning(text, ", ".join(elsewhere), facts.identify_on)
 
 
 def _begin(

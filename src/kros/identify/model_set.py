@@ -12,12 +12,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ..core.errors import ConfigError
 from ..core.frequency import log_grid
 from ..core.lti import StateSpace
 from ..data.population import Channel, Role
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd
-from .ranges import Ranges
+from .factors import Ranges
 
 Array = npt.NDArray[np.float64]
 
@@ -25,35 +26,6 @@ Array = npt.NDArray[np.float64]
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelSet:
     """Koopman (or linear) models of all units, identified in one condition.
-
-    Parameters
-    ----------
-    name : str
-        Kind of model, for example ``koopman_edmd``.
-    condition : str
-    lifting : Lifting
-    channels : tuple of Channel
-    sample_period_s : float
-    unit_ids : tuple of str
-    A : ndarray, shape (unit, n, n)
-    B : ndarray, shape (unit, n, m)
-    parameters : mapping of str to ndarray, shape (unit,)
-        Per-unit parameters of the lifting.
-    residual_covariance : ndarray, shape (unit, n, n)
-        Covariance of the one-step residual on the training episodes.
-    output_scale : ndarray, shape (n,)
-        Range of every lifted state over the pooled training episodes; uncertainty and weights work in these units.
-    input_scale : ndarray, shape (m,)
-    alpha : float or None
-        Tikhonov coefficient, where there is one.
-    alpha_in_ranges : bool
-        Whether `alpha` is for channels divided by the ranges, as one that was searched is, or for the recordings'
-        units.
-    status : tuple of str
-        Per unit ``ok``, or what is wrong.
-    longest_s : float or None, s
-        Length of the longest episode behind the models, below whose inverse they know no frequency; None where it is
-        not known.
 
     Examples
     --------
@@ -64,22 +36,22 @@ class ModelSet:
     ((2, 3, 3), True, True)
     """
 
-    name: str
+    name: str  # kind of model, for example ``koopman_edmd``
     condition: str
     lifting: Lifting
     channels: tuple[Channel, ...]
     sample_period_s: float
     unit_ids: tuple[str, ...]
-    A: Array
-    B: Array
-    parameters: Mapping[str, Array]
-    residual_covariance: Array
-    output_scale: Array
-    input_scale: Array
-    alpha: float | None = None
-    alpha_in_ranges: bool = False
-    status: tuple[str, ...] = field(default=())
-    longest_s: float | None = None
+    A: Array  # (unit, n, n)
+    B: Array  # (unit, n, m)
+    parameters: Mapping[str, Array]  # of the lifting, (unit,)
+    residual_covariance: Array  # (unit, n, n), of the one-step residual on the training episodes
+    output_scale: Array  # (n,), range of every lifted state over the pooled training episodes
+    input_scale: Array  # (m,)
+    alpha: float | None = None  # Tikhonov coefficient, where there is one
+    alpha_in_ranges: bool = False  # whether alpha is for channels divided by the ranges or for the recordings' units
+    status: tuple[str, ...] = field(default=())  # per unit ``ok``, or what is wrong
+    longest_s: float | None = None  # longest episode, below whose inverse the models know no frequency, where known
 
     def __repr__(self) -> str:
         units = f"{len(self.unit_ids)} units in condition {self.condition!r}"
@@ -93,7 +65,7 @@ class ModelSet:
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Names of the model's inputs, the columns of `B`: the recorded ones, then the lifting's input functions."""
+        """Names of the model's inputs, the columns of `B`: recorded inputs, then the lifting's input functions."""
         return self.recorded_inputs + self.lifting.input_functions
 
     @property
@@ -199,3 +171,38 @@ _CONTENT = (
     "status",
     "longest_s",
 )
+
+
+@dataclass(frozen=True)
+class ModelKind:
+    """One kind of model: with lifted functions or without, refined on free-run error or not."""
+
+    name: str
+    lifted: bool
+    refined: bool
+
+    def lifting(self, lifting: Lifting) -> Lifting:
+        """Return the lifting of this kind."""
+        return lifting if self.lifted else Lifting(lifting.states)
+
+
+KINDS = (
+    ModelKind("koopman", lifted=True, refined=True),
+    ModelKind("linear", lifted=False, refined=True),
+    ModelKind("koopman_edmd", lifted=True, refined=False),
+    ModelKind("linear_edmd", lifted=False, refined=False),
+)
+
+
+def kind_of(name: str) -> ModelKind:
+    """Return a kind by its name."""
+    kinds = {kind.name: kind for kind in KINDS}
+    if name not in kinds:
+        raise ConfigError(f"Kind of model {name!r}: is unknown; known are {', '.join(kinds)}.")
+    return kinds[name]
+
+
+def kinds_for(lifting: Lifting, *, refined: bool) -> tuple[ModelKind, ...]:
+    """Return the kinds of models, refined or by EDMD, of a lifting: without functions the linear one alone."""
+    has_functions = bool(lifting.functions + lifting.input_functions)
+    return tuple(kind for kind in KINDS if kind.refined == refined and (has_functions or not kind.lifted))

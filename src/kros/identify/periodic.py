@@ -38,11 +38,11 @@ class PeriodicTest:
     """When a term counts as seen."""
 
     largest_ratio: float = 500.0  # beyond that of any gear
-    lags: int = 3  # steps whose states and inputs the residual is regressed on: more than the order of a drive
+    lags: int = 3  # steps whose states and inputs the residual is regressed on
     units: int = 6  # that are looked at
     episodes: int = 3  # of each
     samples: int = 40_000  # of a unit
-    above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8 among some thousand values
+    above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8
     above_in_every_unit: float = 3.0  # of the peak of each unit over its surroundings
     least_share: float = 0.002  # of the residual that a term explains
     gravity: float = 0.01  # the same for sin(angle), which other smooth terms resemble

@@ -72,9 +72,6 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     """Return what has to be calibrated: nothing, or the phase of a disturbance that is fixed to an angle."""
     if not lifting.parameters:
         return None
-    if lifting.parameters != (PHASE,):
-        problem = f"only {PHASE!r} can be calibrated; write other constants into the formulas"
-        raise ConfigError(f"Lifting parameters {lifting.parameters}: {problem}.")
     known: dict[str, Any] = declared.model_dump(exclude_none=True)
     if "ratio" not in known and "gear_ratio" in population.metadata:
         known["ratio"] = float(population.metadata["gear_ratio"])
@@ -85,9 +82,8 @@ def resolve_phase(declared: CalibrationSettings, population: Population, lifting
     spec, channels = PhaseSpec(**known), population.states + population.inputs
     for name in (spec.angle, spec.reference, spec.measured):
         if name not in channels:
-            near = did_you_mean(name, channels) or ";"
-            remedy = "set calibrate.angle, .reference and .measured"
-            raise ConfigError(f"Calibration: there is no channel {name!r} in {', '.join(channels)}{near} {remedy}.")
+            problem = f"there is no channel {name!r} in {', '.join(channels)}{did_you_mean(name, channels) or ';'}"
+            raise ConfigError(f"Calibration: {problem} set calibrate.angle, .reference and .measured.")
     return spec
 
 

@@ -43,7 +43,7 @@ class CalibrationSettings(Settings):
 
 
 class IdentifySettings(Settings):
-    """Regularisation; ``auto`` is a multiple of the smallest coefficient that stabilises every model, see `AlphaSearch`.
+    """Regularisation; ``auto``: a multiple of the smallest coefficient that stabilises every model (`AlphaSearch`).
 
     At the smallest coefficient itself one unit has a pole on the stability limit, and no uncertainty model of the
     population is finite; the factor is doubled until the peak residual around the best nominal unit is at most one

@@ -112,15 +112,13 @@ def base_and_delay(name: str) -> tuple[str, int]:
 def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
     """Read a formula into a SymPy tree; what may take long is refused before it does."""
     if len(require_text(text)) > MAX_LENGTH:
-        remedy = f"at most {MAX_LENGTH} are read; split it into several functions"
-        raise ConfigError(f"Formula of {len(text)} characters: {remedy}.")
+        raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it.")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # Python warns of text such as 1if
             tree = ast.parse(text.strip(), mode="eval")
     except (SyntaxError, ValueError, RecursionError, MemoryError, Warning) as error:
-        remedy = "write it like 'sin(100*position + phase)'"
-        raise ConfigError(f"Formula {text!r}: not readable ({error}); {remedy}.") from error
+        raise ConfigError(f"Formula {text!r}: not readable ({error}).") from error
     try:
         require_size(tree.body)
         return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
@@ -140,8 +138,7 @@ def _real_magnitude() -> tuple[Any, Any]:
 def require_text(text: object) -> str:
     """Return what is a text, as a formula should be."""
     if not isinstance(text, str):
-        needed = "should be a text such as 'sin(100*position + phase)'"
-        raise ConfigError(f"Formula {text!r}: {needed}, found {type(text).__name__}.")
+        raise ConfigError(f"Formula {text!r}: should be a text, found {type(text).__name__}.")
     return text
 
 
@@ -204,8 +201,7 @@ class _Reader:
         if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
             raise self._error(f"the delay in {written} should be a whole number of samples, such as {name}[-1].")
         if not negative or amount.value == 0:
-            example = f"write {name}[-1] for one sample before, {name} for the present"
-            raise self._error(f"{written} is not an earlier value; {example}.")
+            raise self._error(f"{written} is not an earlier value; write {name}[-1] for one sample before.")
         if amount.value > MAX_DELAY:
             raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
         return sp.Symbol(delayed_name(name, amount.value), real=True)
@@ -229,11 +225,9 @@ def require_size(tree: ast.AST) -> None:
             kind = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
             depth += not (isinstance(node, ast.Name | ast.Constant) or (kind is not None and kind is chain))
             if count > MAX_NODES or depth > MAX_DEPTH:
-                many, deep = (
-                    f"has more than {MAX_NODES} numbers, names and operators",
-                    f"is nested more than {MAX_DEPTH} deep",
-                )
-                raise TooCostlyError(f"{many if count > MAX_NODES else deep}; split it into several functions.")
+                many = f"more than {MAX_NODES} numbers, names and operators"
+                problem = f"has {many}" if count > MAX_NODES else f"is nested more than {MAX_DEPTH} deep"
+                raise TooCostlyError(f"{problem}; split it into several functions.")
             chain = kind
         todo += [(child, depth, chain) for child in ast.iter_child_nodes(node)]
 
@@ -250,8 +244,7 @@ def settled(value: Any) -> Any:
         if part.is_number:
             finite(part)
         if isinstance(part, sp.Pow) and part.exp.is_number and abs(finite(part.exp)) > MAX_EXPONENT:
-            problem = f"holds a power of {finite(part.exp):g}"
-            raise TooCostlyError(f"{problem}; exponents are numbers of magnitude at most {MAX_EXPONENT}.")
+            raise TooCostlyError(f"holds a power of {finite(part.exp):g}; exponents are at most {MAX_EXPONENT}.")
     if isinstance(value, sp.Mul) and len(value.args) > MAX_FACTORS:
         raise TooCostlyError(f"holds a product of {len(value.args)} factors; at most {MAX_FACTORS} are read.")
     return value
@@ -264,8 +257,7 @@ def finite(number: Any) -> float:
     except (TypeError, ArithmeticError):
         value = math.nan
     if not math.isfinite(value):
-        remedy = "check for a division by zero, a root of a negative number, and powers"
-        raise TooCostlyError(f"holds a number that is not finite and real; {remedy}.")
+        raise TooCostlyError("holds a number that is not finite and real.")
     return value
 
 

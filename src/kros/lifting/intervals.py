@@ -33,8 +33,7 @@ _REALS = (-np.inf, np.inf)
 
 def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
     """Return lower and upper bounds of expressions over a box, each of shape (len(expressions),)."""
-    for name, value in box.items():
-        _range(name, value)
+    box = {name: _range(name, value) for name, value in box.items()}
     with np.errstate(all="ignore"):
         pieces = [pieces_of(expression, box) for expression in expressions]
     return np.array([np.min(low) for low, _ in pieces]), np.array([np.max(high) for _, high in pieces])
@@ -43,8 +42,7 @@ def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
 def _range(name: str, value: Any) -> tuple[float, float]:
     low, high = (float(v) for v in (value if np.ndim(value) else (value, value)))
     if not low <= high:
-        remedy = "give a lower and an upper number in this order"
-        raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; {remedy}.")
+        raise ConfigError(f"Bounds: the range of {name!r} is [{low:g}, {high:g}]; give the lower number first.")
     return low, high
 
 
@@ -85,8 +83,7 @@ def _walk(expression: Any, values: Mapping[str, Interval]) -> Interval:
         return _power(_walk(expression.base, values), expression.exp)
     function = _FUNCTIONS.get(type(expression).__name__)
     if function is None:
-        kind, remedy = type(expression).__name__, "use functions that formulas know"
-        raise ConfigError(f"Bounds of {expression}: nothing is known about {kind}; {remedy}.")
+        raise ConfigError(f"Bounds of {expression}: nothing is known about {type(expression).__name__}.")
     return function(*_walk(expression.args[0], values))
 
 
@@ -109,7 +106,7 @@ def _multiply(a: Interval, b: Interval) -> Interval:
 
 
 def _ends(value: Array, sign: Array) -> Interval:
-    """Bounds of a product: what has underflowed lies between zero and the smallest normal number; zero times anything is zero."""
+    """Bounds of a product: what has underflowed is below the smallest normal number, zero times anything is zero."""
     tiny, value = np.abs(value) < _TINY, np.where(sign == 0, 0.0, value)
     return np.where(tiny, np.minimum(sign, 0.0) * _TINY, value), np.where(tiny, np.maximum(sign, 0.0) * _TINY, value)
 
@@ -230,7 +227,8 @@ def _breaks(node: Any) -> Any:
 
     if isinstance(node, sp.Pow) and node.exp.is_number and not node.base.is_number:
         whole, negative = bool(node.exp == int(node.exp)), bool(node.exp.is_negative)
-        return {(True, True): _not_zero, (False, True): _positive, (False, False): _not_negative}.get((whole, negative))
+        kinds = {(True, True): "sign", (False, True): "log", (False, False): "root"}
+        return _TESTS.get(kinds.get((whole, negative), ""))
     return _TESTS.get(type(node).__name__) if node.args and not node.is_number else None
 
 
@@ -243,18 +241,15 @@ def _not_zero(low: Array, high: Array) -> Any:
     return (low > _slack(low, high)) | (high < -_slack(low, high))
 
 
-def _positive(low: Array, high: Array) -> Any:
-    return low > _slack(low, high)
-
-
-def _not_negative(low: Array, high: Array) -> Any:
-    return low >= 0
-
-
 def _between_poles(low: Array, high: Array) -> Any:
     slack = _slack(low, high) + _NEAR
     first, last = np.floor((low - slack) / np.pi + 0.5), np.floor((high + slack) / np.pi + 0.5)
     return np.isfinite(low) & np.isfinite(high) & (first == last)
 
 
-_TESTS: Mapping[str, Any] = {"tan": _between_poles, "log": _positive, "sign": _not_zero}
+_TESTS: Mapping[str, Any] = {
+    "tan": _between_poles,
+    "log": lambda low, high: low > _slack(low, high),
+    "sign": _not_zero,
+    "root": lambda low, high: low >= 0,
+}

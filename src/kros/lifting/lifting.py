@@ -35,23 +35,6 @@ Parameters = Mapping[str, npt.ArrayLike]
 class Lifting:
     """Lifting functions of the state, with per-unit parameters, delays and functions of the inputs.
 
-    Parameters
-    ----------
-    states : tuple of str
-    functions : tuple of str
-        Formulas of the states, of earlier values such as ``position[-1]`` or ``voltage[-2]``, and of the parameters;
-        empty for a linear model.
-    parameters : tuple of str
-        Names of quantities whose value differs from unit to unit, such as ``phase``.
-    inputs : tuple of str
-        Names of the recorded inputs; needed where formulas name an input, otherwise any number of inputs passes
-        through.
-    input_functions : tuple of str
-        Formulas that stand behind the inputs as further inputs of the model, such as ``current*voltage``; ``1`` makes it
-        affine.
-    sizes : tuple of (str, float)
-        Sizes of states, inputs and functions by name, see `in_sizes`; one where none is given.
-
     Raises
     ------
     ConfigError
@@ -65,40 +48,32 @@ class Lifting:
     """
 
     states: tuple[str, ...]
-    functions: tuple[str, ...] = ()
-    parameters: tuple[str, ...] = ()
-    inputs: tuple[str, ...] = ()
-    input_functions: tuple[str, ...] = ()
-    sizes: tuple[tuple[str, float], ...] = ()
+    functions: tuple[str, ...] = ()  # formulas of states, of earlier values such as ``voltage[-2]``, and of parameters
+    parameters: tuple[str, ...] = ()  # quantities whose value differs from unit to unit, such as ``phase``
+    inputs: tuple[str, ...] = ()  # recorded inputs; needed where formulas name one, otherwise any number passes through
+    input_functions: tuple[str, ...] = ()  # further inputs of the model, such as ``current*voltage``; ``1`` is affine
+    sizes: tuple[tuple[str, float], ...] = ()  # of states, inputs and functions by name, see `in_sizes`; else one
 
     def __post_init__(self) -> None:
         """Refuse what cannot be lifted."""
         everything = (*self.states, *self.parameters, *self.inputs)
         clash = {name for name in everything if everything.count(name) > 1}
         if clash:
-            raise ConfigError(
-                f"Lifting: names of states and parameters must differ, and of inputs too, found states {self.states}, "
-                f"parameters {self.parameters} and inputs {self.inputs}; rename {clash}."
-            )
+            raise ConfigError(f"Lifting: names of states, parameters and inputs must differ; rename {clash}.")
         _refuse_repeated(self.formulas, self.states)
         _refuse_repeated(self.input_formulas, self.inputs)
         for formula in self.formulas:
             present = sorted(formula.used & set(self.inputs))
             if present:
-                raise ConfigError(
-                    f"Lifting: {formula.text!r} reads the present input {', '.join(present)}, which the next lifted "
-                    f"state would need from the future; make it an input function, or read {present[0]}[-1]."
-                )
+                problem = f"{formula.text!r} reads the present input {', '.join(present)}"
+                raise ConfigError(f"Lifting: {problem}; make it an input function, or read {present[0]}[-1].")
             if not formula.used - set(self.parameters):
                 problem = f"depends on no state ({', '.join(self.states)}); a constant cannot be lifted"
                 raise ConfigError(f"Lifting: {formula.text!r} {problem}, remove it.")
         for formula in self.input_formulas:
             if formula.used and not {base_and_delay(name)[0] for name in formula.used} & set(self.inputs):
-                known = ", ".join(self.inputs) or "none are named"
-                raise ConfigError(
-                    f"Lifting: the input function {formula.text!r} depends on no input ({known}); "
-                    "a function of states alone belongs to the lifted functions."
-                )
+                problem = f"depends on no input ({', '.join(self.inputs) or 'none are named'})"
+                raise ConfigError(f"Lifting: the input function {formula.text!r} {problem}; make it a function.")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Rebuild from the texts in a worker process: programs do not travel."""
@@ -124,14 +99,8 @@ class Lifting:
     def in_sizes(self, sizes: Mapping[str, float]) -> Lifting:
         """Return the lifting for channels and functions divided by sizes; formulas stay as they are written.
 
-        Parameters
-        ----------
-        sizes : mapping of str to float
-            By name of a state or an input, or text of a function; what is not named keeps its unit. An empty mapping is
-            the way back.
+        Sizes are by name of a state or an input, or text of a function; what is not named keeps its unit.
 
-        Examples
-        --------
         >>> metres = Lifting(("x",), ("x**2",))
         >>> kilometres = metres.in_sizes({"x": 1000.0, "x**2": 1e6})
         >>> metres.lift([[3000.0]]).tolist(), kilometres.lift([[3.0]]).tolist()
@@ -259,23 +228,10 @@ class Lifting:
     def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives, rounded outwards: the bounds hold between any two points of the box, and
-        are infinite where a slope is, or where a function jumps or is not defined.
+        Interval arithmetic on the derivatives, rounded outwards: the bounds (p, n_window) hold between any two points
+        of the box, and are infinite where a slope is, or where a function jumps or is not defined. Ranges are numbers
+        or pairs (lower, upper) by name; what is not named may be anything.
 
-        Parameters
-        ----------
-        box : mapping of str to (lower, upper) or number
-            Ranges of states and inputs; what is not named may be anything. An earlier value has the range of its
-            quantity.
-        parameters : mapping of str to number or (lower, upper)
-            A parameter that is not named may be anything.
-
-        Returns
-        -------
-        lower, upper : ndarray, shape (p, n_window)
-
-        Examples
-        --------
         >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
         array([[100.]])
         """

@@ -25,9 +25,7 @@ class FormulaSeparation:
     window: Window  # what ``w`` holds
     parameters: tuple[str, ...]
     basis: tuple[Any, ...]  # SymPy trees of ``g``
-    terms: tuple[
-        tuple[tuple[int, Any], ...], ...
-    ]  # of each function pairs of a column of ``g`` and the coefficient's tree
+    terms: tuple[tuple[tuple[int, Any], ...], ...]  # of each function: columns of ``g`` and coefficients' trees
 
     @classmethod
     def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
@@ -75,11 +73,8 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
         data = (symbol for symbol in term.free_symbols if symbol not in parameters)
         coefficient, function = term.as_independent(*data, as_Add=False)
         if function.free_symbols & parameters:
-            names = tuple(sorted(p.name for p in parameters))
-            raise ConfigError(
-                f"Lifting function {formula.text!r}: parameters {names} must enter as factors or as phases of sin and "
-                "cos."
-            )
+            problem = f"parameters {tuple(sorted(p.name for p in parameters))} must enter as factors or as phases"
+            raise ConfigError(f"Lifting function {formula.text!r}: {problem} of sin and cos.")
         pairs.append((coefficient, function))
     return pairs
 
@@ -87,10 +82,8 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
 def _require_short(formula: Formula, expression: Any) -> None:
     count = count_terms(expression)
     if count > MAX_TERMS:
-        raise ConfigError(
-            f"Lifting function {formula.text!r}: multiplied out to separate its parameters it has up to {count:.3g} "
-            f"terms, at most {MAX_TERMS} are kept; split it into several functions."
-        )
+        problem = f"multiplied out to separate its parameters it has up to {count:.3g} terms"
+        raise ConfigError(f"Lifting function {formula.text!r}: {problem}, at most {MAX_TERMS} are kept.")
 
 
 def _split_angles(expression: Any, parameters: set[Any]) -> Any:

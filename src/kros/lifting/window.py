@@ -102,10 +102,8 @@ class Window:
         if n_samples < needed:
             name, depth = max(self.depths, key=lambda item: item[1], default=("", 0))
             reason = f" for the delay of {depth} in {name!r}" if self.depths else ""
-            remedy = "leave the episode out or use shorter delays"
-            raise DataError(
-                f"Lifting a recording: needs at least {needed} samples{reason}, found {n_samples}; {remedy}."
-            )
+            problem = f"needs at least {needed} samples{reason}, found {n_samples}"
+            raise DataError(f"Lifting a recording: {problem}; leave the episode out or use shorter delays.")
 
     def require_inputs(self, u: Array) -> None:
         """Refuse inputs that are not those the formulas were written for."""

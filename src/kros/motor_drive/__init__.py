@@ -1,8 +1,7 @@
-"""Load torque: from the error of a recorded current, or by observers with a disturbance state.
+"""Load torque: from the error of a recorded current, or by observers with the load as a state.
 
-`signals` computes what a mounted load does and how much of it can be seen; `from_current` is the paper's way;
-`calibrate` gives the observer that learns from one known load how loads show; `level` brings back
-what no measurement holds; `load_accuracy` judges all of them.
+`signals` computes what a mounted load does and which part of it can be seen; `from_current` is the paper's way;
+`observer` makes the estimator from one known load; `level` brings back what no measurement holds.
 
 Examples
 --------
@@ -12,18 +11,10 @@ Examples
 [0.0, 0.2]
 """
 
-from .calibrate import LoadCalibration, calibrate_load, load_observer
-from .from_current import TorqueScale, calibrate_torque, load_from_current
+from ..core.removed import refusing
 from .level import AngleLoad
-from .signals import known_load
+from .observer import LoadSettings, load_observer
+from .signals import TorqueScale, known_load
 
-__all__ = [
-    "AngleLoad",
-    "LoadCalibration",
-    "TorqueScale",
-    "calibrate_load",
-    "calibrate_torque",
-    "known_load",
-    "load_from_current",
-    "load_observer",
-]
+__all__ = ["AngleLoad", "LoadSettings", "TorqueScale", "known_load", "load_observer"]
+__getattr__ = refusing(__name__)

@@ -2,22 +2,21 @@ r"""The level of a load that is fixed to an angle, and drives at their current l
 
 What is seen of a load lacks its level (`without_level`). A mass mounted off the axis takes ``tau = c_1 sin(theta) + c_2
 cos(theta)`` plus what is fast. The same filter makes ``psi = H phi`` of ``phi = [sin(theta), cos(theta)]``, so that the
-seen part tells c by least squares as soon as the machine turns,
+seen part gives c by least squares as soon as the machine turns,
 
 .. math:: \hat c_k = \Bigl(\sum_j \psi_j \psi_j^T T + \epsilon I\Bigr)^{-1} \sum_j \psi_j \hat\tau_s(j) T, \qquad
           \hat\tau = \hat\tau_s + (\varphi - \psi)^T \hat c .
 
-Only what is missing is filled in: fast and unexpected loads pass as they are seen, and without load c stays near zero.
-
-A controller at its limit holds its integrator back, and from then on differs from the one that an observer knows. Where
-the total current comes out beyond the limit, the excess is taken off the load, and forgotten as slowly as levels are.
-If that would move the load by more than `trusted` from what c says of the angle, it is no load: changes are counted
-again from there, and what excess remains is taken off what the unloaded machine needs.
+A controller at its limit holds its integrator back. Where the total current comes out beyond the limit, the excess is
+taken off the load, and forgotten as slowly as levels are. If that would move the load by more than `trusted` from what
+c says of the angle, it is no load: changes are counted again from there, and what excess remains is taken off what the
+unloaded machine needs.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +26,8 @@ from ..core.errors import DimensionError
 Array = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class LoadAndCurrent:
-    """Load and total current with their levels, both of one shape and, as they are here, in the current's unit."""
+class LoadAndCurrent(NamedTuple):
+    """Load and total current with their levels, both of one shape and in the current's unit."""
 
     load: Array
     current: Array
@@ -38,18 +36,6 @@ class LoadAndCurrent:
 @dataclass(frozen=True)
 class AngleLoad:
     """Fill in the level of loads that are fixed to an angle.
-
-    Parameters
-    ----------
-    level_s : float, s
-        Of the load observer (`LoadCalibration`).
-    sample_period_s : float
-    settling_s : float, s
-        Time at full swing (sin^2 of one half) after which half of c is used.
-    limit : float
-        Of the current; infinite where there is none.
-    trusted : float
-        Most that a load at the current's limit differs from what the angle says, as a share of the limit.
 
     Examples
     --------
@@ -61,23 +47,17 @@ class AngleLoad:
     (3000, 1)
     """
 
-    level_s: float
+    level_s: float  # s; of the load observer (`LoadSettings`)
     sample_period_s: float
-    settling_s: float = 0.1
-    limit: float = np.inf
-    trusted: float = 0.5
+    settling_s: float = 0.1  # s; time at full swing (sin^2 of one half) after which half of c is used
+    limit: float = np.inf  # of the current
+    trusted: float = 0.5  # most that a load at the limit differs from what the angle says, as a share of the limit
 
     def run(self, seen: npt.ArrayLike, current: npt.ArrayLike, position: npt.ArrayLike) -> LoadAndCurrent:
-        """Return loads and currents with their levels.
+        """Return loads and currents with their levels, for signals of shape (n_samples, batch).
 
-        Parameters
-        ----------
-        seen : array_like, shape (n_samples, batch)
-            The observer's load, in the current's unit.
-        current : array_like, shape (n_samples, batch)
-            The observer's current.
-        position : array_like, shape (n_samples, batch), rad
-            As measured; where it is NaN the last angle stands for it.
+        `seen` and `current` are the observer's load and current in the current's unit, `position` is measured in rad;
+        where it is NaN the last angle stands for it.
         """
         seen, current, position = (np.asarray(x, dtype=float) for x in (seen, current, position))
         if seen.ndim != 2 or not seen.shape == current.shape == position.shape:
@@ -85,10 +65,9 @@ class AngleLoad:
                 f"Level of a load: seen part {seen.shape}, current {current.shape} and position {position.shape} "
                 f"should all be (n_samples, batch)."
             )
-        running, found = self.start(position[0]), LoadAndCurrent(np.empty_like(seen), np.empty_like(seen))
-        for k in range(len(seen)):
-            found.load[k], found.current[k] = running.step(seen[k], current[k], position[k])
-        return found
+        running = self.start(position[0])
+        rows = [running.step(*sample) for sample in zip(seen, current, position, strict=True)]
+        return LoadAndCurrent(*(np.stack(column) for column in zip(*rows, strict=True)))
 
     @property
     def pole(self) -> float:
@@ -107,45 +86,39 @@ class RunningAngleLoad:
         self.settings, self._pole = settings, settings.pole
         self._phi = np.stack([np.sin(position), np.cos(position)])
         self._psi, self._right = np.zeros_like(self._phi), np.zeros_like(self._phi)
-        self._excess, self._need = (
-            np.zeros_like(position),
-            np.zeros_like(position),
-        )  # taken off the load, and off the unloaded current
-        trust = np.full_like(position, 0.5 * settings.settling_s)
-        self._gram = np.stack([trust, np.zeros_like(position), trust])  # of sin sin, sin cos, cos cos
+        self._excess, self._need = np.zeros((2, *position.shape))  # taken off the load, and off the unloaded current
+        self._gram = 0.5 * settings.settling_s * np.eye(2)[:, :, None] * np.ones_like(position)
 
-    def step(self, seen: Array, current: Array, position: Array) -> tuple[Array, Array]:
+    def step(self, seen: Array, current: Array, position: Array) -> LoadAndCurrent:
         """Return load and total current now, from the observer's and the measured angles in rad."""
+        limit, pole = self.settings.limit, self._pole
         phi = np.stack([np.sin(position), np.cos(position)])
         phi = np.where(np.isnan(phi), self._phi, phi)
-        self._psi = psi = self._pole * self._psi + np.nan_to_num(phi - self._phi)
-        self._phi = phi
-        phi = np.nan_to_num(phi)  # none has arrived yet
-        self._excess *= self._pole
-        self._need *= self._pole
+        self._psi = psi = pole * self._psi + np.nan_to_num(phi - self._phi)
+        self._phi, self._excess, self._need = phi, pole * self._excess, pole * self._need
         coefficients = self._coefficients()
-        of_angle = np.sum(phi * coefficients, axis=0)
+        of_angle = np.sum(np.nan_to_num(phi) * coefficients, axis=0)  # zero where no angle has arrived yet
         load = seen - self._excess + of_angle - np.sum(psi * coefficients, axis=0)
         total = current - seen - self._need + load
-        bounded = np.clip(total, -self.settings.limit, self.settings.limit)
+        bounded = np.clip(total, -limit, limit)
         beyond = bounded != total
         if beyond.any():
             shifted = load - (total - bounded)
-            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.trusted * self.settings.limit)
+            trusted = beyond & (np.abs(shifted - of_angle) <= self.settings.trusted * limit)
             anew = beyond & ~trusted
             self._excess[trusted] += (total - bounded)[trusted]
             load[trusted] = shifted[trusted]
             psi[:, anew], self._excess[anew], load[anew] = 0.0, seen[anew], of_angle[anew]
             total[anew] = (current - seen - self._need + load)[anew]
-            bounded[anew] = np.clip(total[anew], -self.settings.limit, self.settings.limit)
+            bounded[anew] = np.clip(total[anew], -limit, limit)
             self._need[anew] += (total - bounded)[anew]
         learns = np.where(beyond, 0.0, self.settings.sample_period_s)
-        self._gram += learns * np.stack([psi[0] ** 2, psi[0] * psi[1], psi[1] ** 2])
+        self._gram = self._gram + learns * psi[:, None] * psi
         self._right += learns * psi * (seen - self._excess)
-        return load, bounded
+        return LoadAndCurrent(load, bounded)
 
     def _coefficients(self) -> Array:
-        a, b, d = self._gram
-        return np.stack([d * self._right[0] - b * self._right[1], a * self._right[1] - b * self._right[0]]) / (
-            a * d - b * b
-        )
+        """Solve the normal equations of c, two by two."""
+        (a, b), (_, d) = self._gram
+        first, second = self._right
+        return np.stack([d * first - b * second, a * second - b * first]) / (a * d - b * b)

@@ -1,49 +1,46 @@
-r"""Loads as signals: what a known load asks of a machine, and which part of any load a position measurement can tell.
+r"""Loads as signals: what a mounted load asks of a machine, and which part of a load a position measurement shows.
 
 A drive under integral control stands at its target whatever it carries. The torque tau_0 that it holds at the start
-leaves no trace in positions and targets, then or later: tau and tau - tau_0 look the same. What can be seen is the
-change since the start, and with a leak, which keeps estimates from drifting, its high-passed part
+leaves no trace in positions and targets: tau and tau - tau_0 look the same. What can be seen is the change since the
+start, and with a leak, which keeps estimates from drifting, its high-passed part
 
 .. math:: \tau_s(k) = p\,\tau_s(k-1) + \tau(k) - \tau(k-1), \qquad \tau_s(0) = 0, \quad p = e^{-T/T_\ell},
 
-with the time T_l after which a constant load is forgotten. `AngleLoad` brings the level back where the load is fixed to
-an angle.
+with the time T_l after which a constant load is forgotten.
+
+*The paper's estimate* (section IV-E.2) is the current's error of an observer of the unloaded machine under load,
+``tau = K (i - i_hat)``. An observer that knows the current under load hides the load.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError
+from ..core.errors import ConfigError, DataError
 
 Array = npt.NDArray[np.float64]
-_ORDER = 4
 
 
 def low_passed(signal: npt.ArrayLike, corner_hz: float, sample_period_s: float) -> Array:
-    """Return signals without what is faster than a corner, and without delay: Butterworth, forward and backward."""
+    """Return signals below a corner without delay: Butterworth of order four, forward and backward."""
     from scipy.signal import butter, sosfiltfilt
 
-    if not 0 < corner_hz < 0.5 / sample_period_s:
-        raise ConfigError(
-            f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {0.5 / sample_period_s:g} Hz."
-        )
-    filtered: Array = sosfiltfilt(
-        butter(_ORDER, corner_hz, fs=1 / sample_period_s, output="sos"), np.asarray(signal, dtype=float), axis=0
-    )
-    return filtered
+    top = 0.5 / sample_period_s
+    if not 0 < corner_hz < top:
+        raise ConfigError(f"Low-pass at {corner_hz:g} Hz: the corner should lie between 0 and {top:g} Hz.")
+    sections = butter(4, corner_hz, fs=1 / sample_period_s, output="sos")
+    return np.asarray(sosfiltfilt(sections, np.asarray(signal, dtype=float), axis=0))
 
 
 def without_level(signal: npt.ArrayLike, level_s: float, sample_period_s: float) -> Array:
     """Return the part of signals that can be seen: their change since the start, forgotten after `level_s`."""
     from scipy.signal import lfilter
 
-    signal = np.asarray(signal, dtype=float)
-    changed: Array = lfilter(
-        [1.0, -1.0], [1.0, -float(np.exp(-sample_period_s / level_s))], signal - signal[:1], axis=0
-    )
-    return changed
+    signal, pole = np.asarray(signal, dtype=float), float(np.exp(-sample_period_s / level_s))
+    return np.asarray(lfilter([1.0, -1.0], [1.0, -pole], signal - signal[:1], axis=0))
 
 
 def known_load(
@@ -59,17 +56,15 @@ def known_load(
     Parameters
     ----------
     position : array_like, shape (n_samples, ...), rad
-        Recorded; its second difference is low-passed without delay.
     sample_period_s : float
     moment : float
-        Mass times gravity times lever arm, in any unit of torque, or divided by the torque constant: then the load is
-        in units of current.
+        Mass times gravity times lever arm, in any unit of torque, or over the torque constant, in units of current.
     inertia : float
         Of the load, the same unit times s^2/rad.
     angle_rad : float
         Position at which the mass hangs at rest.
     corner_hz : float
-        Of the acceleration.
+        Up to which the second difference of the position counts, low-passed without delay.
 
     Examples
     --------
@@ -85,3 +80,79 @@ def known_load(
         acceleration[1:-1] = np.diff(position, n=2, axis=0) / sample_period_s**2
         load = load + inertia * low_passed(acceleration, corner_hz, sample_period_s)
     return np.asarray(load, dtype=float)
+
+
+@dataclass(frozen=True)
+class LoadAccuracy:
+    """Errors of a load estimate, low-passed, in units of the load."""
+
+    floor_rms: float  # Of the estimate on episodes without load
+    error_rms: float  # Under load
+    load_rms: float  # Of the load itself
+
+    @property
+    def ratio(self) -> float:
+        """Error under load to the floor."""
+        return self.error_rms / self.floor_rms
+
+    @property
+    def percent(self) -> float:
+        """Error under load in percent of the load."""
+        return 100 * self.error_rms / self.load_rms
+
+
+def load_accuracy(
+    estimate: npt.ArrayLike, load: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 0
+) -> LoadAccuracy:
+    """Judge estimates of the load, shape (n_samples, batch), against known ones."""
+    truth = np.asarray(load, dtype=float)
+    loaded = np.any(truth != 0, axis=0)
+    if loaded.all() or not loaded.any():
+        count = f"{int(loaded.sum())} of {len(loaded)}"
+        raise DataError(f"Load accuracy: needs episodes with and without load, found {count} with load.")
+    slow = low_passed(truth, corner_hz, sample_period_s)[skip:]
+    error = low_passed(estimate, corner_hz, sample_period_s)[skip:] - slow
+    signals = error[:, ~loaded], error[:, loaded], slow[:, loaded]
+    return LoadAccuracy(*(float(np.sqrt(np.mean(signal**2))) for signal in signals))
+
+
+@dataclass(frozen=True)
+class TorqueScale:
+    """Torque of a current's error.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from kros.motor_drive import TorqueScale
+    >>> known = np.sin(2 * np.pi * 0.5 * 0.001 * np.arange(8000))  # N m
+    >>> scale = TorqueScale.calibrated(0.1 + known / 50, known, 0.001)
+    >>> round(scale.torque_constant), round(scale.bias, 3), round(float(scale.load(0.3)), 6)
+    (50, 0.1, 10.0)
+    """
+
+    torque_constant: float  # torque per unit of current
+    bias: float  # error of the current without load, in units of current
+    residual_percent: float  # what is left of the known load, low-passed, in percent of its standard deviation
+
+    @classmethod
+    def calibrated(
+        cls, error: npt.ArrayLike, known: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 300
+    ) -> TorqueScale:
+        """Return the scale from measured minus estimated current and the torque of a known load, (n_samples, ...).
+
+        Least squares with a bias on signals low-passed without delay, without `skip` samples at the start. A DataError
+        says when the known load does not change, or the error does not follow it.
+        """
+        x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
+        dx, dt = x - x.mean(), t - t.mean()
+        if not dt @ dt > 0 or not dx @ dt > 0:
+            found = f"deviations {t.std():.3g} and {x.std():.3g} and covariance {dx @ dt / len(t):.3g}"
+            raise DataError(f"Torque constant: the current's error should follow the load, found {found}; check signs.")
+        constant = float(dx @ dt / (dx @ dx))
+        rest = dt - constant * dx
+        residual = float(100 * np.sqrt(rest @ rest / (dt @ dt)))
+        return cls(constant, float(x.mean() - t.mean() / constant), residual)
+
+    def load(self, error: npt.ArrayLike) -> Array:
+        """Return the load's torque, ``K (i - i_hat - bias)``, from measured minus estimated current."""
+        return self.torque_constant * (np.asarray(error, dtype=float) - self.bias)

@@ -1,20 +1,22 @@
-r"""What makes an observer a filter bank: how it starts, and what stands for measurements that are missing.
+r"""What makes an observer a filter bank: how it starts, and what replaces missing measurements.
 
-While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its internal
-states are the filters z of measurements and inputs, whose estimate is given then, and the filters w of inputs alone with
-their own estimate :math:`x^u` of all recorded states. The fallback
+While measurements arrive, a filter bank feeds nothing back that it estimates. Behind the recorded states x its
+internal states are the filters z of measurements and inputs, whose estimate is given then, and the filters w of
+inputs alone with their own estimate :math:`x^u` of all recorded states. The fallback
 
 .. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
 
-continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. The age a of a gap is the number of samples that are
-missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as the filters forget what stood for them. Every state has its own
-:math:`\mu`: a state that is estimated from slow filters is wrong for longer. The estimate of a state that is not measured is
+continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. The age a of a gap is
+the number of samples that are missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as
+the filters forget what stood for them. Every state has its own :math:`\mu`: a state that is estimated from slow
+filters is wrong for longer. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (f_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
-A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback: what the filters see is bounded for any
-pattern of losses, and so are they. When a measurement returns, the gap is bridged by a straight line: the response r of the filters to a unit ramp was
-run along, and ``z`` is corrected by :math:`r (y - \hat y) / (g + 1)` after g samples.
+A missing measurement is replaced by its estimate, at most :math:`1 - m` times a reach away from the fallback: what
+the filters see is bounded for any pattern of losses, and so are they. When a measurement returns, the gap is bridged
+by a straight line: the response r of the filters to a unit ramp was run along, and ``z`` is corrected by
+:math:`r (y - \hat y) / (g + 1)` after g samples.
 """
 
 from __future__ import annotations
@@ -38,9 +40,9 @@ class FilterBank:
     Parameters
     ----------
     filters : int
-        Number of filters z, the first internal states; those of inputs alone follow, and the estimates of these, one for every recorded state.
+        Number of filters z, the first internal states; filters of inputs alone and their estimates follow.
     start : ndarray, shape (n_states, n_lifted + inputs)
-        First estimate from the lifted first sample: ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, states that are not measured taken as zero.
+        First estimate ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, with zero for states that are not measured.
     forget : ndarray, shape (n,)
         rho of every recorded state, between zero and one.
     half : ndarray, shape (n,)
@@ -48,7 +50,7 @@ class FilterBank:
     recovery : ndarray, shape (n,)
         mu of every recorded state, between zero and one.
     reach : ndarray, shape (q,)
-        Largest distance between what stands for a missing measurement and the fallback, at level zero.
+        Largest distance between the substitute of a missing measurement and the fallback, at level zero.
 
     Raises
     ------
@@ -100,7 +102,7 @@ class FilterBank:
         return np.asarray(ratio * ratio / (1 + ratio * ratio))
 
     def times(self, x: Array, columns: Array, y: Array) -> FilterBank:
-        """Return the bank in other units of measure, by the factors of all states, of the columns of `start` and of measurements."""
+        """Return the bank in other units of measure, by factors of states, columns of `start` and measurements."""
         return replace(self, start=self.start * x[:, None] / columns, reach=self.reach * y)
 
     def turned(self, turn: Array) -> FilterBank:
@@ -128,7 +130,7 @@ class Gaps:
             values[rows] = 0.0
 
     def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
-        """Put measurements (batch, q) and what stands for missing ones into states (batch, n), and bridge gaps that end."""
+        """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
         self.held = (x[:, self.fallback] + self.offset)[:, self.measured]
         reach = (1 - self.bank.level(self.age)[:, self.measured]) * self.bank.reach
         near = np.clip(x[:, self.measured] - self.held, -reach, reach)
@@ -146,7 +148,7 @@ class Gaps:
         return np.asarray(self.bank.forget * (last - x[:, self.fallback]))
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
-        """Change over to the fallback in the next states (batch, n), and move levels, ramps and offsets on; x as `fill` left it."""
+        """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
         offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))
         count = np.where(missing, self.count + 1, 0.0)

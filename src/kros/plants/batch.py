@@ -15,7 +15,6 @@ from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, 
 
 Array = npt.NDArray[np.float64]
 
-SUBSTEPS = 2
 COUNT_RAD = 2 * np.pi / 4096  # of the encoder
 INPUT_STREAM, UNIT_STREAM, OUTLIER_STREAM, NOISE_STREAM = range(4)  # first words of spawn keys
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -34,14 +33,6 @@ T = TypeVar("T")  # true parameters, with `as_dict`, ready for JSON
 class SimulatedPopulation(Generic[T]):
     """Recordings and what is true about them.
 
-    Parameters
-    ----------
-    population : Population
-        Ready for identification, as a reader yields it.
-    raw : Population
-        As recorded, before preparation; the same as `population` where a plant needs none.
-    truth : object with ``as_dict()``
-
     Examples
     --------
     >>> from kros.plants import DcMotorPopulation
@@ -50,9 +41,9 @@ class SimulatedPopulation(Generic[T]):
     ['001', '002']
     """
 
-    population: Population
-    raw: Population
-    truth: T
+    population: Population  # ready for identification, as a reader yields it
+    raw: Population  # as recorded, before preparation; the same where a plant needs none
+    truth: T  # with ``as_dict()``
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,8 +55,7 @@ class SimulatedEpisodes:
     def __call__(self, key: EpisodeKey) -> Array:
         """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
         if key not in self.parts:
-            known = f"the simulation has {len(self.parts)} episodes, first {next(iter(self.parts), None)}"
-            raise DataError(f"Asked for {key}; {known}; take keys from population.episodes.")
+            raise DataError(f"Asked for {key}; the simulation has no such episode; take keys from population.episodes.")
         return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
 
     def restricted(self, keys: Iterable[EpisodeKey]) -> SimulatedEpisodes:
@@ -100,11 +90,38 @@ class BatchSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class UnitTruth:
-    """True parameters, each an array of shape (n_units,)."""
+class UnitTruth(ABC):
+    """True parameters, each an array of shape (n_units,), and the differential equation that they belong to."""
 
     unit_ids: tuple[str, ...]  # order of the unit axis
     plant: ClassVar[str]
+    n_states: ClassVar[int]
+    sample_period_s: ClassVar[float]
+
+    @abstractmethod
+    def rates(self, x: Array, u: Array) -> Array:
+        """Return dx/dt, shape (n_states, n_units, n_episodes), for inputs (n_episodes,)."""
+
+    def held(self, x: Array) -> Array:
+        """Return states within their limits."""
+        return x
+
+    def respond(self, inputs: Array) -> Array:
+        """Return states from rest without sensors, (n_states, n_units, n_episodes, n_samples), inputs held.
+
+        Two steps a sample of the method of Runge and Kutta of order four; inputs have shape (n_episodes, n_samples).
+        """
+        x, h = np.zeros((self.n_states, len(self.unit_ids), len(inputs))), self.sample_period_s / 2
+        out = np.empty((inputs.shape[1], *x.shape))
+        for k, u in enumerate(inputs.T):
+            out[k] = x
+            for _ in range(2):
+                k1 = self.rates(x, u)
+                k2 = self.rates(x + 0.5 * h * k1, u)
+                k3 = self.rates(x + 0.5 * h * k2, u)
+                k4 = self.rates(x + h * k3, u)
+                x = self.held(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+        return np.moveaxis(out, 0, -1).copy()
 
     def as_dict(self) -> dict[str, Any]:
         """Return all parameters, ready for JSON: one entry per unit."""
@@ -119,32 +136,23 @@ P = TypeVar("P", bound=UnitTruth)
 class Batch(BatchSettings, ABC, Generic[P]):
     """A batch of small plants with one pseudorandom input; the first state is seen by an encoder."""
 
+    truth: Callable[..., P]  # of the units: names, then arrays by name
     channels: ClassVar[tuple[Channel, ...]]
     truths: ClassVar[tuple[Channel, ...]] = ()
-    sample_period_s: ClassVar[float]
     noise: ClassVar[tuple[float, ...]]  # standard deviations of the sensors behind the encoder
     parameters: ClassVar[Mapping[str, tuple[float, float]]]  # nominal value, deviation of its logarithm at spread 1
     outlier_log_factors: ClassVar[Mapping[str, float]]
 
     @abstractmethod
-    def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> P:
-        """Return the plant of some units, from parameters of shape (n_units,)."""
-
-    @abstractmethod
     def reference(self, rng: np.random.Generator, n_samples: int) -> Array:
         """Draw the input of an episode, shape (n_samples,)."""
-
-    @abstractmethod
-    def respond(self, truth: P, inputs: Array) -> Array:
-        """Return states from rest, (n_states, n_units, n_episodes, n_samples), for inputs (n_episodes, n_samples)."""
 
     def simulate(self) -> SimulatedPopulation[P]:
         """Simulate all episodes of all units."""
         units, truth = self._units()
-        n_samples = round(self.seconds / self.sample_period_s)
+        n_samples = round(self.seconds / truth.sample_period_s)
         inputs = np.stack([self.reference(self.random(INPUT_STREAM, e), n_samples) for e in range(self.n_episodes)])
-        states = self.respond(truth, inputs)
-        names = [c.name for c in self.channels]
+        states, names = truth.respond(inputs), [c.name for c in self.channels]
         true = states[[names.index(t.of) for t in self.truths]]
         keys = {
             EpisodeKey(unit.id, DEFAULT_CONDITION, str(e)): (u, e)
@@ -156,7 +164,7 @@ class Batch(BatchSettings, ABC, Generic[P]):
             states[1 : 1 + len(noise), *at] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
         source = SimulatedEpisodes({k: (states[:, u, e], inputs[e, None], true[:, u, e]) for k, (u, e) in keys.items()})
-        facts = (self.sample_period_s, units, tuple(keys), source, {"plant": self.plant}, self.truths)
+        facts = (truth.sample_period_s, units, tuple(keys), source, {"plant": truth.plant}, self.truths)
         population = Population(self.channels, *facts)
         return SimulatedPopulation(population, population, truth)
 
@@ -170,29 +178,8 @@ class Batch(BatchSettings, ABC, Generic[P]):
             units.insert(0, Unit("000", OUTLIERS))
             drawn.insert(0, {n: v * factors[n] for n, v in bad.items()})
         values = {n: np.array([d[n] for d in drawn]) for n in self.parameters}
-        return tuple(units), self.truth(tuple(u.id for u in units), values)
+        return tuple(units), self.truth(tuple(u.id for u in units), **values)
 
     def _draw(self, rng: np.random.Generator) -> dict[str, float]:
         kinds = self.parameters.items()
         return {n: v * float(np.exp(self.spread * dev * rng.standard_normal())) for n, (v, dev) in kinds}
-
-
-def runge_kutta(
-    rates: Callable[[Array, Array], Array],
-    start: Array,
-    inputs: Array,
-    period_s: float,
-    held: Callable[[Array], Array] = lambda x: x,
-) -> Array:
-    """Integrate by the method of order four, inputs held, shape (n_states, n_units, n_episodes, n_samples)."""
-    out = np.empty((inputs.shape[1], *start.shape))
-    x, h = start, period_s / SUBSTEPS
-    for k in range(len(out)):
-        out[k] = x
-        for _ in range(SUBSTEPS):
-            k1 = rates(x, inputs[:, k])
-            k2 = rates(x + 0.5 * h * k1, inputs[:, k])
-            k3 = rates(x + 0.5 * h * k2, inputs[:, k])
-            k4 = rates(x + h * k3, inputs[:, k])
-            x = held(x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
-    return np.moveaxis(out, 0, -1).copy()

@@ -11,42 +11,21 @@ exactly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..data.population import Channel, Role
-from .batch import Batch, UnitTruth, runge_kutta
+from .batch import Batch, UnitTruth
 
 Array = npt.NDArray[np.float64]
-
-SAMPLE_PERIOD_S = 0.002
-VELOCITY_NOISE = 0.1  # rad/s, standard deviation
-CURRENT_NOISE = 0.01  # A, standard deviation
-CURRENT_LIMIT_A = 8.0
-SLIP_RAD_S = 1.0  # w_s: below it friction is viscous
-HOLD_SAMPLES = (50, 200)  # shortest and longest level of the input
-VOLTAGE_V = 12.0
-PARAMETERS = {  # nominal value, relative deviation
-    "resistance": (1.0, 0.05),
-    "inductance": (5e-3, 0.08),
-    "torque_constant": (0.05, 0.05),
-    "inertia": (1e-4, 0.05),
-    "viscous": (1e-4, 0.15),
-    "coulomb": (1e-2, 0.15),
-}
-OUTLIER_LOG_FACTORS = {"torque_constant": -0.25, "viscous": 0.8, "coulomb": 1.0}  # a tired magnet and a dry bearing
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
     Channel("velocity", Role.STATE, "rad/s"),
     Channel("current", Role.STATE, "A"),
     Channel("voltage", Role.INPUT, "V"),
 )
-# what the noisy sensors see
-TRUTHS = tuple(Channel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3])
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,17 +38,22 @@ class DcMotorTruth(UnitTruth):
     inertia: Array  # shape (n_units,), kg m^2
     viscous: Array  # shape (n_units,), N m s/rad
     coulomb: Array  # shape (n_units,), N m
-    plant: ClassVar[str] = "dc-motor"
 
-    def respond(self, voltage: Array) -> Array:
-        """Simulate all motors from rest, without sensors, shape (3, n_units, n_episodes, n_samples)."""
-        start = np.zeros((3, len(self.unit_ids), len(voltage)))
-        return runge_kutta(self._rates, start, voltage, SAMPLE_PERIOD_S, _limited)
+    plant, n_states, sample_period_s = "dc-motor", 3, 0.002
+    slip_rad_s = 1.0  # w_s: below it friction is viscous
+    current_limit_a = 8.0
 
-    def _rates(self, x: Array, voltage: Array) -> Array:
-        R, L, k, J, b, c = (getattr(self, name)[:, None] for name in PARAMETERS)
+    def rates(self, x: Array, u: Array) -> Array:
+        """Rates of position, velocity and current for a voltage."""
+        parameters = self.resistance, self.inductance, self.torque_constant, self.inertia, self.viscous, self.coulomb
+        R, L, k, J, b, c = (p[:, None] for p in parameters)
         _, w, i = x
-        return np.stack([w, (k * i - b * w - c * np.tanh(w / SLIP_RAD_S)) / J, (voltage - R * i - k * w) / L])
+        return np.stack([w, (k * i - b * w - c * np.tanh(w / self.slip_rad_s)) / J, (u - R * i - k * w) / L])
+
+    def held(self, x: Array) -> Array:
+        """Keep the current within what the amplifier gives."""
+        x[2] = np.clip(x[2], -self.current_limit_a, self.current_limit_a)
+        return x
 
 
 class DcMotorPopulation(Batch[DcMotorTruth]):
@@ -85,26 +69,24 @@ class DcMotorPopulation(Batch[DcMotorTruth]):
     ['outliers', 'population', 'population', 'population']
     """
 
-    plant = "dc-motor"
-    channels, truths, sample_period_s, noise = CHANNELS, TRUTHS, SAMPLE_PERIOD_S, (VELOCITY_NOISE, CURRENT_NOISE)
-    parameters, outlier_log_factors = PARAMETERS, OUTLIER_LOG_FACTORS
-
-    def truth(self, unit_ids: tuple[str, ...], values: Mapping[str, Array]) -> DcMotorTruth:
-        """Return the motors."""
-        return DcMotorTruth(unit_ids, **values)
+    plant, truth = DcMotorTruth.plant, DcMotorTruth
+    channels = CHANNELS
+    truths = tuple(Channel(f"{c.name}_true", Role.TRUTH, c.unit, of=c.name) for c in CHANNELS[1:3])
+    noise = (0.1, 0.01)  # of velocity in rad/s, of current in A
+    hold = (50, 200)  # shortest and longest level of the input, in samples
+    voltage = 12.0
+    parameters = {  # noqa: RUF012
+        "resistance": (1.0, 0.05),
+        "inductance": (5e-3, 0.08),
+        "torque_constant": (0.05, 0.05),
+        "inertia": (1e-4, 0.05),
+        "viscous": (1e-4, 0.15),
+        "coulomb": (1e-2, 0.15),
+    }
+    outlier_log_factors = {"torque_constant": -0.25, "viscous": 0.8, "coulomb": 1.0}  # noqa: RUF012
 
     def reference(self, rng: np.random.Generator, n_samples: int) -> Array:
         """Voltages of random size, each held for a random time and followed by its opposite for the same time."""
-        pairs = n_samples // (2 * HOLD_SAMPLES[0]) + 1
-        lengths, levels = rng.integers(*HOLD_SAMPLES, size=pairs), rng.uniform(-VOLTAGE_V, VOLTAGE_V, pairs)
+        pairs = n_samples // (2 * self.hold[0]) + 1
+        lengths, levels = rng.integers(*self.hold, size=pairs), rng.uniform(-self.voltage, self.voltage, pairs)
         return np.repeat(np.stack([levels, -levels], axis=1).ravel(), np.repeat(lengths, 2))[:n_samples]
-
-    def respond(self, truth: DcMotorTruth, inputs: Array) -> Array:
-        """Return position, velocity and current from rest."""
-        return truth.respond(inputs)
-
-
-def _limited(x: Array) -> Array:
-    """Keep the current within what the amplifier gives."""
-    x[2] = np.clip(x[2], -CURRENT_LIMIT_A, CURRENT_LIMIT_A)
-    return x

@@ -7,8 +7,9 @@ from shutil import copyfile
 
 from ..core.artifacts import save_artifact
 from ..design.synthesize import synthesize_all
-from ..identify.calibrate import calibrate
-from ..identify.identify import identify
+from ..identify.calibration import calibrate
+from ..identify.identified import IdentifiedModels
+from ..identify.identify import with_models
 from ..uncertainty.quantify import quantify
 from .config import Stage
 from .engine.context import Context
@@ -26,9 +27,8 @@ def run_calibrate(context: Context) -> None:
 
 def run_identify(context: Context) -> None:
     """Identify models of every kind in every condition."""
-    settings = {"calibration": context.calibration, "facts": context.facts, **dict(context.config.identify)}
-    models = identify(context.population, context.lifting, work=context.work, **settings)
-    models.save_models(context.store.draft())
+    base = IdentifiedModels(context.population, context.facts, context.lifting, context.calibration)
+    with_models(base, context.config.identify, context.work).save_models(context.store.draft())
 
 
 def run_quantify(context: Context) -> None:

@@ -20,7 +20,7 @@ from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
-    from .mixed_norms.optimal import mixed
+    from .mixed_norms.mixed import mixed
     from .problem.observer_problem import ObserverProblem
     from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from .riccati.h2 import h2
     from .riccati.hinf import hinf
     from .riccati.kalman import kalman
-    from .worst_case.unit_check import UnitCheck, check_units
     from .worst_case.worst_case_h2 import worst_case_h2
 
 _HOME = {
@@ -38,12 +37,10 @@ _HOME = {
     "ResidualProblem": "residual_shaped.residual_h2",
     "Status": "result",
     "Synthesis": "result",
-    "UnitCheck": "worst_case.unit_check",
-    "check_units": "worst_case.unit_check",
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
     "kalman": "riccati.kalman",
-    "mixed": "mixed_norms.optimal",
+    "mixed": "mixed_norms.mixed",
     "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",
@@ -56,8 +53,6 @@ __all__ = [
     "ResidualProblem",
     "Status",
     "Synthesis",
-    "UnitCheck",
-    "check_units",
     "h2",
     "hinf",
     "kalman",

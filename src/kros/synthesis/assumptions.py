@@ -6,7 +6,6 @@ The labels follow Zhou, Doyle and Glover, *Robust and Optimal Control*, section 
 
 from __future__ import annotations
 
-from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -20,28 +19,20 @@ Array = npt.NDArray[Any]
 
 _RANK = 1e-10
 
-
-class Assumption(str, Enum):
-    """What the Riccati solution needs."""
-
-    STABILISABLE = "A1a: (A, B2) stabilisable"
-    DETECTABLE = "A1b: (C2, A) detectable"
-    CONTROL_PENALTY = "A2a: D12 of full column rank"
-    MEASUREMENT_NOISE = "A2b: D21 of full row rank"
-    NO_ZERO_CONTROL = "A3: no zero of (A, B2, C1, D12) on the stability boundary"
-    NO_ZERO_MEASUREMENT = "A4: no zero of (A, B1, C2, D21) on the stability boundary"
-    PROPER = "D11 = 0 in continuous time"
-
-
-_REMEDY = {
-    Assumption.STABILISABLE: "make the weights stable or let the control reach this mode",
-    Assumption.DETECTABLE: "make the weights stable or measure this mode",
-    Assumption.CONTROL_PENALTY: "add a small correction penalty to z",
-    Assumption.MEASUREMENT_NOISE: "add measurement noise to w",
-    Assumption.NO_ZERO_CONTROL: "make the weights stable, or penalise more outputs",
-    Assumption.NO_ZERO_MEASUREMENT: "make the weights stable, or add process noise",
-    Assumption.PROPER: "use a strictly proper weight",
-}
+# Label and remedy of each assumption.
+STABILISABLE = "A1a: (A, B2) stabilisable", "make the weights stable or let the control reach this mode"
+DETECTABLE = "A1b: (C2, A) detectable", "make the weights stable or measure this mode"
+CONTROL_PENALTY = "A2a: D12 of full column rank", "add a small correction penalty to z"
+MEASUREMENT_NOISE = "A2b: D21 of full row rank", "add measurement noise to w"
+NO_ZERO_CONTROL = (
+    "A3: no zero of (A, B2, C1, D12) on the stability boundary",
+    "make the weights stable, or penalise more outputs",
+)
+NO_ZERO_MEASUREMENT = (
+    "A4: no zero of (A, B1, C2, D21) on the stability boundary",
+    "make the weights stable, or add process noise",
+)
+PROPER = "D11 = 0 in continuous time", "use a strictly proper weight"
 
 
 def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
@@ -49,51 +40,45 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
     outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
-    beyond = []
-    for mode in outside:
-        pencil = np.hstack([A - mode * np.eye(len(A)), B])
-        values = np.linalg.svd(pencil, compute_uv=False)
-        if values[-1] <= 1e-9 * max(values[0], 1e-300):
-            beyond.append(complex(mode))
-    return beyond
+    pencils = (np.hstack([A - mode * np.eye(len(A)), B]) for mode in outside)
+    sizes = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)
+    return [complex(mode) for mode, s in zip(outside, sizes, strict=True) if s[-1] <= 1e-9 * max(s[0], 1e-300)]
 
 
-def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[Assumption, str]:
-    """Check every assumption of H2 synthesis and return those that fail, with what was found."""
+def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[tuple[str, str], str]:
+    """Check every assumption of H2 synthesis and return those that fail, with the values."""
     p, (n, _, n_u, _, n_y) = plant, plant.sizes
     failed = {}
     if modes := unreachable_modes(p.A, p.B2, p.dt):
-        failed[Assumption.STABILISABLE] = f"mode {modes[0]:.6g}"
+        failed[STABILISABLE] = f"mode {modes[0]:.6g}"
     if modes := unreachable_modes(p.A.T, p.C2.T, p.dt):
-        failed[Assumption.DETECTABLE] = f"mode {modes[0]:.6g}"
-    if _rank(p.D12) < n_u:
-        failed[Assumption.CONTROL_PENALTY] = f"rank {_rank(p.D12)}, {n_u} controls"
-    if _rank(p.D21) < n_y:
-        failed[Assumption.MEASUREMENT_NOISE] = f"rank {_rank(p.D21)}, {n_y} measurements"
+        failed[DETECTABLE] = f"mode {modes[0]:.6g}"
+    if (rank := _rank(p.D12)) < n_u:
+        failed[CONTROL_PENALTY] = f"rank {rank}, {n_u} controls"
+    if (rank := _rank(p.D21)) < n_y:
+        failed[MEASUREMENT_NOISE] = f"rank {rank}, {n_y} measurements"
     if proper and p.dt == 0 and np.any(p.D11):
-        failed[Assumption.PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
+        failed[PROPER] = f"largest entry {np.abs(p.D11).max():.3g}"
     if failed or not n:
         return failed
     if zeros := _boundary_zeros(p.A, p.B2, p.C1, p.D12, p.dt):
-        failed[Assumption.NO_ZERO_CONTROL] = f"zero {zeros[0]:.6g}"
+        failed[NO_ZERO_CONTROL] = f"zero {zeros[0]:.6g}"
     if zeros := _boundary_zeros(p.A.T, p.C2.T, p.B1.T, p.D21.T, p.dt):
-        failed[Assumption.NO_ZERO_MEASUREMENT] = f"zero {zeros[0]:.6g}"
+        failed[NO_ZERO_MEASUREMENT] = f"zero {zeros[0]:.6g}"
     return failed
 
 
 def require_plant(plant: object, method: str) -> None:
     """Raise a `DimensionError` when it is no generalized plant."""
     if not isinstance(plant, GeneralizedPlant):
-        raise DimensionError(
-            f"{method} needs a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt), found "
-            f"{type(plant).__name__}; build one first."
-        )
+        needed = "a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt)"
+        raise DimensionError(f"{method} needs {needed}, found {type(plant).__name__}; build one first.")
 
 
 def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
     """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
     require_plant(plant, method)
-    failed = [f"{a.value} ({found}): {_REMEDY[a]}" for a, found in h2_violations(plant, proper).items()]
+    failed = [f"{label} ({value}): {fix}" for (label, fix), value in h2_violations(plant, proper).items()]
     if failed:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")
 
@@ -102,10 +87,8 @@ def require_detectable(A: Array, C: Array, dt: float, method: str) -> None:
     """Raise a `SynthesisError` naming the first mode on or beyond the stability boundary that C does not see."""
     modes = unreachable_modes(A.T, C.T, dt)
     if modes:
-        raise SynthesisError(
-            f"{method}: (A, C) is not detectable, mode {modes[0]:.6g} is on or outside the unit circle and invisible "
-            "in y; measure another state."
-        )
+        problem = f"mode {modes[0]:.6g} is on or outside the unit circle and invisible in y"
+        raise SynthesisError(f"{method}: (A, C) is not detectable, {problem}; measure another state.")
 
 
 def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
@@ -129,15 +112,12 @@ def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[c
     D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C.
     """
     pinv = np.linalg.pinv(D)
-    inner = A - B @ pinv @ C
-    rest = C - D @ (pinv @ C)
-    inner, seen = _balanced(inner.T, rest.T)
-    inner, rest = inner.T, seen.T
+    inner, seen = _balanced((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T)
     zeros = []
     for mode in np.linalg.eigvals(inner):
         distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))
         if distance < 1e-12:
-            values = np.linalg.svd(np.vstack([inner - mode * np.eye(len(A)), rest]), compute_uv=False)
+            values = np.linalg.svd(np.hstack([inner - mode * np.eye(len(A)), seen]), compute_uv=False)
             if values[-1] <= 1e-10 * values[0]:
                 zeros.append(complex(mode))
     return zeros

@@ -8,7 +8,7 @@ K : controller with matrices A^c, B^c, C^c, D^c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -37,27 +37,6 @@ class GeneralizedPlant:
             +----------->|  K  |----------------+      u = + K y
                          +-----+
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-    B1 : ndarray, shape (n, n_w)
-    B2 : ndarray, shape (n, n_u)
-    C1 : ndarray, shape (n_z, n)
-    C2 : ndarray, shape (n_y, n)
-    D11 : ndarray, shape (n_z, n_w)
-    D12 : ndarray, shape (n_z, n_u)
-    D21 : ndarray, shape (n_y, n_w)
-    D22 : ndarray, shape (n_y, n_u)
-    dt : float, s
-        Sampling period; 0 means continuous time.
-    n_w1 : int, optional
-        For `mixed`: the first `n_w1` disturbances are ``w1`` (performance), the others ``w2`` (uncertainty). Default
-        all.
-    n_z1 : int, optional
-        For `mixed`: the first `n_z1` outputs are ``z1``, the others ``z2``. Default all.
-    w_parts, z_parts : dict of str to int
-        Names and sizes of the parts of w and of z, in order, where they have names.
-
     Raises
     ------
     DimensionError
@@ -75,20 +54,18 @@ class GeneralizedPlant:
     True
     """
 
-    A: Array
-    B1: Array
-    B2: Array
-    C1: Array
-    C2: Array
-    D11: Array
-    D12: Array
-    D21: Array
-    D22: Array
-    dt: float
-    n_w1: int | None = None
-    n_z1: int | None = None
-    w_parts: dict[str, int] = field(default_factory=dict)
-    z_parts: dict[str, int] = field(default_factory=dict)
+    A: Array  # (n, n)
+    B1: Array  # (n, n_w)
+    B2: Array  # (n, n_u)
+    C1: Array  # (n_z, n)
+    C2: Array  # (n_y, n)
+    D11: Array  # (n_z, n_w)
+    D12: Array  # (n_z, n_u)
+    D21: Array  # (n_y, n_w)
+    D22: Array  # (n_y, n_u)
+    dt: float  # s; 0 means continuous time
+    n_w1: int | None = None  # for `mixed`: so many disturbances are w1 (performance), the others w2; default all
+    n_z1: int | None = None  # for `mixed`: so many outputs are z1, the others z2; default all
 
     def __post_init__(self) -> None:
         for name in _MATRICES:
@@ -100,23 +77,13 @@ class GeneralizedPlant:
         expected |= {"D11": (n_z, n_w), "D12": (n_z, n_u), "D21": (n_y, n_w), "D22": (n_y, n_u)}
         for name, shape in expected.items():
             if getattr(self, name).shape != shape:
-                found = {key: getattr(self, key).shape for key in _MATRICES}
-                raise DimensionError(
-                    f"Generalized plant: {name} should have shape {shape}, found {found}; transpose or pad the "
-                    "offending matrix."
-                )
+                shapes = {key: getattr(self, key).shape for key in _MATRICES}
+                raise DimensionError(f"Generalized plant: {name} should have shape {shape}, found {shapes}.")
         if not all(np.isfinite(getattr(self, name)).all() for name in _MATRICES):
-            raise DimensionError(
-                "Generalized plant: a matrix contains NaN or infinity; look at the weights that went into it."
-            )
+            raise DimensionError("Generalized plant: a matrix contains NaN or infinity; check the weights.")
         for name, part, whole in (("n_w1", self.n_w1, n_w), ("n_z1", self.n_z1, n_z)):
             if part is not None and not 0 <= part <= whole:
                 raise DimensionError(f"Generalized plant: {name} = {part} should lie between 0 and {whole}.")
-        for name, parts, whole in (("w", self.w_parts, n_w), ("z", self.z_parts, n_z)):
-            if parts and sum(parts.values()) != whole:
-                raise DimensionError(
-                    f"Generalized plant: the parts of {name} should have {whole} signals together, found {parts}."
-                )
 
     @property
     def sizes(self) -> tuple[int, int, int, int, int]:
@@ -132,24 +99,6 @@ class GeneralizedPlant:
         """Columns of w that belong to channel 1 (performance) or 2 (uncertainty)."""
         split = self.sizes[1] if self.n_w1 is None else self.n_w1
         return slice(0, split) if channel == 1 else slice(split, None)
-
-    def part(self, signal: str, name: str) -> Array:
-        """Return the indices of a named part of ``w`` or ``z``.
-
-        Raises
-        ------
-        DimensionError
-            When the signal has no part of that name.
-        """
-        parts = {"w": self.w_parts, "z": self.z_parts}.get(signal, {})
-        if name not in parts:
-            raise DimensionError(
-                f"Generalized plant: {signal!r} has no part {name!r}, only {', '.join(parts) or 'none'}; name one of "
-                "them."
-            )
-        names = list(parts)
-        first = sum(parts[other] for other in names[: names.index(name)])
-        return np.arange(first, first + parts[name])
 
     def channel(self, rows: slice | Array, columns: slice | Array) -> GeneralizedPlant:
         """Return the plant restricted to some performance outputs and disturbances."""
@@ -215,17 +164,13 @@ class GeneralizedPlant:
         K = StateSpace.of(controller)
         _, _, n_u, _, n_y = self.sizes
         if (K.n_outputs, K.n_inputs) != (n_u, n_y) or K.dt != self.dt or K.batch_shape:
+            size = f"{K.n_outputs} x {K.n_inputs} at {K.dt} s"
             raise DimensionError(
-                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {K.n_outputs} x "
-                f"{K.n_inputs} at {K.dt} s; "
-                "match the sizes and resample one of them."
+                f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {size}."
             )
         loop = np.eye(n_y) - self.D22 @ K.D
         if n_y and np.linalg.cond(loop) > 1e14:
-            raise DimensionError(
-                "Closing the loop: I - D22 D^c is singular, so the algebraic loop has no solution; use a strictly "
-                "proper controller."
-            )
+            raise DimensionError("Closing the loop: I - D22 D^c is singular; use a strictly proper controller.")
         # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))
         y_x, y_w = solved[:, : self.A.shape[0] + K.n_states], solved[:, self.A.shape[0] + K.n_states :]
@@ -237,13 +182,8 @@ class GeneralizedPlant:
         return StateSpace(A, np.vstack([self.B1 + self.B2 @ u_w, K.B @ y_w]), C, self.D11 + self.D12 @ u_w, self.dt)
 
 
-def split(system: StateSpace, n_w: int, n_z: int, **parts: Any) -> GeneralizedPlant:
-    """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` as in `GeneralizedPlant`."""
+def split(system: StateSpace, n_w: int, n_z: int, **parts: int | None) -> GeneralizedPlant:
+    """Cut a system from (w, u) to (z, y) into the nine matrices; `parts` are n_w1 and n_z1."""
     (B1, B2), (C1, C2) = np.split(system.B, [n_w], axis=1), np.split(system.C, [n_z])
     (D11, D12), (D21, D22) = (np.split(D, [n_w], axis=1) for D in np.split(system.D, [n_z]))
     return GeneralizedPlant(system.A, B1, B2, C1, C2, D11, D12, D21, D22, system.dt, **parts)
-
-
-def partitioned(system: StateSpace, w: dict[str, int], z: dict[str, int]) -> GeneralizedPlant:
-    """Cut a system from (w, u) to (z, y); channel 1 is all but the perturbation's part."""
-    return split(system, sum(w.values()), sum(z.values()), n_w1=w.get("w1"), n_z1=z.get("z1"), w_parts=w, z_parts=z)

@@ -1,10 +1,8 @@
 r"""Order reduction of a controller, with its loss in the certified cost, and of a generalized plant.
 
-A controller is balanced *in its loop*. Its states are as important as ``R R'``, their covariance while the closed loop
-is driven, and ``S S'``, the error that they cause through the loop, say together. These are the blocks of the closed
-loop's Gramians, so the weighting of the controller's error by the plant on both sides (Enns) and the balancing of the
-loop's own Gramians (Wortelboer) are the same thing here, and neither needs a stable controller. Every order is judged
-by the certificate itself.
+A controller is balanced *in its loop*, by the blocks of the closed loop's Gramians that belong to its states. So the
+weighting of its error by the plant on both sides (Enns) and the balancing of the loop's Gramians (Wortelboer) are the
+same here, and neither needs a stable controller. Every order is judged by the certificate itself.
 
 References
 ----------
@@ -80,16 +78,12 @@ def reduce_controller(
     (2, 0)
     """
     if largest_loss_percent < 0 or (order is not None and order < 0):
-        raise ConfigError(
-            f"Order reduction: order = {order} and largest_loss_percent = {largest_loss_percent} should not be "
-            "negative."
-        )
+        options = f"order = {order} and largest_loss_percent = {largest_loss_percent}"
+        raise ConfigError(f"Order reduction: {options} should not be negative.")
     full = synthesis.controller
     before = _verified(problem, full, synthesis)
     if before is None:
-        raise SynthesisError(
-            "Order reduction: the controller to be reduced does not stabilise; start from one that does."
-        )
+        raise SynthesisError("Order reduction: the controller does not stabilise; start from one that does.")
     left, right = _balanced(problem, full)
     limit = _cost(before) * (1 + largest_loss_percent / 100) if order is None else np.inf
     for k in range(full.n_states) if order is None else [min(order, full.n_states)]:
@@ -98,9 +92,7 @@ def reduce_controller(
         if full.n_states and reduced is not None and _cost(reduced) <= limit:
             return _bounded(reduced, synthesis, before)
     if order is not None and full.n_states:
-        raise SynthesisError(
-            f"Order reduction: no controller of order {order} that was found stabilises; ask for a higher one."
-        )
+        raise SynthesisError(f"Order reduction: no controller of order {order} stabilises; ask for a higher one.")
     return synthesis
 
 
@@ -116,10 +108,8 @@ def _verified(problem: ObserverProblem | GeneralizedPlant, K: StateSpace, synthe
         return None
     whole = problem.n_w1 is None and problem.n_z1 is None
     peak = hinf_norm(closed if whole else problem.uncertainty.close(K))
-    radius = closed.largest_pole()
-    return Synthesis(
-        synthesis.method, K, Status.CERTIFIED, h2_norm=value, hinf_norm=peak, spectral_radius=radius, solver="riccati"
-    )
+    norms: dict[str, Any] = {"h2_norm": value, "hinf_norm": peak, "spectral_radius": closed.largest_pole()}
+    return Synthesis(synthesis.method, K, Status.CERTIFIED, **norms, solver="riccati")
 
 
 def _cost(synthesis: Synthesis) -> float:

@@ -45,10 +45,9 @@ class Status(str, Enum):
         The optimum of the stated problem, verified: norms recomputed, loop stable.
     CERTIFIED
         Verified and its guarantee recomputed; the distance to the optimum is at most `gap_percent` (where it is known).
-        To narrow it raise the order of the weights or the number of refinements.
     INACCURATE
-        The solver stopped early (time limit, or reduced accuracy), but what it returned passed the same verification.
-        Raise the time limit, or add measurement noise and penalty, to come closer to the optimum.
+        The solver stopped early, but its result passed the same verification. Raise the time limit, or add measurement
+        noise and penalty, to come closer to the optimum.
 
     Examples
     --------
@@ -66,33 +65,6 @@ class Status(str, Enum):
 class Synthesis:
     """A verified correction filter and its certificate.
 
-    Parameters
-    ----------
-    method : str
-        Name of the method, for example ``worst_case_h2``.
-    controller : StateSpace
-        The filter K, ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``.
-    status : Status
-    injection : Injection
-    h2_norm : float or None
-        H2 norm of the closed loop from w (or w1) to z (or z1), recomputed.
-    hinf_norm : float or None
-        H-infinity norm of the closed loop from w (or w2) to z (or z2), recomputed.
-    worst_case_h2 : float or None
-        Certified H2 norm for every member of the uncertain set.
-    lower_bound : float or None
-        No controller of this kind does better.
-    gap_percent : float or None
-        ``100 (value / lower_bound - 1)``.
-    quadrature_error : float or None
-        Estimated error of `worst_case_h2`, already included in it.
-    spectral_radius : float or None
-        Of the nominal closed loop (for continuous systems the largest real part). It says nothing about robustness.
-    solve_s : float
-        Time of the numerical solution, without the fitting of weights.
-    solver : str
-    notes : tuple of str
-
     Examples
     --------
     >>> from kros.synthesis import kalman
@@ -101,18 +73,18 @@ class Synthesis:
     ('kalman', 'optimal', 0.5)
     """
 
-    method: str
-    controller: StateSpace
+    method: str  # for example ``worst_case_h2``
+    controller: StateSpace  # ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``
     status: Status
     injection: Injection = Injection.NONE
-    h2_norm: float | None = None
-    hinf_norm: float | None = None
-    worst_case_h2: float | None = None
-    lower_bound: float | None = None
-    gap_percent: float | None = None
-    quadrature_error: float | None = None
-    spectral_radius: float | None = None
-    solve_s: float = 0.0
+    h2_norm: float | None = None  # of the closed loop from w (or w1) to z (or z1), recomputed
+    hinf_norm: float | None = None  # of the closed loop from w (or w2) to z (or z2), recomputed
+    worst_case_h2: float | None = None  # certified for every member of the uncertain set
+    lower_bound: float | None = None  # no controller of this kind does better
+    gap_percent: float | None = None  # ``100 (value / lower_bound - 1)``
+    quadrature_error: float | None = None  # of `worst_case_h2`, already included in it
+    spectral_radius: float | None = None  # of the nominal loop (continuous: the largest real part)
+    solve_s: float = 0.0  # s, without the fitting of weights
     solver: str = ""
     notes: tuple[str, ...] = ()
 
@@ -120,11 +92,8 @@ class Synthesis:
         for name, kind in (("status", Status), ("injection", Injection)):
             object.__setattr__(self, name, member(kind, getattr(self, name), f"Synthesis {self.method}: the {name}"))
         if self.gap_percent is not None and not self.gap_percent >= 0:
-            raise SynthesisError(
-                f"Synthesis {self.method}: a lower bound of {self.lower_bound} lies above what is attained "
-                f"({self.gap_percent:.6g} %); "
-                "no result claims that. Please report the problem that led here."
-            )
+            problem = f"a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %)"
+            raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")
 
     def save(self, folder: Path) -> None:
         """Write `synthesis.json` and `arrays.npz`."""
@@ -138,12 +107,9 @@ class Synthesis:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "synthesis")
         values: dict[str, Any] = {name: content.get(name) for name in _PLAIN}
-        values |= {
-            "status": Status(content["status"]),
-            "injection": Injection(content["injection"]),
-            "notes": tuple(content["notes"]),
-        }
-        return cls(controller=StateSpace(arrays["A"], arrays["B"], arrays["C"], arrays["D"], content["dt"]), **values)
+        values["notes"] = tuple(content["notes"])
+        A, B, C, D = (arrays[name] for name in "ABCD")
+        return cls(controller=StateSpace(A, B, C, D, content["dt"]), **values)
 
 
 def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
@@ -153,15 +119,9 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
     if lower is None:
         return None, None, ("No lower bound could be proven.",)
     if lower > value * (1 + _ROUNDING):
-        log.error("Lower bound %.9g above the attained value %.9g: it is dropped.", lower, value)
-        return (
-            None,
-            None,
-            (
-                f"Internal error: a lower bound of {lower:.9g} above the attained {value:.9g} was dropped; please "
-                "report this problem.",
-            ),
-        )
+        problem = f"a lower bound of {lower:.9g} above the attained {value:.9g} was dropped"
+        log.error("Internal error: %s", problem)
+        return None, None, (f"Internal error: {problem}; please report this problem.",)
     lower = min(lower, value)
     return lower, 100 * (value / lower - 1), ()
 

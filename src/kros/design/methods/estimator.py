@@ -9,16 +9,16 @@ from typing import ClassVar
 
 import numpy as np
 
-from ...identify.kinds import kind_of
+from ...identify.model_set import kind_of
 from ...observer import EstimatorSettings, Recordings, identify_estimator
-from ...observer.sensor import sides
+from ...observer.sensor import Sensor, sides
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Method
 
 
 @dataclass(frozen=True)
 class Estimator(Method):
-    """Regression on filtered measurements and inputs; what sensors are declared to be is in its training episodes."""
+    """Regression on filtered measurements and inputs; declared sensors are in its training episodes, a bias in its errors."""
 
     name: ClassVar[str] = "estimator"
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
@@ -32,12 +32,13 @@ class Estimator(Method):
         """Identify the estimator."""
         began, models, training = time.perf_counter(), task.models, task.recordings
         nominal = {name: float(values[models.index(task.unit)]) for name, values in models.parameters.items()}
+        bias = np.array([task.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
         identified = identify_estimator(
             task.name,
             models.lifting,
             models.measured,
             models.recorded_inputs,
-            Recordings.of(training.keys, training.read_one),
+            Recordings.of(training.keys, training.read_one, bias),
             models.sample_period_s,
             nominal,
             self.settings,

@@ -13,7 +13,7 @@ import numpy as np
 from ... import synthesis, uncertainty  # solvers load when they are used
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, block_diagonal, gain
-from ...identify.kinds import kind_of
+from ...identify.model_set import kind_of
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
 from ...uncertainty.weights.entries import EntryWeights, fit_entries

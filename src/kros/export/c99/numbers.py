@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
-from ...lifting.c_code import Precision, c_code
+from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval

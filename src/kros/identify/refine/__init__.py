@@ -8,10 +8,9 @@ True
 """
 
 from ...core.removed import refusing
-from .gauss_newton import GaussNewton
 from .model import Refinement
-from .options import RefineOptions
 from .population import refine_population
+from .search import GaussNewton, RefineOptions
 
 __all__ = ["GaussNewton", "RefineOptions", "Refinement", "refine_population"]
 __getattr__ = refusing(__name__)

@@ -14,13 +14,12 @@ import numpy.typing as npt
 from ..edmd import KoopmanMatrices
 from ..factors import Factor, combine
 from .model import Refinement, TrainingData
-from .options import RefineOptions
 from .problem import OneStep, RefinementProblem
+from .search import RefineOptions
 from .segments import read_segments, segment_owners
 from .sensitivity import normal_equations
 
 Array = npt.NDArray[np.float64]
-_AT_ONCE = 16_000_000  # numbers in memory
 
 
 def episode_normals(
@@ -52,14 +51,11 @@ def _free_runs(V: Array, problem: RefinementProblem) -> tuple[Array, Array]:
     units, n, p = V.shape
     count, width = problem.segments.valid.shape[2], n * p + 1
     runs, counts = np.empty((units, count, width, width)), np.empty(units)
-    step = max(1, _AT_ONCE // (count * width * (width + n)))
-    for rows in (np.arange(units)[start : start + step] for start in range(0, units, step)):
-        values = {name: np.repeat(given[rows], count) for name, given in problem.parameters.items()}
-        alone = problem.segments.units(rows).one_by_one()
-        each = np.repeat(V[rows], count, axis=0)
+    for row in range(units):
+        values = {name: np.repeat(given[[row]], count) for name, given in problem.parameters.items()}
+        alone, each = problem.segments.units(np.array([row])).one_by_one(), np.repeat(V[[row]], count, axis=0)
         normal = normal_equations(each, problem.T, problem.lifting, values, alone, problem.sigma, problem.stride)
-        runs[rows] = normal.matrix.reshape(len(rows), count, width, width)
-        counts[rows] = normal.counts.reshape(len(rows), count).sum(axis=1)
+        runs[row], counts[row] = normal.matrix, normal.counts.sum()
     return runs, counts
 
 

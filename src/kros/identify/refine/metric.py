@@ -7,7 +7,7 @@ as nominal:
     cost = N strength level^2 mean over frequency of [(1 + e)^power - 1] / power,      e = (||E||_F / level)^2
 
 which is quadratic below `level`; a power above one flattens the residual's peak, which is what a weight has to cover.
-`dE` leaves out how the range of G turns, which is of second order.
+`dE` neglects how the range of G turns, which is of second order.
 """
 
 from __future__ import annotations

@@ -16,8 +16,7 @@ from ...data.population import Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
-from ..factors import Factor
-from ..ranges import Ranges
+from ..factors import Factor, Ranges
 from .segments import Keys
 
 Array = npt.NDArray[np.float64]
@@ -57,10 +56,9 @@ class TrainingData:
         wrong = [name for name in self.lifting.parameters if np.shape(self.parameters.get(name, 0.0)) != units]
         if self.factor.R.shape != shape or wrong or self.pooled.shape != units or not self.pooled.any():
             raise DimensionError(
-                f"Refinement: {len(self.keys)} units with {self.lifting.n_lifted} lifted states and {m} inputs need "
-                f"factors of shape {shape}, found {self.factor.R.shape}, parameters of one value a unit (wrong: "
-                f"{wrong}) and a pooled unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass factors from "
-                "episode_factors."
+                f"Refinement: needs factors of shape {shape}, found {self.factor.R.shape}, one value of parameters a "
+                f"unit (wrong: {wrong}) and a pooled unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass "
+                "factors from episode_factors."
             )
 
 
@@ -78,25 +76,6 @@ class TradeOff:
 class Refinement:
     """What a refinement is known by beside the models of its units.
 
-    Parameters
-    ----------
-    pooled : KoopmanMatrices
-        A (n, n) and B (n, m) of the model fitted to all pooled units at once.
-    strength : float
-        Of the prior, as chosen on held-out training episodes.
-    trade_off : tuple of TradeOff
-        One row for every strength that was tried, strongest first, and a first one for the pooled model alone (strength
-        infinite).
-    sigma : ndarray, shape (n_states,)
-        Errors that count as one.
-    converged : ndarray of bool, shape (unit,)
-        Whether the last step gained less than `GaussNewton.least_gain`; the others ran out of iterations, and are no
-        less valid.
-    information : ndarray, shape (unit, P, P)
-        Gauss-Newton matrix of every unit's cost, prior included, for parameters V with ``[A B] = V T^T``.
-    whitening : ndarray, shape (p, p)
-        T.
-
     Examples
     --------
     >>> import kros
@@ -106,13 +85,13 @@ class Refinement:
     ((3, 3), True, (2,))
     """
 
-    pooled: KoopmanMatrices
-    strength: float
-    trade_off: tuple[TradeOff, ...]
-    sigma: Array
-    converged: npt.NDArray[np.bool_]
-    information: Array
-    whitening: Array
+    pooled: KoopmanMatrices  # A (n, n) and B (n, m) of the model fitted to all pooled units at once
+    strength: float  # of the prior, as chosen on held-out training episodes
+    trade_off: tuple[TradeOff, ...]  # of the pooled model alone (strength infinite), then by strength, strongest first
+    sigma: Array  # (n_states,), errors that count as one
+    converged: npt.NDArray[np.bool_]  # (unit,); the others ran out of iterations, and are no less valid
+    information: Array  # (unit, P, P), Gauss-Newton matrix of every unit's cost for V with ``[A B] = V T^T``
+    whitening: Array  # (p, p), T
 
     def divided_by(self, ranges: Ranges) -> Refinement:
         """Return the same for channels divided by ranges; `Ranges.inverse` is the way back."""

@@ -10,27 +10,24 @@ held-out training episodes: the strongest one whose error is as good as the best
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import IdentificationError
-from ...core.linalg import radius_text
+from ...core.linalg import qr_triangle, radius_text
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
-from ..edmd import KoopmanMatrices
-from ..factors import Factor
-from ..ranges import Ranges
-from .gauss_newton import Evaluate, GaussNewton, Solution
-from .metric import ResponsePrior
+from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
+from ..factors import Factor, Ranges
+from ..free_run import free_run
+from .metric import ResponsePrior, peak_residual_db
 from .model import Refinement, TradeOff, TrainingData
-from .options import RefineOptions
-from .pooled import matrices_of, normalised, refine_pooled, start_pooled
-from .problem import RefinementProblem
-from .segments import held_segments, read_segments
-from .validation_set import require_bounded, trade_off
+from .problem import OneStep, RefinementProblem, stability_barrier
+from .search import Evaluate, GaussNewton, RefineOptions, Solution
+from .segments import Segments, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -55,9 +52,8 @@ def refine_population(
         Training episodes of every unit; the last one of each validates the strength of the prior.
     lifting : Lifting
     parameters : mapping of str to ndarray, shape (unit,)
-        The lifting's parameters, in the order of `keys`.
     factor : Factor
-        Of ``[Psi | Theta_plus]`` for this lifting, the batch over units in the order of `keys` (see `lifted_factor`).
+        Of ``[Psi | Theta_plus]`` for this lifting, the batch over units in the order of `keys`.
     pooled : ndarray of bool, shape (unit,), optional
         Units that make the pooled model and choose the strength; all by default. The others get the same prior.
     options : RefineOptions, optional
@@ -65,8 +61,7 @@ def refine_population(
     Returns
     -------
     models : KoopmanMatrices
-        A (unit, n, n) and B (unit, n, m): stable linear models with a bounded re-lifted free run on every training
-        episode.
+        Stable linear models with a bounded re-lifted free run on every training episode.
     refinement : Refinement
 
     Raises
@@ -113,11 +108,11 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     log.info("prior of strength %g chosen, held-out score %.4g", rows[choice].strength, rows[choice].score)
     final = replace(problem, segments=segments).with_prior(rows[choice].strength)
     solution = _settle(final, path[choice])
-    models = matrices_of(solution.V, final)
+    models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
     return models, Refinement(
-        pooled=matrices_of(common, problem),
+        pooled=problem.matrices(common),
         strength=rows[choice].strength,
         trade_off=(trade_off(data, problem, common, np.inf), *rows),
         sigma=problem.sigma,
@@ -129,7 +124,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
 
 def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
     """Return the problem of all units with errors in units of those of the pooled model, and a prior around it."""
-    options, pooled = problem.options, matrices_of(common, problem)
+    options, pooled = problem.options, problem.matrices(common)
     prior = ResponsePrior(pooled.A, pooled.B, problem.T, options.prior_level, options.prior_power)
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
@@ -202,3 +197,167 @@ def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> No
                 f"Refinement: the model of unit {unit} has spectral radius {radius_text(value)}, not below "
                 f"{radius_text(1 - margin)}; use a stronger prior."
             )
+
+
+def start_pooled(
+    data: TrainingData, segments: Segments, options: RefineOptions
+) -> tuple[Array, RefinementProblem, Array]:
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
+    lifting, rows = data.lifting, data.rows
+    n, nl = lifting.n_states, lifting.n_lifted
+    R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
+    p = R.shape[-1] - nl
+    matrices = edmd(R, nl, options.alpha_factor * smallest_stabilising_alpha([(R[None], nl)], options.margin))
+    T = _whitening(R[:p, :p], int(data.factor.n_samples[rows].sum()))
+    V = np.linalg.solve(T, np.concatenate([matrices.A, matrices.B], axis=-1).T).T[None]
+    one_step = OneStep.of(data.factor, T, n, rows)
+    problem = RefinementProblem(lifting, data.parameters, segments, T, np.ones(n), one_step, options)
+    normal = problem.of_one_model(rows).run(V)
+    with np.errstate(invalid="ignore"):
+        error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
+    error = np.clip(np.where(np.isfinite(error), error, 1.0), options.least_error, 1.0)
+    return V, replace(problem, sigma=error**options.balance), error
+
+
+def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Callable[[Array], float]) -> Array:
+    """Fit one model to all units, horizons growing, from every start; shape (n_lifted, p)."""
+    options = problem.options
+    count = max(2, -(-options.pooled_segments // problem.segments.n_units))
+    few = replace(problem, segments=problem.segments.first(count))
+    briefly = replace(options.search, iterations=options.trial_iterations)
+    ends: list[tuple[float, float, Array]] = []
+    sigma = problem.sigma
+    for first, balance in options.starts:
+        inside = _stable_end(V, few, error**balance, first)
+        if inside is not None:
+            sigma = sigma if ends else normalised(few, inside).sigma
+            edged = replace(few, sigma=sigma, edged=True)
+            end = briefly.minimise(edged.evaluate, edged.admissible, inside)
+            ends.append((score(end.V[0]), float(end.cost[0]), end.V))
+            log.debug("pooled model from horizon %d, balance %g: score %.6g, cost %.6g", first, balance, *ends[-1][:2])
+    if not ends:
+        raise IdentificationError(
+            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
+            "or the model is unstable; omit lifting functions that grow, or set identify.refine = false."
+        )
+    edged = replace(problem, sigma=sigma, edged=True)
+    best = min(ends, key=lambda row: row[:2])[2]
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, best).V[0])
+
+
+def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
+    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
+    options = problem.options
+    stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
+    for stage in (*stages, problem):
+        solution = options.search.minimise(stage.evaluate, problem.finite, V)
+        if not np.isfinite(solution.cost).all():
+            return None
+        V = solution.V
+    return _stabilise(V, problem)
+
+
+def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
+    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
+    n, options = problem.lifting.n_states, problem.options
+    shortened = []
+    for share in np.linspace(1.0, 0.0, options.shortenings + 1):
+        shortened.append(V.copy())
+        shortened[-1][:, n:] *= share
+    for margin in (max(options.guard, options.margin), options.margin):
+        for trial in shortened:
+            if problem.admissible(trial, margin).all():
+                return trial
+    V = min(shortened, key=lambda trial: float(problem.matrices(trial).spectral_radius().max()))
+    for heavier in 10.0 ** np.arange(options.penalties):
+
+        def evaluate(trial: Array, weight: float = heavier) -> Array:
+            edge = stability_barrier(trial, problem.T, options.guard, problem.edge_weight)
+            return problem.evaluate(trial) + weight * edge
+
+        solution = options.search.minimise(evaluate, problem.finite, V)
+        if not np.isfinite(solution.cost).all():
+            return None
+        V = solution.V
+        if problem.admissible(V).all():
+            return V
+    return None
+
+
+def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
+    """Return the problem with errors in units of those of a pooled model V, and with a soft edge of stability."""
+    normal, least = problem.run(V), problem.options.least_error
+    size = np.sqrt(max(float(normal.cost.mean()) / problem.residuals, least**2))
+    return replace(problem, sigma=problem.sigma * size, edged=True)
+
+
+def _whitening(R11: Array, n_samples: int) -> Array:
+    """T with ``(R11 T)^T (R11 T) = n_samples I``; a direction that the data do not excite keeps its size."""
+    size = np.maximum(np.linalg.norm(R11, axis=0), np.finfo(float).tiny)
+    _, values, right = np.linalg.svd(R11 / size)
+    values = np.maximum(values, len(values) * np.finfo(float).eps * values[0])
+    return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])
+
+
+_TOGETHER = 32  # episodes, as many as the compiled loop runs side by side
+
+
+def free_run_errors(
+    models: KoopmanMatrices,
+    lifting: Lifting,
+    parameters: Mapping[str, Array],
+    population: Population,
+    keys: Sequence[EpisodeKey],
+) -> tuple[Array, Array, Array]:
+    """Return RMS errors of free runs, and the largest recorded and reached values, all (episode, n)."""
+    shape = len(keys), lifting.n_states
+    rms, top, reached = np.full(shape, np.inf), np.zeros(shape), np.full(shape, np.inf)
+    for start in range(0, len(keys), _TOGETHER):
+        episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
+        by_length: dict[int, list[int]] = {}
+        for row, episode in episodes.items():
+            by_length.setdefault(len(episode), []).append(row)
+        for rows in by_length.values():
+            values = {name: given[rows] for name, given in parameters.items()}
+            part = KoopmanMatrices(models.A[rows], models.B[rows])
+            rms[rows], top[rows], reached[rows] = _errors(part, lifting, values, [episodes[row] for row in rows])
+    return rms, top, reached
+
+
+def _errors(
+    models: KoopmanMatrices, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
+) -> tuple[Array, Array, Array]:
+    """Do the same for episodes of one length."""
+    n, h, recorded = lifting.n_states, lifting.history, np.stack(episodes)
+    x = recorded[..., :n]
+    run = free_run(models.A, models.B, lifting, parameters, x[:, : h + 1], recorded[..., n:])
+    with np.errstate(over="ignore", invalid="ignore"):
+        rms = np.sqrt(np.mean((run - x) ** 2, axis=1))
+        sizes = rms, np.abs(run).max(axis=1)
+    rms, reached = (np.where(np.isfinite(values), values, np.inf) for values in sizes)
+    return rms, np.abs(x).max(axis=1), reached
+
+
+def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:
+    """Refuse models whose free runs over a training episode leave the bound, in ranges of the states."""
+    rows = [row for row, episodes in enumerate(data.keys.values()) for _ in episodes]
+    keys = [key for episodes in data.keys.values() for key in episodes]
+    values = {name: given[rows] for name, given in data.parameters.items()}
+    each = KoopmanMatrices(models.A[rows], models.B[rows])
+    _, _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
+    for which, state in np.argwhere(~(reached <= bound)):
+        size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
+        remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
+        raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
+
+
+def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:
+    """Return accuracy on held-out training episodes, and uncertainty, of models (unit, n_lifted, p) or one for all."""
+    rows, count = data.rows, len(data.keys)
+    models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
+    last = [episodes[-1] for episodes in data.keys.values()]
+    values = {name: given[rows] for name, given in data.parameters.items()}
+    rms, top, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
+    percent = np.median(100 * rms / np.where(top > 0, top, 1.0), axis=0)  # a state may rest at zero in the last episode
+    score = np.mean((rms / problem.sigma) ** 2)
+    return TradeOff(strength, tuple(percent.tolist()), float(score), peak_residual_db(models.A, models.B))

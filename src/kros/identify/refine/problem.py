@@ -27,9 +27,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...lifting import Lifting
+from ..edmd import KoopmanMatrices
 from ..factors import Factor
 from .metric import ResponsePrior
-from .options import RefineOptions
+from .search import RefineOptions
 from .segments import Segments
 from .sensitivity import Normal, normal_equations
 
@@ -133,6 +134,11 @@ class RefinementProblem:
         finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
         radius = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], A, 0.0))).max(axis=-1)
         return np.asarray(finite & (radius < 1 - (self.options.margin if margin is None else margin)))
+
+    def matrices(self, V: Array) -> KoopmanMatrices:
+        """Return A and B of whitened parameters."""
+        W, n_lifted = V @ self.T.T, self.lifting.n_lifted
+        return KoopmanMatrices(W[..., :n_lifted], W[..., n_lifted:])
 
     def finite(self, V: Array) -> npt.NDArray[np.bool_]:
         """Return which models hold numbers only."""

@@ -79,7 +79,7 @@ def read_segments(
     valid = np.ones((length, len(keys), count), dtype=bool)
     for row, (unit, episodes) in enumerate(keys.items()):
         if not episodes:
-            raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out or give it one.")
+            raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
         rng = np.random.default_rng([seed, row])
         owners = segment_owners(keys, count)[row]
         for episode in dict.fromkeys(owners.tolist()):
@@ -96,10 +96,8 @@ def read_segments(
 def _read(population: Population, key: EpisodeKey, history: int) -> Array:
     samples = population.read(key)
     if len(samples) < history + 2:
-        raise DataError(
-            f"Refinement: {key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}; "
-            "leave the episode out or use shorter delays."
-        )
+        problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
+        raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
     return samples
 
 

@@ -46,7 +46,7 @@ class SignalBound:
     Parameters
     ----------
     states : tuple of str
-        The recorded ones.
+        Of the recordings.
     units : tuple of str
     cover : ndarray, shape (n,)
         Bound on the RMS error of every state for any signal inside the cover of all units; infinite where there is

@@ -1,6 +1,6 @@
 """The estimator: a linear regression of all states on a bank of fixed stable filters.
 
-measurements, lifting, inputs --channels--> signals --filters--> bank --ridge regression--> estimate --reduction--> observer
+measurements, inputs --channels--> signals --filters--> bank --ridge regression--> estimate --reduction--> observer
 
 Examples
 --------

@@ -4,8 +4,9 @@ For a channel v the bank holds
 
 .. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
-with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first sample everything is taken to equal it.
-As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`, :math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
+with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first
+sample everything is taken to equal it. As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`,
+:math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ class Bank:
 
     @classmethod
     def of(cls, channels: Channels, length: float, settings: EstimatorSettings) -> Bank:
-        """Return the bank for a median episode of so many samples."""
+        """Return the bank for a median episode of this length in samples."""
         lags = () if channels.recent else settings.lags(length)
         starts = () if channels.recent else (*settings.start, *lags)
         return cls(len(channels), channels.linear, channels.nonlinear, settings.blocks(length), lags, starts)
@@ -63,7 +64,7 @@ class Bank:
         return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[every] * len(self.starts), every[-1:]])
 
     def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
-        """Return the bank at some samples of an episode's signals, v (n_samples, channels); shape (len(at), len(self))."""
+        """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
         from scipy.signal import lfilter
 
         moving, past = v[:, :-1], v[:, : self.delayed]
@@ -79,7 +80,7 @@ class Bank:
         return np.hstack([*parts, np.ones((len(at), 1))])
 
     def sizes(self, rms: Array) -> Array:
-        """Return the sizes that entries are divided by, from their RMS: for the start that of its constant, so that rest is no small size."""
+        """Return the sizes of entries, their RMS; for the start that of its constant, since machines start at rest."""
         size, count = rms.copy(), len(self.starts) * self.channels
         size[-1 - count : -1] = np.repeat(rms[-1 - count : -1].reshape(-1, self.channels)[:, -1], self.channels)
         return np.maximum(size, 1e-9 * size.max())

@@ -39,7 +39,8 @@ class Identified:
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
     >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
-    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001, settings=few)
+    >>> lifting = Lifting(motors.states)
+    >>> found = identify_estimator("motor", lifting, (0,), motors.inputs, recordings, 0.001, settings=few)
     >>> sorted(found.facts["left_out_percent"])
     ['current', 'velocity']
     """
@@ -66,7 +67,7 @@ def identify_estimator(
     ----------
     name : str
     lifting : Lifting
-        Functions of measured states and of inputs become channels; functions of states that are not measured are left out.
+        Functions of measured states and of inputs become channels; those of other states are ignored.
     measured : sequence of int
     inputs : sequence of str
     recordings : Recordings
@@ -89,7 +90,8 @@ def identify_estimator(
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
     >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
     >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
-    >>> found = identify_estimator("motor", Lifting(motors.states), (0,), motors.inputs, recordings, 0.001, settings=few)
+    >>> lifting = Lifting(motors.states)
+    >>> found = identify_estimator("motor", lifting, (0,), motors.inputs, recordings, 0.001, settings=few)
     >>> found.observer.recorded
     ('position', 'velocity', 'current')
     """
@@ -146,7 +148,7 @@ def best_family(
     settings: EstimatorSettings,
     hidden: Sequence[int],
 ) -> tuple[Readout, str]:
-    """Return the readout of the first family of channels after which the next is not better by the margin on left-out units."""
+    """Return the readout of the first family after which the next is not better by the margin on left-out units."""
     ranges = ranges_of(lifting, measured, inputs, recordings)
     best: Readout | None = None
     chosen = FAMILIES[0]
@@ -193,7 +195,7 @@ def ranges_of(
 
 
 def first_estimate(channels: Channels, recordings: Recordings) -> tuple[Array, Array]:
-    """Return the maps from the first sample's channels, (n, channels), and from those of inputs alone, to the first state."""
+    """Return the maps (n, channels) to the first state from all channels of the first sample, and from inputs alone."""
     blind = channels.without_measurements()
     v, w, x = [], [], []
     for key in recordings.keys:
@@ -211,7 +213,7 @@ def first_estimate(channels: Channels, recordings: Recordings) -> tuple[Array, A
 
 
 def _ridge(X: Array, T: Array, units: npt.NDArray[Any]) -> Array:
-    """Return ridge coefficients with the penalty that is best on units that are left out; the last column, a constant, has none."""
+    """Return ridge coefficients, the penalty best on left-out units; the last column, a constant, has no penalty."""
     size = np.sqrt(np.mean(X**2, axis=0))
     X = X / np.where(size > 0, size, 1.0)
 
@@ -289,7 +291,7 @@ def assembled(
 
 
 def settle_samples(filters: Filters, fallback: Filters, bank: FilterBank | None) -> int:
-    """Return the samples after which what a disturbance left is below one percent: five of the slowest time constants."""
+    """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
     poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in (filters, fallback)]
     slowest = max([*poles, *(bank.recovery if bank is not None else ())])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

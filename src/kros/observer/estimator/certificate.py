@@ -1,12 +1,14 @@
-r"""What is certain about a filter bank as it runs: nothing that it estimates is fed back.
+r"""What is certain about a filter bank at run time: nothing that it estimates is fed back.
 
-While measurements arrive, the error of its estimate is the residual of its regression on what was recorded, plus what the filters make of noise,
+While measurements arrive, the error of its estimate is the residual of its regression on what was recorded, plus what
+the filters make of noise,
 
 .. math:: e_{k+1} = \omega_k - \sum_i F_i\, n_{k-i}, \qquad
           \|e\|_2 \le \gamma\, (\|\omega\|_2^2 + \|n\|_2^2)^{1/2},
 
-with :math:`\gamma` the H-infinity norm of [1, F], signals divided by their sizes. It holds for every machine and has no assumption on slopes for noise
-that lifted functions do not feel. The bound for recorded signals is the largest error on a unit that was left out of the regression.
+with :math:`\gamma` the H-infinity norm of [1, F], signals divided by their sizes. It holds for every machine and has
+no assumption on slopes for noise that lifted functions do not feel. The bound for recorded signals is the largest
+error on a unit that was left out of the regression.
 """
 
 from __future__ import annotations
@@ -62,7 +64,9 @@ def linear_estimate(
     assert observer.bank is not None
     own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
     if delay_of(observer.sensor):
-        raise SynthesisError("not certified for the set of plants: measurements arrive late, which the set leaves out.")
+        raise SynthesisError(
+            "not certified for the set of plants: measurements arrive late, and the set has none that do."
+        )
     size, first = n + observer.bank.filters, q + modelled.n_states
     weights = np.hstack([observer.A, observer.B])[:size]
     signals = _signals(modelled, observer.inputs)
@@ -89,7 +93,7 @@ def linear_estimate(
 
 
 def _signals(lifting: Lifting, inputs: Sequence[str]) -> list[str]:
-    """Return what stands behind the states in [theta(x); u; gamma(u, x)]."""
+    """Return the columns after the states of [theta(x); u; gamma(u, x)]."""
     functions, of_inputs = ([f.text for f in formulas] for formulas in (lifting.formulas, lifting.input_formulas))
     return [*functions, *inputs, *of_inputs]
 
@@ -100,13 +104,13 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    rows, weight = design.sample
+    rows, weight = design.sample()
     added = rows[:, outside] @ readout.coefficients[outside]
     return np.asarray(100 * np.sqrt(weight @ added**2) / design.recordings.size)
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:
-    """Return the certificate of a filter bank as it runs."""
+    """Return the certificate of a filter bank at run time."""
     n = len(observer.recorded)
     noise = noise_response(observer)
     error = scales.error[:n, None]
@@ -127,7 +131,7 @@ def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCe
 def left_out_bound(
     observer: ObserverData, sizes: Array, units: Sequence[str], errors: Array, worst_percent: Mapping[str, float]
 ) -> SignalBound:
-    """Return the bound on every state's RMS error: the largest on a unit that was left out, and beside it the errors (units, n) of training."""
+    """Return the bound on RMS errors, the largest of left-out units, beside the errors (units, n) of training."""
     worst = np.array([worst_percent[name] for name in observer.recorded]) * sizes / 100
     bound = np.maximum(worst, errors.max(axis=0))
     each = np.repeat(bound[None], len(units), axis=0)

@@ -20,7 +20,7 @@ FAMILIES = ("delays", "linear", "products", "products and random features")  # t
 
 @dataclass(frozen=True, eq=False)
 class Channels:
-    """Signals that filters see: ``v = [y; sigma(y); u; gamma(u, y); 1]``, those of the lifting's columns that `columns` selects."""
+    """Signals that filters see: ``v = [y; sigma(y); u; gamma(u, y); 1]``, columns of the lifting."""
 
     lifting: Lifting
     measured: tuple[int, ...]
@@ -62,7 +62,7 @@ def channels_of(
     ranges: Ranges,
     settings: EstimatorSettings,
 ) -> Channels:
-    """Return the channels of a family; functions of the lifting that read states which are not measured are left out."""
+    """Return the channels of a family, without functions that read states which are not measured."""
     states = {lifting.states[i] for i in measured}
     known = states | set(lifting.parameters)
     functions = [f.text for f in lifting.formulas if f.used <= known]
@@ -82,7 +82,7 @@ def channels_of(
 
 
 def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:
-    """Return the cosine that belongs to a sine of a calibrated angle and the other way round: a bank sees the angle itself."""
+    """Return the cosine that belongs to a sine of a calibrated angle, or the sine of a cosine."""
     outer = text.strip().partition("(")[0]
     if outer in _QUADRATURE and used & set(lifting.parameters) and text.strip().endswith(")"):
         return _QUADRATURE[outer] + text.strip()[len(outer) :]

@@ -21,7 +21,7 @@ _NEVER = 1e12  # samples: an age that no gap has
 def training(
     recordings: Recordings, settings: EstimatorSettings, count: int
 ) -> tuple[Array, Array, Array, dict[str, Array]]:
-    """Return states, measurements and inputs of some episodes side by side, cut to one length, with their parameters."""
+    """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
     some = recordings.some(count)
     length = min(min(some.lengths), settings.gap_samples)
     batches = [recordings.read(key) for key in some.keys]
@@ -34,7 +34,7 @@ def training(
 
 
 def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> Array:
-    """Return the factor rho of every recorded state by which its distance from the estimate of inputs alone persists from sample to sample."""
+    """Return the factor rho of every recorded state by which its distance from the estimate of inputs alone decays."""
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
     n, at = len(observer.recorded), list(observer.measured)
     estimates = run_observer(observer, shown[..., at], inputs, observer.own(parameters))
@@ -51,7 +51,7 @@ def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSe
 
 
 def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
-    """Return samples (n_samples, batch) that are missing: independently of one another, or in gaps of log-uniform lengths as those between them."""
+    """Return samples (n_samples, batch) that are missing: independently, or in gaps of log-uniform lengths."""
     missing = np.zeros((n_samples, batch), dtype=bool)
     for i in range(batch):
         if i % 2:
@@ -63,7 +63,7 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
 
 
 def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
-    """Return the filter bank with the forgetting, and the ages of gaps that make errors of hidden states under simulated losses least."""
+    """Return the filter bank with forgetting and ages of gaps that minimise errors under simulated losses."""
     bank = observer.bank
     assert bank is not None
     states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
@@ -89,7 +89,7 @@ def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSet
 def blended_errors(
     states: Array, filtered: Array, from_inputs: Array, missing: Flags, forget: Array, half: Array, recovery: Array
 ) -> Array:
-    """Return the mean logarithms of the mean squared errors of episodes (c, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    """Return mean log squared errors (c, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
     x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
     for k, lost in enumerate(missing[:-1]):

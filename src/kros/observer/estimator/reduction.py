@@ -1,8 +1,9 @@
 r"""Fewer states: balanced truncation of a bank with its readout, controllability taken from the recordings.
 
-With L the root of the observability Gramian and P the recordings' second moment of the bank, the principal directions of :math:`L P L^T` carry the
-squared singular values. The projection is orthogonal in the metric of the observability Gramian, in which A is a contraction, so that the result is
-stable whatever P is (B. C. Moore, IEEE Trans. Autom. Control 26 (1981) 17-32; L. Pernebo and L. M. Silverman, ibid. 27 (1982) 382-387).
+With L the root of the observability Gramian and P the recordings' second moment of the bank, the principal directions
+of :math:`L P L^T` carry the squared singular values. The projection is orthogonal in the metric of the observability
+Gramian, in which A is a contraction, so that the result is stable whatever P is (B. C. Moore, IEEE Trans. Autom.
+Control 26 (1981) 17-32; L. Pernebo and L. M. Silverman, ibid. 27 (1982) 382-387).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _EPISODES = 8
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Filters with a readout: ``z+ = A z + B v``, estimate ``C z + D v``, started with ``z = S v`` at the first sample."""
+    """Filters with a readout: ``z+ = A z + B v``, estimate ``C z + D v``, ``z = S v`` at the first sample."""
 
     A: Array  # (r, r)
     B: Array  # (r, channels)
@@ -48,7 +49,7 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     fine = replace(design, bank=design.bank.fine)
     A, B, S = fine.bank.system()
     weights = design.bank.refined(readout.coefficients).T
-    X, w = fine.sample
+    X, w = fine.sample()
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]

@@ -1,9 +1,10 @@
 r"""Ridge regression of all states on the bank, its penalty chosen on units and episodes that are left out.
 
-Rows :math:`\xi_k` of the bank, divided by their sizes, have principal directions and singular values :math:`\sigma_i`. In whitened directions the
-penalty of the bank's own coefficients is :math:`\lambda / \sigma_i^2`. Rows with target zero say how far an entry may be wrong. Moments of units,
-conditions and parts of the episodes are summed once; leaving some out is a difference of moments. Units often follow the same references: errors are
-those of coefficients that know neither the unit nor its episodes.
+Rows :math:`\xi_k` of the bank, divided by their sizes, have principal directions and singular values
+:math:`\sigma_i`. In whitened directions the penalty of the bank's own coefficients is :math:`\lambda / \sigma_i^2`.
+Rows with target zero say how far an entry may be wrong. Moments of units, conditions and parts of the episodes are
+summed once; leaving some out is a difference of moments. Units often follow the same references: errors are those of
+coefficients that know neither the unit nor its episodes.
 """
 
 from __future__ import annotations
@@ -53,6 +54,8 @@ class Recordings:
         Sizes of the recorded states.
     ranges : tuple of ndarray, shape (n,)
         Their least and largest values.
+    bias : ndarray, optional
+        Offsets of the measured states that their sensors may have at run time, of either sign, shape (q,).
 
     Examples
     --------
@@ -70,16 +73,17 @@ class Recordings:
     read: Read
     size: Array
     ranges: tuple[Array, Array]
+    bias: Array | None = None
 
     @classmethod
-    def of(cls, keys: Sequence[EpisodeKey], read: Read) -> Recordings:
+    def of(cls, keys: Sequence[EpisodeKey], read: Read, bias: Array | None = None) -> Recordings:
         """Return the episodes with their lengths and the sizes of their states."""
         batches = [read(key) for key in keys]
         low = np.min([b.states[: b.lengths[0]].min(axis=(0, 1)) for b in batches], axis=0)
         high = np.max([b.states[: b.lengths[0]].max(axis=(0, 1)) for b in batches], axis=0)
         size = np.maximum(np.abs(low), np.abs(high))
         size[size == 0] = 1.0
-        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size, (low, high))
+        return cls(tuple(keys), tuple(int(b.lengths[0]) for b in batches), read, size, (low, high), bias)
 
     @property
     def length(self) -> float:
@@ -134,13 +138,18 @@ class Design:
     recordings: Recordings
     settings: EstimatorSettings
 
-    def rows(self, recordings: Recordings, rows: int) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
-        """Yield episode, bank rows, targets and weights of every episode; targets are states at the next sample, of measured ones their change."""
+    def rows(
+        self, recordings: Recordings, rows: int, offset: Array | float = 0.0
+    ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
+        """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
+
+        Targets are states at the next sample, of measured ones their change.
+        """
         thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
         for number, (key, length) in enumerate(zip(recordings.keys, recordings.lengths, strict=True)):
             batch = recordings.read(key)
-            y = interpolated(batch.measurements(measured)[:length, 0])
+            y = interpolated(batch.measurements(measured)[:length, 0]) + offset
             v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
             at, weights = thinning.at(length, number)
             targets = batch.states[at + 1, 0] / recordings.size
@@ -149,7 +158,7 @@ class Design:
             yield key, self.bank.rows(v, at), targets, weights
 
     def signals(self, some: int, length: int) -> Array:
-        """Return the channels of some episodes side by side, cut to a length and to the shortest, shape (n_samples, batch, channels)."""
+        """Return the channels of some episodes, cut to one length, shape (n_samples, batch, channels)."""
         found = []
         for key in self.recordings.some(some).keys:
             batch = self.recordings.read(key)
@@ -165,10 +174,9 @@ class Design:
         found = self.recordings.groups(self.settings.folds, self.settings.parts)
         return dict(zip(self.recordings.keys, found, strict=True))
 
-    @cached_property
-    def sample(self) -> tuple[Array, Array]:
-        """Thinned rows of the bank, and weights that sum to one."""
-        parts = list(self.rows(self.recordings.some(150), self.settings.sample))
+    def sample(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
+        """Return thinned rows of the bank, and weights that sum to one."""
+        parts = list(self.rows(self.recordings.some(150), self.settings.sample, offset))
         weights = np.concatenate([w for *_, w in parts])
         return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()
 
@@ -197,9 +205,12 @@ class Whitening:
     @classmethod
     def of(cls, design: Design) -> Whitening:
         """Find the directions from thinned rows."""
-        X, weights = design.sample
+        X, weights = design.sample()
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
-        trust = np.diag(design.bank.trust(design.settings))
+        trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
+        if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
+            moved = (design.sample(bias)[0] - X) / size * np.sqrt(weights)[:, None]
+            trust = np.vstack([trust, qr_triangle(moved)])
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
@@ -256,7 +267,7 @@ class Moments:
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
 
     def known(self, group: Group) -> npt.NDArray[np.bool_]:
-        """Return which groups know neither the units nor the episodes of one; where that leaves none in its condition, not the units, or not the episodes."""
+        """Return the groups without units and episodes of one; if none is left in its condition, without either."""
         alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
         for known in (folds & parts, folds, parts):
@@ -276,7 +287,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Readout:
-    """Coefficients of all states on a bank, in the channels' units, with errors of coefficients that know neither unit nor episodes."""
+    """Coefficients of all states on a bank, in the channels' units, with errors on units and episodes left out."""
 
     design: Design
     coefficients: Array  # (p, n)
@@ -288,7 +299,7 @@ class Readout:
 
     @classmethod
     def of(cls, design: Design) -> Readout:
-        """Fit all states: conditions count inversely to their errors, and the penalty of a state is best on what is left out."""
+        """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
         weights, penalties = condition_weights(moments, whitening), design.settings.penalties

@@ -61,30 +61,30 @@ class EstimatorSettings(Settings):
     measured_loss: float = Field(
         10.0,
         ge=1,
-        description="how many times less an error of a measured state counts in the reduction than one of a hidden state",
+        description="ratio of the weights of hidden and measured states in the reduction",
     )
     half: float = Field(
         1.0,
         gt=0,
-        description="age of a gap in which what stands for a measurement comes half as near to the fallback, in longest delays",
+        description="age of a gap at which the reach of a measurement is halved, in longest delays",
     )
     halves: tuple[float, ...] = Field(
-        (0.3, 1.0, 3.0, 10.0, 100.0),
-        description="ages of a gap at which the fallback counts one half for a hidden state, in longest delays; training chooses",
+        (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
+        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses",
     )
     recoveries: tuple[float, ...] = Field(
         (0.3, 3.0, 30.0),
-        description="time constants in which the age of a gap falls when measurements return, in longest delays; training chooses",
+        description="time constants of the age when measurements return, in longest delays; training chooses",
     )
     room: float = Field(
         0.25,
         ge=0,
-        description="share of its range in training by which the estimate of a hidden state may leave it; it is cut off there",
+        description="share of its range in training by which a hidden state may leave it; it is cut off there",
     )
     reach: float = Field(
         0.25,
         ge=0,
-        description="share of a measurement's range by which its estimate may differ from the fallback where it is missing",
+        description="share of its range by which a missing measurement may differ from the fallback",
     )
     gap_samples: int = Field(
         20_000, ge=100, description="samples of an episode on which losses are simulated in training"
@@ -93,7 +93,7 @@ class EstimatorSettings(Settings):
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 
     def lags(self, length: float) -> tuple[float, ...]:
-        """Return the time constants of the lags in samples, for a median episode of so many samples."""
+        """Return the time constants of the lags in samples, for a median episode of this length in samples."""
         last = self.last_lag * length
         count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - 1e-9)))
         return tuple(last / self.lag_ratio**i for i in range(count, -1, -1))

@@ -45,20 +45,6 @@ class HarmonicDrivePopulation(BatchSettings):
 
     Episode `e` follows the same reference everywhere; the outlier has loose fasteners.
 
-    Parameters
-    ----------
-    n_units : int
-        Units of the population, the outlier not counted.
-    loop : Loop or str
-        Stiff or soft velocity loop.
-    conditions : tuple of str
-        Among "noload" and "load".
-
-    Raises
-    ------
-    ConfigError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> simulated = HarmonicDrivePopulation(n_units=2, n_episodes=2, seconds=4.0, conditions=("noload",)).simulate()
@@ -67,8 +53,8 @@ class HarmonicDrivePopulation(BatchSettings):
     """
 
     n_units: int = 12
-    loop: Loop | str = Loop.STIFF
-    conditions: tuple[str, ...] = CONDITIONS
+    loop: Loop | str = Loop.STIFF  # stiff or soft velocity loop
+    conditions: tuple[str, ...] = CONDITIONS  # among "noload" and "load"
 
     plant: ClassVar[str] = "harmonic-drive"
     least_seconds: ClassVar[float] = 2.0
@@ -77,19 +63,14 @@ class HarmonicDrivePopulation(BatchSettings):
         super().__post_init__()
         object.__setattr__(self, "loop", member(Loop, self.loop, "Harmonic Drive population: the loop"))
         object.__setattr__(self, "conditions", tuple(self.conditions))
-        wrong = len(set(self.conditions)) < len(self.conditions) or not set(self.conditions) <= set(CONDITIONS)
-        if wrong or not self.conditions:
+        if sorted(self.conditions) not in ([c] if isinstance(c, str) else sorted(c) for c in (*CONDITIONS, CONDITIONS)):
             wanted = f"should be one or both of {CONDITIONS}, each once"
             raise ConfigError(f"Harmonic Drive population: conditions {self.conditions} {wanted}.")
 
     def simulate(self) -> SimulatedPopulation[Truth]:
-        """Simulate all episodes of all units.
+        """Simulate all episodes of all units, as the reader of the raw layout yields them and, `raw`, as recorded.
 
-        Returns
-        -------
-        SimulatedPopulation
-            `population` as the reader of the raw layout yields it, offset calibrated and rest dropped; `raw` before
-            preparation, with a second at rest at the start and an offset of the measured position in each episode.
+        Raw episodes have a second at rest at the start and an offset of the measured position.
         """
         units, conditions = self._units(), sorted(self.conditions)
         severity = self.outlier_severity if self.outlier else None

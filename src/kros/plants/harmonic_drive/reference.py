@@ -38,14 +38,13 @@ def episode_reference(seed: int, episode: int, n_samples: int, n_rest: int, peri
 
 def profile(checkpoints: Array, starts: Array, n_samples: int, period_s: float) -> tuple[Array, Array]:
     """Move from checkpoint to checkpoint, leaving each at a sample; position and velocity, (n_samples,), rad, rad/s."""
-    padding = _RAMPS
     lengths = np.abs(np.diff(checkpoints)) / (MAX_SPEED * period_s)
     knots = np.stack([starts, starts + lengths], axis=1).ravel()
-    ramp = np.interp(np.arange(-padding, n_samples + 1), knots, np.repeat(checkpoints, 2)[1:-1])
+    ramp = np.interp(np.arange(-_RAMPS, n_samples + 1), knots, np.repeat(checkpoints, 2)[1:-1])
     for length in (ACCELERATION_SAMPLES, JERK_SAMPLES):
         ramp = _moving_average(ramp, length)
-    position = ramp[padding:]
-    velocity = np.diff(ramp[padding - 1 :])
+    position = ramp[_RAMPS:]
+    velocity = np.diff(ramp[_RAMPS - 1 :])
     velocity = 0.5 * (velocity[:-1] + velocity[1:]) / period_s
     return position[:-1].copy(), velocity
 
@@ -71,10 +70,7 @@ def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float)
         good = _fits(drawn, n_samples, period_s)
         if good.any():
             return drawn[np.argmax(good)]
-    raise ConfigError(
-        f"Drawing {n_moves} checkpoints for an episode of {seconds:g} s: none fit at {MAX_SPEED:.3g} rad/s; "
-        "ask for seconds >= 2."
-    )
+    raise ConfigError(f"Drawing {n_moves} checkpoints for {seconds:g} s: none fit; ask for seconds >= 2.")
 
 
 def _candidates(rng: np.random.Generator, n_moves: int, shortest: float) -> Array:

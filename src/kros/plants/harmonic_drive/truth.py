@@ -64,9 +64,7 @@ class Truth:
     def load_torque(self, key: EpisodeKey) -> Array:
         """Return the torque that the load takes from the flange in an episode, inertia and gravity, (n_samples,)."""
         if key not in self.load_rows:
-            raise DataError(
-                f"Asked for the load torque of {key}; only the {len(self.load_rows)} loaded episodes have one."
-            )
+            raise DataError(f"Load torque of {key}: only the {len(self.load_rows)} loaded episodes have one.")
         return self.load_signals[self.load_rows[key]]
 
     def as_dict(self) -> dict[str, Any]:
@@ -85,13 +83,11 @@ def disturbance_response(p: DriveParameters, gains: Gains, loaded: bool, speed: 
     omega = GEAR_RATIO * speed
     zeta = np.exp(1j * omega * SAMPLE_PERIOD_S)
     Phi, Gu, Gm = _substep(p, loaded, speed)
-    Phi_T, Gu_T = np.broadcast_to(np.eye(5), Phi.shape), np.zeros_like(Gu)
-    Gd_T = np.zeros(Gm.shape, complex)
+    Phi_T, Gu_T, Gd_T = np.broadcast_to(np.eye(5), Phi.shape), np.zeros_like(Gu), np.zeros(Gm.shape, complex)
     for j in range(SUBSTEPS):
         d = -p.torque_constant[:, None] * np.exp(1j * omega * (j + 0.5) * SUBSTEP_S)
-        Phi_T = Phi @ Phi_T
-        Gu_T = _apply(Phi, Gu_T) + Gu
-        Gd_T = _apply(Phi, Gd_T) + Gm * d
+        Phi_T, Gu_T = Phi @ Phi_T, np.einsum("nij,nj->ni", Phi, Gu_T) + Gu
+        Gd_T = np.einsum("nij,nj->ni", Phi, Gd_T) + Gm * d
     V = (1 - VELOCITY_POLE) / SAMPLE_PERIOD_S * (1 - 1 / zeta) / (1 - VELOCITY_POLE / zeta)
     C = -(gains.velocity + gains.integral * SAMPLE_PERIOD_S / (zeta - 1)) * (gains.position + V)
     system = zeta * np.eye(5) - Phi_T
@@ -104,15 +100,9 @@ def _substep(p: DriveParameters, loaded: bool, speed: float) -> tuple[Array, Arr
     """Map over a substep on [s, w, w_l, i, q], with the slope of friction at `speed`."""
     n = len(p)
     M = transition(p, np.full(n, float(loaded)))
-    Phi = np.zeros((n, 5, 5))
-    Phi[:, :, :4] = M[:, :, :4]
-    Phi[:, 4, 4] = 1.0
+    Phi = np.concatenate([M[:, :, :4], np.broadcast_to(np.eye(5)[:, 4:], (n, 5, 1))], axis=2)
     Gu, Gm = M[:, :, 4], M[:, :, 5]
     h = 1e-4
     slope = (p.dry_friction(np.full(n, speed + h)) - p.dry_friction(np.full(n, speed - h))) / (2 * h)
     Phi[:, :, 1] -= Gm * slope[:, None]
     return Phi, Gu, Gm
-
-
-def _apply(Phi: Array, vectors: Array) -> Array:
-    return np.einsum("nij,nj->ni", Phi, vectors)

@@ -21,7 +21,7 @@ from ...data.prepare import with_gaps
 from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
-from ...identify.calibrate import segments_of
+from ...identify.calibration import segments_of
 from ...observer import Observer
 from ...observer.screen import Bits, SampleStatus
 from ...observer.simulate import Course

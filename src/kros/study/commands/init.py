@@ -21,7 +21,7 @@ from ...data.readers.opening import LOOKS, detect_reader
 from ...data.recording import some
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
-from ...identify.calibrate import calibrate
+from ...identify.calibration import calibrate
 from ...identify.periodic import PeriodicTerm, periodic_term
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import StudyConfig, validate_config

@@ -26,7 +26,7 @@ from ...data.survey import RecordingFacts
 from ...design.task import is_robust
 from ...evaluate import next_unit_bound
 from ...evaluate.next_unit import fewest_units
-from ...identify.calibrate import calibration_keys, segments_of
+from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import Stage, StudyConfig

@@ -24,9 +24,8 @@ from ...data.population import EpisodeKey
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import AngleLoad, calibrate_load, calibrate_torque, known_load, load_from_current, load_observer
-from ...motor_drive.from_current import load_accuracy
-from ...motor_drive.signals import low_passed
+from ...motor_drive import AngleLoad, LoadSettings, TorqueScale, known_load, load_observer
+from ...motor_drive.signals import load_accuracy, low_passed
 from ...observer import Observer, run_observer
 from ..engine.context import Context
 
@@ -97,17 +96,9 @@ def load_metrics(context: Context) -> dict[str, Any]:
 def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, dict[str, Any]]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
     settings, (angle, current) = trial.settings, trial.places
-    calibration = calibrate_load(
-        lifting,
-        trial.measured,
-        trial.train,
-        trial.truth[0],
-        current,
-        settings.level_s,
-        settings.corner_hz,
-        settings.limit(trial.limits),
-    )
-    observer = load_observer(f"{kind}/{LOAD}", calibration, context.population.inputs)
+    read = LoadSettings(current, settings.level_s, settings.corner_hz, settings.limit(trial.limits))
+    inputs, known = context.population.inputs, trial.truth[0]
+    observer, left_out = load_observer(f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, known, read)
     observer = replace(observer, seen=seen_by(context.identified, observer.measured))
     observer.save(context.store.draft(LOAD, f"{kind}.json"))
     y = np.asarray(trial.test.states[..., list(trial.measured)])
@@ -115,7 +106,7 @@ def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) 
     leveled = settings.level(trial.dt, trial.limits)
     seen = estimate[..., observer.lifting.states.index("load")]
     load = leveled.run(seen, estimate[..., current], trial.test.states[..., angle]).load
-    return load, {"order": observer.internal, "episodes_left_out": len(calibration.left_out)}
+    return load, {"order": observer.internal, "episodes_left_out": len(left_out)}
 
 
 def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str, Any]]:
@@ -126,8 +117,8 @@ def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str
         estimate = run_observer(observer, y, batch.inputs, observer.own(batch.parameters))
         errors.append(batch.states[..., current] - estimate[..., current])
     loaded = [i for i, k in enumerate(trial.train.keys) if k.condition == trial.settings.condition]
-    scale = calibrate_torque(errors[0][:, loaded], trial.truth[0][:, loaded], trial.dt)
-    return load_from_current(errors[1], 0.0, scale), {}
+    scale = TorqueScale.calibrated(errors[0][:, loaded], trial.truth[0][:, loaded], trial.dt)
+    return scale.load(errors[1]), {}
 
 
 @dataclass(frozen=True, eq=False)

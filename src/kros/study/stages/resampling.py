@@ -17,8 +17,7 @@ import numpy.typing as npt
 from ...core.errors import DataError
 from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights
 from ...identify.bootstrap import bootstrap_refined
-from ...identify.factors import lifted_factor
-from ...identify.ranges import Ranges
+from ...identify.factors import Ranges, lifted_factor
 from ...identify.refine import Refinement, RefineOptions
 from ...identify.refine.episodes import episode_normals
 from ...identify.refine.model import TrainingData

@@ -1,4 +1,1 @@
-"""Mixed H2/H-infinity synthesis.
-
-Inequalities, the solvers that they are given to, and the Youla program as a yardstick.
-"""
+"""Mixed H2/H-infinity synthesis: matrix inequalities and their solver, local improvement, lower bounds."""

@@ -3,7 +3,7 @@ r"""Interior-point method for small dense matrix inequalities.
 It solves ``min c'x + x'Qx/2`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
 
 Conic solvers spend their time on one large sparse matrix for all cones. The problems of this package have few variables
-and small, dense matrices; there the Newton step of the logarithmic barrier
+and small, dense matrices. There the Newton step of the logarithmic barrier
 
 .. math:: f(x) - \mu \sum_k \log\det F_k(x) - \mu \sum_i \log (r^2 - x_i^2)
 
@@ -38,17 +38,16 @@ _SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below t
 
 
 class Ending(str, Enum):
-    """How it ended, and what to change.
+    """How it ended.
 
     SOLVED
         The value is within the tolerance of the optimum.
     INFEASIBLE
-        No point satisfies the inequalities (within the box); relax the level, or give the variables more room.
+        No point within the box satisfies the inequalities.
     TIME
-        The time limit was reached; what is returned satisfies the inequalities, if there is anything.
+        The time limit was reached; a point, if any, satisfies the inequalities.
     STALLED
-        Rounding stopped the progress; what is returned satisfies the inequalities, if there is anything. Scale the
-        problem.
+        Rounding stopped the progress; a point, if any, satisfies the inequalities.
     """
 
     SOLVED = "solved"
@@ -69,8 +68,8 @@ class Block:
         return self.constant + self.along(x)
 
     def along(self, x: Array) -> Array:
-        """``sum_i x_i M_i``; without BLAS, whose threads cost more than these sums where cores are shared."""
-        return np.einsum("n,nf->f", x, self.basis.reshape(len(x), -1)).reshape(self.basis.shape[1:])
+        """``sum_i x_i M_i``."""
+        return np.tensordot(x, self.basis, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,19 +105,17 @@ def minimise(
 
 def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     """Minimise t subject to ``F_k + t I >= 0``, ``t >= -1``, until t is negative enough."""
-    n = len(start)
-    lifted = [
-        Block(
-            b.constant, np.concatenate([b.basis, np.broadcast_to(np.eye(b.constant.shape[-1]), (1, *b.constant.shape))])
-        )
-        for b in programme.blocks
-    ]
-    goal = np.append(np.zeros(n), 1.0)
-    lifted.append(Block(np.ones((1, 1, 1)), goal[:, None, None, None]))
-    worst = max(float(-np.linalg.eigvalsh(b.at(start)).min()) for b in programme.blocks)
-    point = np.append(np.clip(start, -0.9 * programme.box, 0.9 * programme.box), 1.5 * max(worst, 0.0) + 1.0)
-    room = np.append(programme.box, 10 * point[n])
-    extended = _Programme(goal, np.zeros((n + 1, n + 1)), lifted, room, programme.end)
+    n, goal = len(start), np.append(np.zeros(len(start)), 1.0)
+    lifted = [Block(np.ones((1, 1, 1)), goal[:, None, None, None])]
+    for block in programme.blocks:
+        unit = np.broadcast_to(np.eye(block.constant.shape[-1]), (1, *block.constant.shape))
+        lifted.append(Block(block.constant, np.concatenate([block.basis, unit])))
+    worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
+    inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
+    point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
+    extended = _Programme(
+        goal, np.zeros((n + 1, n + 1)), lifted, np.append(programme.box, 10 * point[n]), programme.end
+    )
     outcome = _follow(extended, point, 1e-9, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
         return replace(outcome, x=outcome.x[:n])
@@ -131,7 +128,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
 
     With `stop_below`, end at a centred point whose value lies clearly below it.
     """
-    scaled, size = _Scaled.of(programme.blocks, len(x)), programme.size
+    size = programme.size
     mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
     for _ in range(_STEPS):
         if time.perf_counter() > programme.end:
@@ -139,13 +136,13 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
             break
         try:
             slope = programme.c + programme.Q @ x
-            gradient, hessian, roots = programme.derivatives(scaled, x)
+            gradient, hessian, roots = programme.derivatives(x)
             gradient, hessian = slope / mu + gradient, programme.Q / mu + hessian
             direction = -_solve(hessian, gradient)
         except np.linalg.LinAlgError:
             break
         eigenvalues = programme.spectrum(roots, x, direction)
-        decrement = float(np.sqrt(max(-gradient @ direction, 0.0)))
+        decrement = float(np.sqrt(max(-float(gradient @ direction), 0.0)))
         if not np.isfinite(decrement):
             break
         if eigenvalues.max(initial=0.0) <= 1:
@@ -153,7 +150,8 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         here, proven = programme.value(x), np.isfinite(stop_below) and lower > stop_below
         if proven or here - lower <= rtol * max(abs(here), 1e-12) or (here < stop_below - 1e-7 and decrement < 1):
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
-        step = _line_search(slope @ direction / mu, float(direction @ programme.Q @ direction) / mu, eigenvalues)
+        curvature = float(direction @ programme.Q @ direction)
+        step = _line_search(float(slope @ direction) / mu, curvature / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
         if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
             break
@@ -186,12 +184,22 @@ class _Programme:
         inside = bool((np.abs(x) < self.box).all())
         return inside and all(np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in self.blocks)
 
-    def derivatives(self, scaled: _Scaled, x: Array) -> tuple[Array, Array, list[Array]]:
-        """Gradient and Hessian of the barrier, and the inverse Cholesky factors of all blocks."""
-        roots = [np.linalg.inv(np.linalg.cholesky(block.at(x))) for block in self.blocks]
-        trace, products = scaled.along([root for block in roots for root in block])
+    def derivatives(self, x: Array) -> tuple[Array, Array, list[Array]]:
+        """Gradient ``-tr D_i`` and Hessian ``tr D_i D_j`` of the barrier, and the inverse Cholesky factors R.
+
+        ``D_i = R M_i R'`` for every matrix M_i of coefficients.
+        """
         above, below = 1 / (self.box - x), 1 / (self.box + x)
-        return above - below - trace, np.diag(above**2 + below**2) + products, roots
+        gradient, hessian, roots = above - below, np.diag(above**2 + below**2), []
+        for block in self.blocks:
+            root = np.linalg.inv(np.linalg.cholesky(block.at(x)))
+            D = root @ block.basis @ root.swapaxes(-1, -2)
+            gradient = gradient - np.trace(D, axis1=-2, axis2=-1).sum(axis=1)
+            row, column = np.tril_indices(D.shape[-1])  # of symmetric matrices; entries below the diagonal count twice
+            flat = (D[..., row, column] * np.where(row > column, np.sqrt(2.0), 1.0)).reshape(len(x), -1)
+            hessian = hessian + flat @ flat.T
+            roots.append(root)
+        return gradient, hessian, roots
 
     def spectrum(self, roots: Sequence[Array], x: Array, direction: Array) -> Array:
         """Eigenvalues of ``F^-1/2 dF F^-1/2`` of all blocks and of the box."""
@@ -202,45 +210,11 @@ class _Programme:
         return np.concatenate(parts)
 
 
-@dataclass(frozen=True, eq=False)
-class _Scaled:
-    """Coefficients of all matrices with the variables last, (d, d n) each, and memory for the results of a step."""
-
-    bases: list[Array]
-    left: list[Array]  # of their shapes: R M_i
-    lower: Array  # (entries, n): lower triangles of R M_i R', those of one matrix after the other
-
-    @classmethod
-    def of(cls, blocks: Sequence[Block], n: int) -> _Scaled:
-        """Of blocks with n variables."""
-        bases = [
-            np.ascontiguousarray(np.moveaxis(m, 0, 2)).reshape(len(m[0]), -1)
-            for b in blocks
-            for m in np.swapaxes(b.basis, 0, 1)
-        ]
-        return cls(
-            bases, [np.empty_like(m) for m in bases], np.empty((sum(len(m) * (len(m) + 1) // 2 for m in bases), n))
-        )
-
-    def along(self, roots: Sequence[Array]) -> tuple[Array, Array]:
-        """Return ``sum_k tr D_ki`` and ``sum_k tr D_ki D_kj`` of ``D_ki = R_k M_ki R_k'``, R triangular."""
-        end, trace = 0, np.zeros(self.lower.shape[1])
-        for root, basis, memory in zip(roots, self.bases, self.left, strict=True):
-            left = np.matmul(root, basis, out=memory).reshape(*root.shape, -1)
-            for row in range(len(root)):
-                start, end = end, end + row + 1
-                np.matmul(root[: row + 1, : row + 1], left[row, : row + 1], out=self.lower[start:end])
-                trace += self.lower[end - 1]
-                self.lower[end - 1] *= np.sqrt(0.5)  # counts once, all others twice
-        return trace, 2 * (self.lower.T @ self.lower)
-
-
 def _solve(hessian: Array, gradient: Array) -> Array:
     """Newton direction in units in which the Hessian has a unit diagonal, with one step of refinement."""
     scale = 1 / np.sqrt(np.diag(hessian))
     scaled = hessian * scale[:, None] * scale + 1e-14 * np.eye(len(hessian))
     right = gradient * scale
-    # LU: where cores are shared, the threads of a Cholesky factorisation of this size wait for each other.
     direction = np.linalg.solve(scaled, right)
     direction += np.linalg.solve(scaled, right - scaled @ direction)
     return direction * scale
@@ -254,10 +228,7 @@ def _line_search(slope: float, curvature: float, eigenvalues: Array) -> float:
     for _ in range(50):
         ratio = eigenvalues / (1 + t * eigenvalues)
         first, second = slope + curvature * t - ratio.sum(), curvature + ratio @ ratio
-        if first > 0:
-            high = t
-        else:
-            low = t
+        low, high = (low, t) if first > 0 else (t, high)
         step = t - first / second
         t_new = step if low < step < high else (low + min(high, 4 * low + 1)) / 2
         if abs(t_new - t) <= 1e-3 * t_new:

@@ -13,8 +13,7 @@ the rows are combined accordingly (a congruence):
     H2:    [[-W-W', W, B~1], [., G~, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~, 0], [., ., I]] > 0,   min tr Z
     Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
 
-A Lyapunov matrix for each channel (de Oliveira, Geromel, Bernussou 2002) has three times the variables and, after local
-improvement, ended at the same controllers. In balanced coordinates G~ has the diagonal (s, s); rows and columns are
+In balanced coordinates G~ has the diagonal (s, s); rows and columns are
 divided by its root.
 
 References
@@ -44,11 +43,8 @@ from .barrier import Block
 Array = npt.NDArray[Any]
 Values = dict[str, Array]
 
-# Least eigenvalue of the scaled Lyapunov matrices: the controller is recovered from I - Y X, which it keeps regular.
-_MARGIN = 1e-3
-_KNOWN = (
-    1e-3  # error, in a state's standard deviations, for which coordinates are chosen where a state is known exactly
-)
+_MARGIN = 1e-3  # least eigenvalue of the scaled Lyapunov matrices, which keeps I - Y X regular
+_KNOWN = 1e-3  # error, in a state's standard deviations, that stands for that of a state known exactly
 
 
 @dataclass(frozen=True, eq=False)

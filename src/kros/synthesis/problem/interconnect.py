@@ -27,22 +27,13 @@ def interconnect(
     """Return the system from `inputs` to `outputs`."""
     whole = block_diagonal(list(blocks.values()))
     sources = {name: block.n_outputs for name, block in blocks.items()}
-    unknown = (
-        {source for row in [*wires.values(), *outputs.values()] for source in row} - sources.keys() - inputs.keys()
-    )
-    if unknown:
-        raise DimensionError(
-            f"Interconnection: there is no block or input {', '.join(sorted(unknown))}; name one of them."
-        )
     heights = {name: block.n_inputs for name, block in blocks.items()}
     F, H = _matrix(wires, heights, sources), _matrix(wires, heights, inputs)
     tall = {name: next(iter(row.values())).shape[0] for name, row in outputs.items()}
     P, Q = _matrix(outputs, tall, sources), _matrix(outputs, tall, inputs)
     loop = np.eye(len(F)) - F @ whole.D
     if len(F) and np.linalg.cond(loop) > 1e14:
-        raise DimensionError(
-            "Interconnection: the blocks form an algebraic loop without a solution; put a delay into it."
-        )
+        raise DimensionError("Interconnection: an algebraic loop has no solution; put a delay into it.")
     v = np.linalg.solve(loop, np.hstack([F @ whole.C, H]))
     v_x, v_w = v[:, : whole.n_states], v[:, whole.n_states :]
     return StateSpace(

@@ -34,7 +34,7 @@ from ...core.norms import hinf_norm
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant, partitioned
+from ..generalized_plant import GeneralizedPlant, split
 from ..result import Injection
 from .interconnect import interconnect
 from .uncertainty_location import LOCATIONS, UncertaintyLocation
@@ -51,43 +51,6 @@ _WEIGHTS = ("W_L", "W_R", "W_u", "W_p", "remainder_left", "remainder_right")
 class ObserverProblem:
     """What an observer must be good at: a nominal model, an uncertain set around it, measurement noise.
 
-    Parameters
-    ----------
-    nominal : StateSpace
-        Nominal model; only `A` (n, n), `B` (n, m) and `dt` are used, the state being the full lifted state.
-    C : ndarray, shape (q, n)
-        Selects the measured outputs from the lifted state.
-    W_L : StateSpace
-        Left weight of ``E = W_L Delta W_R`` on scaled signals; stable. As many outputs as E has rows, any number of
-        inputs. Diagonal, scalar and full weights are all sound, since Delta has no structure.
-    W_R : StateSpace
-        Right weight; stable. As many inputs as E has columns, any number of outputs.
-    input_scale : ndarray, shape (m,)
-        Physical size of each input; scaled input = input / scale.
-    output_scale : ndarray, shape (n,)
-        Physical size of each (lifted) state.
-    noise : ndarray, shape (q,)
-        Standard deviation of the white measurement noise per sample, in the units of y; positive.
-    n_original : int, optional
-        The first `n_original` states are the original ones; the rest are lifted functions with no weight. Default all.
-    W_u : StateSpace, (m, m), optional
-        Weight of the scaled inputs; default identity: white scaled inputs of unit variance.
-    W_p : ndarray, shape (p, n), or StateSpace, optional
-        Performance weight on the error in physical units; default ``1 / output_scale`` on the original states.
-    correction_penalty : float
-        Small weight of the scaled correction; used where the problem is singular without it.
-    remainder_left : StateSpace, (n, n), optional
-        Left weight of the additive remainder on scaled states.
-    remainder_right : StateSpace, (m, m), optional
-        Right weight of the additive remainder on scaled inputs.
-    injection : Injection or its name
-        Where the correction enters.
-    process_noise : ndarray, shape (n,), optional
-        Standard deviation of white noise on every (lifted) state per sample, independent of everything else; default
-        none.
-    form : Form or str
-        Form of the uncertainty; default inverse input multiplicative, as in the paper.
-
     Raises
     ------
     DimensionError
@@ -103,22 +66,22 @@ class ObserverProblem:
     ('inverse_input_multiplicative', 'state')
     """
 
-    nominal: StateSpace
-    C: Array
-    W_L: StateSpace
-    W_R: StateSpace
-    input_scale: Array
-    output_scale: Array
-    noise: Array
-    n_original: int | None = None
-    W_u: StateSpace | None = None
-    W_p: Array | StateSpace | None = None
-    correction_penalty: float = 1e-3
-    remainder_left: StateSpace | None = None
-    remainder_right: StateSpace | None = None
-    injection: Injection = Injection.STATE
-    process_noise: Array | None = None
-    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE
+    nominal: StateSpace  # only A (n, n), B (n, m) and dt are used, the state being the full lifted state
+    C: Array  # (q, n), selects the measured outputs from the lifted state
+    W_L: StateSpace  # left weight of ``E = W_L Delta W_R`` on scaled signals, stable; as many outputs as E has rows
+    W_R: StateSpace  # right weight, stable; as many inputs as E has columns
+    input_scale: Array  # (m,), physical size of each input
+    output_scale: Array  # (n,), physical size of each (lifted) state
+    noise: Array  # (q,), standard deviation of the white measurement noise per sample, in the units of y
+    n_original: int | None = None  # the first states are the original ones, the rest have no weight; default all
+    W_u: StateSpace | None = None  # (m, m), of the scaled inputs; default white inputs of unit variance
+    W_p: Array | StateSpace | None = None  # (p, n), on the error; default ``1 / output_scale`` on the original states
+    correction_penalty: float = 1e-3  # of the scaled correction, where the problem is singular without it
+    remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
+    remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
+    injection: Injection = Injection.STATE  # where the correction enters
+    process_noise: Array | None = None  # (n,), standard deviation of white noise on every state per sample
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE  # of the uncertainty
 
     def __post_init__(self) -> None:
         put = partial(object.__setattr__, self)
@@ -126,20 +89,13 @@ class ObserverProblem:
         put("injection", member(Injection, self.injection, "Observer problem: the injection"))
         put("nominal", StateSpace.of(self.nominal))
         put("C", np.atleast_2d(np.asarray(self.C, dtype=float)))
-        n, m, q = self.nominal.n_states, self.nominal.n_inputs, self.C.shape[0]
-        self._require(
-            self.C.shape[1] == n,
-            f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}; select rows of the identity",
-        )
-        kept = n if self.n_original is None else self.n_original
-        self._require(1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
+        n, m, q, kept = self.nominal.n_states, self.nominal.n_inputs, len(self.C), self.n_original
+        self._require(self.C.shape[1] == n, f"C should be (q, {n}) for {n} lifted states, found {self.C.shape}")
+        self._require(kept is None or 1 <= kept <= n, f"n_original = {kept} should lie between 1 and {n}")
         for name, size in (("input_scale", m), ("output_scale", n), ("noise", q)):
             value = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
             valid = value.shape == (size,) and bool(np.all(np.isfinite(value) & (value > 0)))
-            self._require(
-                valid,
-                f"{name} should be {size} positive numbers, found {value}; noise of an encoder is its step / sqrt(12)",
-            )
+            self._require(valid, f"{name} should be {size} positive numbers, found {value}")
             put(name, value)
         level = np.zeros(n) if self.process_noise is None else np.asarray(self.process_noise, dtype=float)
         valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
@@ -147,38 +103,31 @@ class ObserverProblem:
         put("process_noise", level)
         W_p = np.diag(1 / self.output_scale)[:kept] if self.W_p is None else self.W_p
         put("W_p", gain(W_p, self.nominal.dt) if isinstance(W_p, np.ndarray | list) else W_p)
-        self._require(
-            self.correction_penalty > 0,
-            f"correction_penalty = {self.correction_penalty} should be positive; 1e-3 is the default",
-        )
-        self._require(
-            self.injection is not Injection.NONE, "injection should be Injection.INPUT or Injection.STATE, found NONE"
-        )
-        together = (self.remainder_left is None) == (self.remainder_right is None)
-        self._require(together, "remainder_left and remainder_right come together, found only one of them")
-        rows, columns = self.location.sizes(n, m)
-        left_right = {"remainder_left": (n, None), "remainder_right": (None, m)}
-        for name, size in (
-            {"W_L": (rows, None), "W_R": (None, columns), "W_u": (m, m), "W_p": (None, n)} | left_right
-        ).items():
-            if getattr(self, name) is not None:
-                put(name, StateSpace.of(getattr(self, name)))
-                self._check_weight(name, *size)
+        penalty, one = self.correction_penalty, (self.remainder_left is None) != (self.remainder_right is None)
+        self._require(penalty > 0, f"correction_penalty = {penalty} should be positive; 1e-3 is the default")
+        self._require(self.injection is not Injection.NONE, "injection should be INPUT or STATE, found NONE")
+        self._require(not one, "remainder_left and remainder_right come together, found only one of them")
+        self._check_weights()
 
     def _require(self, condition: bool, message: str) -> None:
         if not condition:
             raise DimensionError(f"Observer problem: {message}.")
 
-    def _check_weight(self, name: str, rows: int | None, columns: int | None) -> None:
-        weight, dt = getattr(self, name), self.nominal.dt
-        size = weight.n_outputs, weight.n_inputs
-        fits = size == (rows or size[0], columns or size[1]) and not weight.batch_shape
-        wanted = f"{name} should be {rows or 'any'} x {columns or 'any'} for {as_form(self.form).value} uncertainty"
-        self._require(fits, f"{wanted}, found {size[0]} x {size[1]}{weight.batch_shape or ''}")
-        self._require(
-            weight.dt == dt,
-            f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s; fit it at the model's period",
-        )
+    def _check_weights(self) -> None:
+        """Refuse weights whose sizes or sampling periods do not fit; None is any size."""
+        n, m, dt = self.nominal.n_states, self.nominal.n_inputs, self.nominal.dt
+        rows, columns = self.location.sizes(n, m)
+        sizes = (rows, None), (None, columns), (m, m), (None, n), (n, None), (None, m)
+        for name, (height, width) in zip(_WEIGHTS, sizes, strict=True):
+            if getattr(self, name) is not None:
+                weight = StateSpace.of(getattr(self, name))
+                object.__setattr__(self, name, weight)
+                size = weight.n_outputs, weight.n_inputs
+                fits = size == (height or size[0], width or size[1]) and not weight.batch_shape
+                wanted = f"{name} should be {height or 'any'} x {width or 'any'} for {as_form(self.form).value}"
+                shape = f"{size[0]} x {size[1]}{weight.batch_shape or ''}"
+                self._require(fits, f"{wanted} uncertainty, found {shape}")
+                self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
 
     @classmethod
     def from_uncertain(
@@ -211,11 +160,9 @@ class ObserverProblem:
         """
         unit, remainder = uncertain.nominal_id, uncertain.remainder
         if unit not in models.unit_ids:
-            raise SynthesisError(
-                f"Observer problem: the nominal {unit!r} is none of the models' units; quantify with one of them as "
-                "nominal."
-            )
-        problem = cls(
+            problem = f"the nominal {unit!r} is none of the models' units"
+            raise SynthesisError(f"Observer problem: {problem}; quantify with one of them as nominal.")
+        case = cls(
             nominal=models.systems([unit])[0],
             C=np.eye(models.lifting.n_lifted)[list(models.measured)],
             W_L=uncertain.weight.left,
@@ -231,15 +178,11 @@ class ObserverProblem:
             form=uncertain.form,
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
-        expected, found = (
-            system.frequency_response(freqs) for system in (uncertain.scaled_nominal(), problem.scaled_model)
-        )
-        if found.shape != expected.shape or np.abs(found - expected).max() > 1e-6 * np.abs(expected).max():
-            raise SynthesisError(
-                f"Observer problem: the model of {unit!r} is not the nominal that the uncertain set surrounds; "
-                "quantify these very models."
-            )
-        return problem
+        expected, own = (s.frequency_response(freqs) for s in (uncertain.scaled_nominal(), case.scaled_model))
+        if own.shape != expected.shape or np.abs(own - expected).max() > 1e-6 * np.abs(expected).max():
+            problem = f"the model of {unit!r} is not the nominal that the uncertain set surrounds"
+            raise SynthesisError(f"Observer problem: {problem}; quantify these very models.")
+        return case
 
     @property
     def location(self) -> UncertaintyLocation:
@@ -310,25 +253,19 @@ class ObserverProblem:
     @cached_property
     def _soundness(self) -> float:
         if self.nominal.dt == 0:
-            raise SynthesisError(
-                "Observer synthesis works in discrete time, found a continuous nominal model (dt = 0); sample it."
-            )
+            raise SynthesisError("Observer synthesis works in discrete time, found a continuous model; sample it.")
         require_detectable(self.nominal.A, self.C, self.nominal.dt, "Observer synthesis")
         for name in ("nominal", *_WEIGHTS):
             system = getattr(self, name)
             if isinstance(system, StateSpace) and not system.is_stable():
-                raise SynthesisError(
-                    f"Observer synthesis: {name} has spectral radius {float(system.spectral_radius()):.9g}; it must "
-                    "be below 1, "
-                    "use a stable model (identification guarantees it) and stable weights."
-                )
+                radius = f"{name} has spectral radius {float(system.spectral_radius()):.9g}"
+                raise SynthesisError(f"Observer synthesis: {radius}; it must be below 1, use a stable model.")
         size = 0.0 if self.N is None else hinf_norm(self.N)
         if size >= 1:
             raise SynthesisError(
                 f"Observer synthesis: ||{self.location.N_name}|| = {size:.6g} should be below 1 for "
-                f"{as_form(self.form).value.replace('_', ' ')} "
-                "uncertainty, otherwise the set contains ill-posed plants; choose another form or nominal, or leave "
-                "outliers out."
+                f"{as_form(self.form).value.replace('_', ' ')} uncertainty, otherwise the set contains ill-posed "
+                "plants; choose another form or nominal, or leave outliers out."
             )
         return size
 
@@ -352,7 +289,7 @@ class ObserverProblem:
         system = interconnect(
             {"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs
         )
-        return partitioned(system, w, {"z": self.performance.n_outputs})
+        return split(system, sum(w.values()), self.performance.n_outputs)
 
     def error_system(self, controller: StateSpace) -> StateSpace:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
@@ -371,18 +308,12 @@ class ObserverProblem:
         """
         A, B, C, _ = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
-        filters = (
-            gain(np.diag(1 / self.output_scale), dt)
-            @ estimate
-            @ gain(np.diag([*self.noise, *self.output_scale, *self.input_scale]), dt)
-        )
+        sizes = np.diag([*self.noise, *self.output_scale, *self.input_scale])
+        filters = gain(np.diag(1 / self.output_scale), dt) @ estimate @ gain(sizes, dt)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
-        blocks = {
-            "plant": StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt),
-            "F": filters,
-            "W_p": self.performance,
-        }
+        plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
+        blocks = {"plant": plant, "F": filters, "W_p": self.performance}
         wires = {
             "plant": {"d": B, "s": B, "v": np.diag(self.scaled_process_noise)},
             "F": {"plant": truth, "r": truth} | columns,
@@ -392,17 +323,16 @@ class ObserverProblem:
         return interconnect(blocks, wires, inputs, {"z": {"W_p": eye(self.performance.n_outputs)}})
 
     @property
-    def _scales(self) -> tuple[StateSpace, StateSpace]:
-        """Sizes of the correction and of the measurements, as gains."""
-        correction = self.input_scale if self.injection is Injection.INPUT else self.output_scale
-        return gain(np.diag(correction), self.nominal.dt), gain(np.diag(self.noise), self.nominal.dt)
+    def _scales(self) -> tuple[Array, Array]:
+        """Sizes of the correction and of the measurements."""
+        return self.input_scale if self.injection is Injection.INPUT else self.output_scale, self.noise
 
     def to_scaled(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in physical units into one in scaled coordinates."""
-        correction, noise = self._scales
-        return gain(np.linalg.inv(correction.D), noise.dt) @ controller @ noise
+        (correction, noise), dt = self._scales, self.nominal.dt
+        return gain(np.diag(1 / correction), dt) @ controller @ gain(np.diag(noise), dt)
 
     def to_physical(self, controller: StateSpace) -> StateSpace:
         """Turn a controller in scaled coordinates into one in physical units."""
-        correction, noise = self._scales
-        return correction @ controller @ gain(np.linalg.inv(noise.D), noise.dt)
+        (correction, noise), dt = self._scales, self.nominal.dt
+        return gain(np.diag(correction), dt) @ controller @ gain(np.diag(1 / noise), dt)

@@ -31,16 +31,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
-from ..generalized_plant import GeneralizedPlant, partitioned, split
+from ..generalized_plant import GeneralizedPlant, split
 from .interconnect import interconnect
 from .observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
 
-_LEAST_NOISE, _LEAST_PENALTY = (
-    1e-3,
-    3e-2,
-)  # in matrix inequalities: share of the measured channel's range, weight of the scaled correction
+# In matrix inequalities: share of the measured channel's range, weight of the scaled correction.
+_LEAST_NOISE, _LEAST_PENALTY = 1e-3, 3e-2
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
@@ -53,13 +51,8 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
     whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), problem.nominal.dt)
-    blocks = {
-        "error": whole,
-        "W_p": problem.performance,
-        "W_u": problem.input_weight,
-        "W_L": problem.W_L,
-        "W_R": problem.W_R,
-    }
+    blocks = {"error": whole, "W_p": problem.performance, "W_u": problem.input_weight}
+    blocks |= {"W_L": problem.W_L, "W_R": problem.W_R}
     inputs = {"w1": m, "w2": problem.W_L.n_inputs}
     error = {"error": eye(n)} | ({} if location.at_input else {"W_L": eye(n)})
     drive = {"u": -J} | ({"W_L": B} if location.at_input else {})
@@ -84,8 +77,8 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     wires |= {"error": drive, "W_p": error}
     measured = {name: C @ matrix for name, matrix in error.items()} | {"n": eye(q)}
     system = interconnect(blocks, wires, inputs | {"u": J.shape[1]}, outputs | {"y": measured})
-    parts_z = {name: next(iter(row.values())).shape[0] for name, row in outputs.items()}
-    return partitioned(system, inputs, parts_z)
+    sizes = [next(iter(row.values())).shape[0] for row in outputs.values()]
+    return split(system, sum(inputs.values()), sum(sizes), n_w1=m, n_z1=sizes[0])
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
@@ -106,28 +99,29 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     whole = generalized_plant(replace(problem, remainder_left=None, remainder_right=None, process_noise=None))
     whole = penalise(whole, max(problem.correction_penalty, _LEAST_PENALTY))
     noise = np.maximum(1.0, _LEAST_NOISE * (np.abs(problem.C) @ problem.output_scale) / problem.noise)
+    w1, w2, n = np.split(np.arange(whole.sizes[1]), np.cumsum([len(problem.input_scale), problem.W_L.n_inputs]))
+    z1, z2, penalty = np.split(
+        np.arange(whole.sizes[3]), np.cumsum([problem.performance.n_outputs, problem.W_R.n_outputs])
+    )
     size = np.ones(whole.sizes[1])
-    size[whole.part("w", "n")] = noise
-    columns = np.concatenate([whole.part("w", name) for name in ("w1", "n", "w2")])
-    rows = np.concatenate([whole.part("z", name) for name in ("z1", "penalty", "z2")])
-    w1, z2 = len(columns) - whole.w_parts["w2"], len(rows) - whole.z_parts["z2"]
-    return replace(whole.transformed(w=np.diag(size)).channel(rows, columns), n_w1=w1, n_z1=z2)
+    size[n] = noise
+    plant = whole.transformed(w=np.diag(size)).channel(np.r_[z1, penalty, z2], np.r_[w1, n, w2])
+    return replace(plant, n_w1=len(w1) + len(n), n_z1=len(z1) + len(penalty))
 
 
 def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
     """Put a filter in front of the disturbances: w = weight * nu."""
     _, _, n_u, n_z, _ = plant.sizes
     shaped = plant.open_loop() @ block_diagonal([weight, gain(np.eye(n_u), plant.dt)])
-    return split(shaped, weight.n_inputs, n_z, n_z1=plant.n_z1, z_parts=plant.z_parts)
+    return split(shaped, weight.n_inputs, n_z, n_z1=plant.n_z1)
 
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:
-    """Append the weighted control to the performance outputs, as the part "penalty" where these have names."""
+    """Append the weighted control to the performance outputs."""
     n, n_w, n_u, _, _ = plant.sizes
     return replace(
         plant,
         C1=np.vstack([plant.C1, np.zeros((n_u, n))]),
         D11=np.vstack([plant.D11, np.zeros((n_u, n_w))]),
         D12=np.vstack([plant.D12, penalty * np.eye(n_u)]),
-        z_parts=plant.z_parts | {"penalty": n_u} if plant.z_parts else {},
     )

@@ -43,21 +43,6 @@ _NEGLIGIBLE = 1e-12
 class ResidualProblem:
     """Problem of a residual-shaped observer: error dynamics, residuals of a population, measurement noise.
 
-    Parameters
-    ----------
-    A : ndarray, shape (n, n)
-        Error dynamics of the original states (`mean_error_dynamics` in `kros.observer.residual.one_step`).
-    C : ndarray, shape (q, n)
-        Selects the measured states.
-    spectra : ndarray, shape (unit, f, n, n), complex
-        Cross spectral density of every unit's one-step residual (`residual_spectra` in
-        `kros.observer.residual.one_step`), physical units.
-    noise : ndarray, shape (q,)
-        Standard deviation of the measurement noise.
-    scale : ndarray, shape (n,)
-        Range of every state; norms are of errors in these units.
-    dt : float, s
-
     Raises
     ------
     DimensionError
@@ -73,23 +58,21 @@ class ResidualProblem:
     (1, 65, 1, 1)
     """
 
-    A: Array
-    C: Array
-    spectra: Spectra
-    noise: Array
-    scale: Array
-    dt: float
+    A: Array  # (n, n), error dynamics of the original states
+    C: Array  # (q, n), selects the measured states
+    spectra: Spectra  # (unit, f, n, n), complex: cross spectral density of every unit's one-step residual
+    noise: Array  # (q,), standard deviation of the measurement noise
+    scale: Array  # (n,), range of every state; norms are of errors in these units
+    dt: float  # s
 
     def __post_init__(self) -> None:
         for name in ("A", "C", "noise", "scale"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         n, q = len(self.A), len(self.C)
-        found = self.A.shape, self.C.shape, self.noise.shape, self.scale.shape, self.spectra.shape[2:]
-        if found != ((n, n), (q, n), (q,), (n,), (n, n)) or self.spectra.ndim != 4:
-            raise DimensionError(
-                "Residual-shaped observer: needs A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,), "
-                f"found {self.A.shape}, {self.C.shape}, {self.spectra.shape}, {self.noise.shape}, {self.scale.shape}."
-            )
+        shapes = tuple(np.shape(x) for x in (self.A, self.C, self.spectra, self.noise, self.scale))
+        if shapes != ((n, n), (q, n), (*shapes[2][:2], n, n), (q,), (n,)):
+            needed = "A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,)"
+            raise DimensionError(f"Residual-shaped observer: needs {needed}, found {', '.join(map(str, shapes))}.")
 
     def scaled(self, basis: Basis) -> _Scaled:
         """Return the problem in scaled coordinates, for a basis of the shaping filter."""
@@ -149,8 +132,7 @@ def residual_h2(
     K = shaped.correction(full)
     if not np.isfinite(shaped.norm(full, K)):
         raise SynthesisError(
-            "Residual-shaped observer: the error of the optimal observer is not bounded; check the nominal model and "
-            "what is measured."
+            "Residual-shaped observer: its error is not bounded; check the model and what is measured."
         )
     K = shaped.reduced(full, K, tolerance_percent, full.n_states if max_order is None else max_order)
     norm = shaped.norm(full, K)

@@ -42,10 +42,8 @@ class Basis:
 
     def __post_init__(self) -> None:
         if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):
-            raise DimensionError(
-                "Shaping filter: needs delays of at least 0 and different poles inside the unit circle, found "
-                f"{self.delays} and {self.poles}."
-            )
+            problem = "needs delays of at least 0 and different poles inside the unit circle"
+            raise DimensionError(f"Shaping filter: {problem}, found {self.delays} and {self.poles}.")
 
     @cached_property
     def scalar(self) -> tuple[Array, Array]:
@@ -54,10 +52,8 @@ class Basis:
 
         shift = np.eye(self.delays, k=-1)
         poles = np.array(self.poles)
-        first = np.eye(self.delays, 1)[:, 0]
-        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], np.concatenate(
-            [first, np.sqrt(1 - poles**2)]
-        )
+        b = np.concatenate([np.eye(self.delays, 1)[:, 0], np.sqrt(1 - poles**2)])
+        return block_diag(shift, np.diag(poles))[-self.size :, -self.size :], b
 
     @property
     def size(self) -> int:
@@ -71,10 +67,8 @@ class Basis:
 
     def system(self, n: int) -> tuple[Array, Array]:
         """Return A_z and B_z for n channels, the channels of one delay or lag side by side."""
-        A, b = self.scalar
-        return np.kron(A, np.eye(n)).reshape(n * self.size, n * self.size), np.kron(b[:, None], np.eye(n)).reshape(
-            n * self.size, n
-        )
+        (A, b), size = self.scalar, n * self.size
+        return np.kron(A, np.eye(n)).reshape(size, size), np.kron(b[:, None], np.eye(n)).reshape(size, n)
 
 
 def circle_weights(f: int) -> Array:
@@ -88,18 +82,13 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     """Fit a shaping filter to a spectrum."""
     f, n = spectrum.shape[:2]
     if spectrum.shape != (f, n, n) or f < 2:
-        raise DimensionError(
-            "Shaping filter: the spectrum should have shape (f, n, n) with at least two frequencies, found "
-            f"{spectrum.shape}."
-        )
+        problem = "the spectrum should have shape (f, n, n) with at least two frequencies"
+        raise DimensionError(f"Shaping filter: {problem}, found {spectrum.shape}.")
     weight = circle_weights(f)
     R = np.tensordot(weight, spectrum, 1).real
     largest = float(np.max(np.diag(R), initial=0.0))
     if not (np.isfinite(R).all() and largest > 0):
-        raise SynthesisError(
-            "Shaping filter: the residual is zero or not finite, there is nothing to shape; correct nothing (open "
-            "loop)."
-        )
+        raise SynthesisError("Shaping filter: the residual is zero or not finite; correct nothing (open loop).")
     R = R + _FLOOR * largest * np.eye(n)
     response = basis.response(np.exp(1j * np.linspace(0, np.pi, f)))
     k = basis.size
@@ -112,11 +101,9 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
     if values.max() <= _PREDICTABLE * largest:
-        raise SynthesisError(
-            f"Shaping filter: the residual can be predicted to {np.sqrt(max(values.max(), 0) / largest):.1g} of its "
-            "size, it is constant or a few tones; "
-            "record longer or richer episodes."
-        )
+        error = f"{np.sqrt(max(values.max(), 0) / largest):.1g} of its size"
+        problem = f"the residual can be predicted to {error}, it is constant or a few tones"
+        raise SynthesisError(f"Shaping filter: {problem}; record longer or richer episodes.")
     root = vectors * np.sqrt(np.maximum(values, 0))
     A, B = basis.system(n)
     return StateSpace(A + B @ Theta, B @ root, Theta, root, dt)

@@ -36,17 +36,12 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
     try:
         X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
     except (LinAlgError, ValueError) as error:
-        raise SynthesisError(
-            f"{method}: the Riccati equation of {A.shape[0]} states has no stabilising solution that can be computed "
-            f"({error}); "
-            "check stabilisability, detectability and scaling."
-        ) from error
+        problem = f"the Riccati equation of {len(A)} states has no stabilising solution that can be computed ({error})"
+        raise SynthesisError(f"{method}: {problem}; check stabilisability, detectability and scaling.") from error
     X = (X + X.T) / 2
-    if dt > 0 and _residual(A, B, Q, R, S, X) > 1e-5:
-        raise SynthesisError(
-            f"{method}: the Riccati solution has residual {_residual(A, B, Q, R, S, X):.2g}; scale states, inputs "
-            "and outputs to similar size."
-        )
+    if dt > 0 and (residual := _residual(A, B, Q, R, S, X)) > 1e-5:
+        problem = f"the Riccati solution has residual {residual:.2g}"
+        raise SynthesisError(f"{method}: {problem}; scale states, inputs and outputs to similar size.")
     return X
 
 
@@ -99,8 +94,6 @@ def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
     if np.linalg.cond(loop) > 1e12:
-        raise SynthesisError(
-            "Algebraic loop: the controller makes I + D^c D22 singular; add a delay to the plant, or change D22."
-        )
+        raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)

@@ -17,7 +17,9 @@ from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -37,8 +39,8 @@ _NEGLIGIBLE = 1e-9  # share of the norm without control below which the optimum 
 _BOUNDARY = 1e-9  # distance from the stability boundary, relative, that rounding decides
 
 
-def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: float = 1e-5) -> Synthesis:
-    r"""Return a controller with the smallest H-infinity norm from w to z, or one below a given level.
+def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
+    r"""Return a controller with the smallest H-infinity norm from w to z.
 
     .. math:: \min_K \|T_{zw}\|_\infty = \min_K \sup_\omega \bar\sigma(T_{zw}(e^{j\omega\Delta t}))
 
@@ -47,10 +49,9 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     plant : GeneralizedPlant
         Discrete, or continuous (``dt = 0``); ``D12`` of full column rank, ``D21`` of full row rank, D11 and D22
         arbitrary.
-    gamma : float, optional
-        Ask for this level instead of the optimum. A level well above the optimum gives a calmer controller.
     tolerance : float
-        Distance of the norm from the proven bound, as a fraction of it, at which the search ends.
+        Distance of the norm from the proven bound, as a fraction of it, at which the search ends. Some percent give a
+        calmer controller than the optimum.
 
     Returns
     -------
@@ -62,10 +63,9 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     Raises
     ------
     ConfigError
-        When an option is out of range.
+        When the tolerance is out of range.
     SynthesisError
-        When an assumption fails (each is named, with the remedy), when `gamma` is out of reach, or when no controller
-        survives verification.
+        When an assumption fails (each is named, with the remedy), or when no controller survives verification.
 
     Examples
     --------
@@ -76,29 +76,17 @@ def hinf(plant: GeneralizedPlant, *, gamma: float | None = None, tolerance: floa
     >>> optimum.status.value, bool(optimum.hinf_norm < optimum.lower_bound * 1.001)
     ('optimal', True)
     """
-    if gamma is not None and not (np.isfinite(gamma) and gamma > 0):
-        raise ConfigError(
-            f"H-infinity synthesis: gamma should be positive, found {gamma}; leave it out for the optimum."
-        )
     if not 1e-8 <= tolerance < 1:
-        raise ConfigError(
-            f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}; 1e-5 is the default."
-        )
+        raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}.")
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
     idle = _closed(plant, gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt))
-    if 0 in plant.sizes[2::2]:
-        best, lower = idle, idle.norm
-    else:
-        frame = Frame.of(plant)
-        best, lower = (_Loop(None), 0.0) if gamma is None else _attempt(frame, gamma)
-        if best.norm > (gamma or 0.0):
-            best, lower = _search(frame, idle, tolerance, gamma or 0.0)
-    if gamma is not None and best.norm > gamma:
-        raise _out_of_reach(gamma, best, lower)
-    vanishes = best.norm <= _negligible(idle)
-    optimal = gamma is None and (vanishes or best.norm <= lower * (1 + tolerance) * (1 + 2e-6))
-    return _result(plant, best, 0.0 if vanishes else lower, optimal, time.perf_counter() - start)
+    negligible = _NEGLIGIBLE * idle.norm if np.isfinite(idle.norm) else 0.0
+    trivial = 0 in plant.sizes[2::2]
+    best, lower = (idle, idle.norm) if trivial else _search(Frame.of(plant), idle, tolerance, negligible)
+    lower = 0.0 if best.norm <= negligible else lower
+    optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2e-6))
+    return _result(plant, best, lower, optimal, time.perf_counter() - start)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,27 +103,16 @@ def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
         if K is None:
             return _Loop(None)
         closed = plant.close(K)
-        largest = closed.largest_pole()
         limit = 1.0 if closed.dt > 0 else 0.0
         size = 1.0 if closed.dt > 0 else float(np.abs(closed.poles()).max(initial=1.0))
-        return _Loop(None) if largest >= limit - _BOUNDARY * size else _Loop(K, hinf_norm(closed))
+        stable = closed.largest_pole() < limit - _BOUNDARY * size
+        return _Loop(K, hinf_norm(closed)) if stable else _Loop(None)
     except (KrosError, np.linalg.LinAlgError):
         return _Loop(None)
 
 
-def _negligible(idle: _Loop) -> float:
-    """Return the norm below which an optimum is zero but for rounding.
-
-    Zero where the plant is unstable without control.
-    """
-    return _NEGLIGIBLE * idle.norm if np.isfinite(idle.norm) else 0.0
-
-
-def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple[_Loop, float]:
-    """Return the best loop and the largest level that is proven to be out of reach.
-
-    It ends where a wanted norm is attained.
-    """
+def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float) -> tuple[_Loop, float]:
+    """Return the best loop and the largest level that is proven to be out of reach."""
     best = min(idle, _closed(frame.given, _h2_controller(frame.given)), key=lambda loop: loop.norm)
     lower = low = pointwise_bound(frame.scaled)
     level = best.norm * (1 - tolerance / 2) if np.isfinite(best.norm) else 2 * max(lower, 1e-3)
@@ -146,14 +123,10 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, wanted: float) -> tuple
         if lower <= trial.norm * (1 + _ROUNDING):
             best = min(best, trial, key=lambda loop: loop.norm)
         low = max(low, lower, level if level < (1 - tolerance) * best.norm and level * (1 + 1e-6) < trial.norm else 0.0)
-        if (
-            best.norm <= max(wanted or lower * (1 + tolerance), low * (1 + tolerance / 4), _negligible(idle))
-            or lower >= wanted > 0
-        ):
+        if best.norm <= max(lower * (1 + tolerance), low * (1 + tolerance / 4), negligible):
             break
         # Where the bound is tight this level ends the search, with a calmer controller than that of the optimum.
-        close = min(lower * (1 + 0.9 * tolerance), (lower + wanted) / 2 if wanted else np.inf)
-        level = close if np.isfinite(best.norm) else 4 * level
+        level = lower * (1 + 0.9 * tolerance) if np.isfinite(best.norm) else 4 * level
         if low >= level:
             bottom = max(low, _NEGLIGIBLE * best.norm)
             level = float(np.sqrt(bottom * best.norm)) if best.norm > 2 * bottom else (bottom + best.norm) / 2
@@ -178,19 +151,6 @@ def proven_bound(plant: GeneralizedPlant, level: float) -> float:
     return max(best, level_bound(frame, frame.halves(level)))
 
 
-def _out_of_reach(gamma: float, best: _Loop, lower: float) -> SynthesisError:
-    reached = f"the best that was reached is {best.norm:.6g}, and no controller is below {lower:.6g}"
-    if lower >= gamma:
-        return SynthesisError(
-            f"H-infinity synthesis: the level gamma = {gamma:.6g} is out of reach; {reached}. Raise gamma."
-        )
-    return SynthesisError(
-        f"H-infinity synthesis: the level gamma = {gamma:.6g} was not reached, which does not prove that it cannot "
-        f"be; {reached}. Raise gamma, or "
-        "scale states, inputs and outputs to similar size."
-    )
-
-
 def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, elapsed: float) -> Synthesis:
     """Recompute the rest; the gap follows from the norm and the bound."""
     if best.K is None:
@@ -201,8 +161,7 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, e
     if lower > best.norm * (1 + _ROUNDING):
         raise SynthesisError(
             f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {best.norm:.9g} that "
-            "is attained; please "
-            "report the plant."
+            "is attained; please report the plant."
         )
     lower = min(lower, best.norm)
     closed = plant.close(best.K)
@@ -210,7 +169,7 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, e
         method="hinf",
         controller=best.K,
         status=Status.OPTIMAL if optimal else Status.CERTIFIED,
-        h2_norm=_h2_norm(closed),
+        h2_norm=_strict(h2_norm, closed),
         hinf_norm=best.norm,
         lower_bound=lower,
         gap_percent=100 * (best.norm / lower - 1) if lower > 0 else None,
@@ -222,21 +181,16 @@ def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, e
 
 def _h2_controller(plant: GeneralizedPlant) -> StateSpace | None:
     """H2-optimal controller, for the first upper bound; in continuous time as if D11 were zero."""
-    if plant.dt == 0:
-        plant = replace(plant, D11=np.zeros_like(plant.D11))
+    direct = np.zeros_like(plant.D11) if plant.dt == 0 else plant.D11
+    optimum = _strict(h2, replace(plant, D11=direct))
+    return None if optimum is None else optimum.controller
+
+
+def _strict(function: Callable[[Any], Any], argument: Any) -> Any:
+    """Return a result; None where rounding leaves it without digits, for poles close to the stability boundary."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         try:
-            return h2(plant).controller
+            return function(argument)
         except (SynthesisError, RuntimeWarning):
-            return None
-
-
-def _h2_norm(closed: StateSpace) -> float | None:
-    """H2 norm; None where poles are so close to the stability boundary that it has no digits."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        try:
-            return h2_norm(closed)
-        except RuntimeWarning:
             return None

@@ -48,12 +48,7 @@ Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
 _RANK = 1e-9  # of direct gains and of kernels, relative: signals smaller than this prove nothing
-_CUTS = (
-    1e-12,
-    1e-9,
-    1e-6,
-    1e-3,
-)  # directions of the state below this share of the largest are left out; the others prove a bound
+_CUTS = (1e-9, 1e-3)  # relative size below which directions of the state are left out; the others prove a bound
 _REACHED = 1e-10  # new directions below this share are not reached
 _SINGULAR = 1e-12  # of constraints, relative: an input that states of the signals can replace
 _NEAR = 1e-2  # distance from the boundary, relative, of eigenvalues whose frequencies are tried
@@ -129,17 +124,9 @@ def _reachable(side: Side) -> Array:
     return np.asarray(null_space((left @ L[:, :k]).T) if k else np.eye(n))
 
 
-def direct_bound(p: GeneralizedPlant) -> float:
-    """Return the smallest norm of ``D11 + D12 K D21`` over all gains K (Parrott).
-
-    That of every closed loop at infinity.
-    """
-    return max(side.at_infinity() for side in Side.both(p))
-
-
 def pointwise_bound(p: GeneralizedPlant, rad: Array | None = None) -> float:
     """Return the largest Parrott bound over frequencies, by default around all poles, less its rounding."""
-    best = direct_bound(p)
+    best = max(side.at_infinity() for side in Side.both(p))
     if not len(p.A) or (rad is not None and not len(rad)):
         return best * (1 - _MARGIN)
     for side in Side.both(p):

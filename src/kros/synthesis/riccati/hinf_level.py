@@ -40,7 +40,7 @@ Array = npt.NDArray[Any]
 
 _AXIS = 1e-14  # distance of an eigenvalue from the axis, relative to the matrix, that rounding decides
 _NEGATIVE, _ASYMMETRY = 1e-7, 1e-5  # of a Riccati solution, relative: beyond them there is none that is semidefinite
-_POLE = 1e12  # condition beyond which a pole is at z = -1, the point that the map sends to infinity
+_POLE = 1e12  # condition above which a pole is at z = -1, the point that the map sends to infinity
 
 
 @dataclass(frozen=True, eq=False)

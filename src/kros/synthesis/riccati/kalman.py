@@ -64,21 +64,14 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     A, C, Q, R = (np.atleast_2d(np.asarray(x, dtype=float)) for x in (A, C, Q, R))
     n, q = A.shape[0], C.shape[0]
     if A.shape != (n, n) or C.shape != (q, n) or Q.shape != (n, n) or R.shape != (q, q):
-        raise DimensionError(
-            f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {A.shape}, {C.shape}, {Q.shape}, "
-            f"{R.shape}."
-        )
+        shapes = f"{A.shape}, {C.shape}, {Q.shape}, {R.shape}"
+        raise DimensionError(f"Kalman predictor: needs A (n, n), C (q, n), Q (n, n), R (q, q), found {shapes}.")
     if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
-        raise SynthesisError(
-            "Kalman predictor: the measurement noise covariance R is not positive definite; every measurement needs "
-            "some noise."
-        )
-    lowest = np.linalg.eigvalsh((Q + Q.T) / 2)
-    if lowest.min() < -1e-12 * max(lowest.max(), 1e-300):
-        raise SynthesisError(
-            f"Kalman predictor: the process noise covariance Q has the eigenvalue {lowest.min():.3g}; it must be "
-            "positive semidefinite."
-        )
+        raise SynthesisError("Kalman predictor: R is not positive definite; every measurement needs some noise.")
+    values, vectors = np.linalg.eigh((Q + Q.T) / 2)
+    if values.min() < -1e-12 * max(values.max(), 1e-300):
+        problem = f"Q has the eigenvalue {values.min():.3g}"
+        raise SynthesisError(f"Kalman predictor: {problem}; it must be positive semidefinite.")
     require_detectable(A, C, dt, "Kalman predictor")
     start = time.perf_counter()
     L, _ = predictor(A, C, Q, R, np.zeros((n, q)), "Kalman predictor")
@@ -86,11 +79,8 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     closed = A - L @ C
     radius = float(np.abs(np.linalg.eigvals(closed)).max(initial=0.0))
     if radius >= 1:
-        raise SynthesisError(
-            f"Kalman predictor: the error dynamics have spectral radius {radius:.9g}; add process noise on the modes "
-            "on the unit circle."
-        )
-    values, vectors = np.linalg.eigh((Q + Q.T) / 2)
+        problem = f"the error dynamics have spectral radius {radius:.9g}"
+        raise SynthesisError(f"Kalman predictor: {problem}; add process noise on the modes on the unit circle.")
     noise = np.hstack([vectors * np.sqrt(np.maximum(values, 0)), -L @ np.linalg.cholesky(R)])
     norm = h2_norm(StateSpace(closed, noise, np.eye(n), np.zeros((n, n + q)), dt))
     return Synthesis(

@@ -47,9 +47,7 @@ class Enclosure:
     def __init__(self, system: StateSpace) -> None:
         self.system = system
         T = _even_coordinates(system)
-        self._A = np.linalg.solve(T, system.A @ T) - np.eye(
-            system.n_states
-        )  # of z - 1, for the sake of low frequencies
+        self._A = np.linalg.solve(T, system.A @ T) - np.eye(system.n_states)  # of z - 1, for low frequencies
         self._B, self._C = np.linalg.solve(T, system.B), system.C @ T
 
     def __call__(self, theta: Array, half: Array) -> tuple[Array, Array]:
@@ -80,13 +78,8 @@ class Enclosure:
         CR2, R2B = CR @ R, R @ RB
         bend = np.abs(CR2 @ RB)
         tail = _size(CR2, -1)[..., None] * _size(R2B, -2)[:, None] / np.where(reach < 1, 1 - reach, 1.0)
-        lost = (
-            self.system.n_states
-            * _RESOLVENT
-            * (_size(CR, -1) + half[:, None] * _size(CR2, -1))[..., None]
-            * _size(RB, -2)[:, None]
-        )
-        moved = np.abs(slope)
+        moved, left = np.abs(slope), (_size(CR, -1) + half[:, None] * _size(CR2, -1))[..., None]
+        lost = self.system.n_states * _RESOLVENT * left * _size(RB, -2)[:, None]
         distance = h**2 * (moved / 2 + bend + h * tail) + lost + _ROUNDING * (np.abs(middle) + h * moved)
         return ends, np.where(reach < 1, distance, np.inf)
 
@@ -123,10 +116,8 @@ def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 
         if not loose.any() or tried > max_arcs:
             break
         quarter = half[loose] / 2
-        theta, half = (
-            np.concatenate([theta[loose] - quarter, theta[loose] + quarter]),
-            np.concatenate([quarter, quarter]),
-        )
+        theta = np.concatenate([theta[loose] - quarter, theta[loose] + quarter])
+        half = np.concatenate([quarter, quarter])
         proven, seen = ratio(theta, half)
     else:
         loose = np.full(len(theta), True)

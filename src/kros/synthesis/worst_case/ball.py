@@ -1,33 +1,28 @@
 r"""The uncertain set per frequency: a matrix ball, its worst element and its average.
 
-Derivation. With ``N = W_R W_L`` and ``||N|| < 1``, let ``X = Delta (I - N Delta)^-1``, so that ``Delta = (I + X N)^-1
-X`` and
+With ``N = W_R W_L``, ``||N|| < 1`` and ``X = Delta (I - N Delta)^-1``, completing the square in ``||Delta|| <= 1``
+gives
 
-    ||Delta|| <= 1  <=>  X^H X <= (I + N X)^H (I + N X)  <=>  X^H Q X - X^H N^H - N X <= I,     Q = I - N^H N > 0.
+    { X : ||Delta|| <= 1 } = { X_c + R_l Theta R_r : ||Theta|| <= 1 },
+    X_c = N^H (I - N N^H)^-1,   R_l = (I - N^H N)^(-1/2),   R_r = (I - N N^H)^(-1/2).
 
-Completing the square with ``X_c = Q^-1 N^H = N^H (I - N N^H)^-1`` gives ``(X - X_c)^H Q (X - X_c) <= I + N Q^-1 N^H =
-(I - N N^H)^-1``:
+Without a loop (``N = 0``) it is the unit ball itself; the same formulas hold whatever N is made of.
 
-    { Delta (I - N Delta)^-1 : ||Delta|| <= 1 } = { X_c + R_l Theta R_r : ||Theta|| <= 1 },
-    R_l = (I - N^H N)^(-1/2),   R_r = (I - N N^H)^(-1/2).
+*Upper bound* of ``||a + P Theta Q||_F``, a Lagrangian dual. With ``P = U diag(s) V^H``, ``Q = G diag(q) H^H``, ``d_ij =
+s_i^2 q_j^2`` and ``c_ij = s_i q_j (U^H a H)_ij``, the rows and columns of a contraction have norms of at most one.
+Giving them multipliers g_i, l_j >= 0 with ``g_i + l_j >= d_ij`` and completing the square,
 
-*Upper bound.* `dual_bound`. Where the ball is around zero, von Neumann's trace inequality gives the maximum itself,
-``||P Theta Q||_F^2 = tr(P^H P  Theta Q Q^H Theta^H) <= sum_i s_i(P)^2 s_i(Q)^2`` (`spread`).
+    ||a + P Theta Q||_F^2 <= ||a||_F^2 + sum_i g_i + sum_j l_j + sum_ij |c_ij|^2 / (g_i + l_j - d_ij).
 
-Without a loop (``N = 0``) the set is the unit ball itself and the bound is attained; the same formulas hold whatever N
-is made of, for example ``W_R G W_L``.
+*Any* feasible multipliers give a valid bound; coordinate descent makes it good. For ``a = 0`` it is ``sum s_i^2 q_i^2``
+(von Neumann's trace inequality, `spread`), for scalars ``(|a| + s q)^2``: both exact.
 
 *Lower bound.* The worst case is at least any average over the set. Theta uniform on the matrices (b, a) with
-orthonormal columns or rows has
-mean zero and ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / max(a, b)``, so for every T
-
-    max_X ||T X M||_F^2 >= tr T (X_c M M^H X_c^H + R_l R_l^H ||R_r M||_F^2 / max(a, b)) T^H.
-
-If N and M are diagonal the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and
-without a loop not under ``X -> V X``; averaging over V removes the off-diagonal entries of ``X M M^H X^H``. So in both
-cases *the diagonal of the spectrum of any element* gives a lower bound as well, and because the observer's error is
-linear in the spectrum, so does every convex combination of such spectra. Elsewhere the largest diagonal spectrum below
-the average's is used.
+orthonormal columns or rows has mean zero and ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / max(a, b)`` (`Ball.average`). If
+N and M are diagonal, the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and
+without a loop not under ``X -> V X``. Averaging over V removes the off-diagonal entries of ``X M M^H X^H``, so in both
+cases *the diagonal of the spectrum of any element* gives a lower bound as well. Elsewhere the largest diagonal spectrum
+below the average's is used.
 
 Symbols
 -------
@@ -44,7 +39,6 @@ import numpy.typing as npt
 
 from ...core.linalg import adjoint
 from ..problem.observer_problem import ObserverProblem
-from .dual_bound import dual_bound
 
 Array = npt.NDArray[Any]
 
@@ -58,19 +52,16 @@ class Ball:
     right: Array  # shape (f, a, m); ``R_r M``
 
     @classmethod
-    def of(cls, N: Array, M: Array) -> Ball:
-        """Build the ball of ``Delta (I - N Delta)^-1 M`` from N, shape (f, a, b), and M, shape (f, a, m)."""
+    def of(cls, N: Array | None, M: Array, b: int) -> Ball:
+        """Build the ball of ``Delta (I - N Delta)^-1 M`` from N (f, a, b), None without a loop, and M (f, a, m)."""
+        if N is None:
+            f, _, m = M.shape
+            return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
         U, s, Vh = np.linalg.svd(N)
         k = s.shape[-1]
         radius = 1 / np.sqrt(1 - s**2)
         X_c = (adjoint(Vh)[..., :k] * (s * radius**2)[..., None, :]) @ adjoint(U)[..., :k, :]
         return cls(X_c @ M, _with_gains(adjoint(Vh), radius), _with_gains(U, radius) @ M)
-
-    @classmethod
-    def without_loop(cls, M: Array, b: int) -> Ball:
-        """Build the ball of ``Delta M`` for Delta with b rows."""
-        f, _, m = M.shape
-        return cls(np.zeros((f, b, m), complex), np.broadcast_to(np.eye(b, dtype=complex), (f, b, b)), M)
 
     def bound(self, T: Array, certain: Array | float = 0.0) -> Array:
         """Upper bound of ``||certain + T X M||_F`` over the set, shape (f,); `certain` is (f, p, m).
@@ -90,41 +81,30 @@ class Ball:
 
     def worst(self, T: Array, certain: Array | float = 0.0, iterations: int = 15) -> Array:
         """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
-        P = T @ self.left
-        _, _, Vh_p = np.linalg.svd(P)
-        U_q, _, _ = np.linalg.svd(self.right)
+        P, Qh = T @ self.left, adjoint(self.right)
+        left, right = adjoint(np.linalg.svd(P)[2]), np.linalg.svd(self.right)[0]
         k = min(P.shape[-1], self.right.shape[-2])
         starts = (
-            polar(adjoint(self.left) @ self.center @ adjoint(self.right)),  # aligned with the centre
-            polar(
-                adjoint(P) @ (certain + T @ self.center) @ adjoint(self.right)
-            ),  # aligned with the centre, as T sees it
-            adjoint(Vh_p)[..., :k] @ adjoint(U_q)[..., :k, :],  # worst without the centre
+            polar(adjoint(self.left) @ self.center @ Qh),  # aligned with the centre
+            polar(adjoint(P) @ (certain + T @ self.center) @ Qh),  # aligned with the centre, as T sees it
+            left[..., :k] @ adjoint(right)[..., :k, :],  # worst without the centre
         )
         best, best_value = starts[0], np.full(T.shape[:-2], -1.0)
         for theta in starts:
             for k in range(iterations + 1):
                 error = certain + T @ (self.center + self.left @ theta @ self.right)
-                if k in (0, iterations):
-                    value = np.linalg.norm(error, axis=(-2, -1))
-                    better = value > best_value * (1 + 1e-6)
-                    best, best_value = (
-                        np.where(better[..., None, None], theta, best),
-                        np.where(better, value, best_value),
-                    )
-                theta = polar(adjoint(P) @ error @ adjoint(self.right))
+                value = np.linalg.norm(error, axis=(-2, -1))
+                better = value > best_value * (1 + 1e-6) if k in (0, iterations) else np.zeros_like(value, bool)
+                best = np.where(better[..., None, None], theta, best)
+                best_value = np.where(better, value, best_value)
+                theta = polar(adjoint(P) @ error @ Qh)
         return best
 
 
 def uncertain_ball(problem: ObserverProblem, freqs_hz: Array) -> Ball:
     """Return the ball of ``Delta (I - N Delta)^-1 M`` of a problem at frequencies."""
     N = None if problem.N is None else problem.N.frequency_response(freqs_hz)
-    return ball_of(N, problem.M.frequency_response(freqs_hz), problem.W_L.n_inputs)
-
-
-def ball_of(N: Array | None, M: Array, b: int) -> Ball:
-    """Return the ball of ``Delta (I - N Delta)^-1 M`` for Delta with b rows; N is None where there is no loop."""
-    return Ball.without_loop(M, b) if N is None else Ball.of(N, M)
+    return Ball.of(N, problem.M.frequency_response(freqs_hz), problem.W_L.n_inputs)
 
 
 def spread(P: Array, Q: Array) -> Array:
@@ -152,3 +132,64 @@ def polar(matrix: Array) -> Array:
     """Return the unitary polar factors, shape (f, a, b)."""
     U, _, Vh = np.linalg.svd(matrix, full_matrices=False)
     return U @ Vh
+
+
+_SWEEPS = 10
+_STEPS = 4
+
+
+def dual_bound(a: Array, P: Array, Q: Array) -> Array:
+    """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,)."""
+    U, s, _ = np.linalg.svd(P, full_matrices=False)
+    _, q, Hh = np.linalg.svd(Q, full_matrices=False)
+    d = (s[..., :, None] * q[..., None, :]) ** 2
+    rotated = adjoint(U) @ a @ adjoint(Hh)
+    c = d * np.abs(rotated) ** 2
+    g, multipliers = _without_centre(s, q)
+    g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]
+    g, multipliers = _descended(c, d, g, multipliers)
+    rounding = 4 * np.finfo(float).eps
+    g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
+    slack = g[..., :, None] + multipliers[..., None, :] - d
+    rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
+    squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
+    return np.where(np.isfinite(squared), np.sqrt(squared), np.inf)
+
+
+def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
+    """Optimal multipliers for ``a = 0``: the dual of the sorted assignment (s and q descend)."""
+    rows, columns = s.shape[-1], q.shape[-1]
+    size = max(rows, columns)
+    s, q = (np.concatenate([x, np.zeros((*x.shape[:-1], size - x.shape[-1]))], axis=-1) for x in (s, q))
+    following = np.concatenate([s[..., 1:] ** 2, np.zeros((*s.shape[:-1], 1))], axis=-1)
+    steps = (s**2 - following) * q**2
+    g = np.cumsum(steps[..., ::-1], axis=-1)[..., ::-1]
+    return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
+
+
+def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array, Array]:
+    """Return better multipliers of rows and columns, by turns.
+
+    With frequencies last, where sums over few entries are those of long vectors.
+    """
+    c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
+    c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
+    rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
+    for _ in range(_SWEEPS):
+        rows = _best_rows(c, columns - d)
+        columns = _best_rows(c_columns, rows - d_columns)
+    return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
+
+
+def _best_rows(c: Array, shift: Array) -> Array:
+    """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0``, ``x + shift_ij >= 0``, for every row i."""
+    least = np.maximum(np.max(-shift, axis=1), 0.0)
+    gap = least[:, None] + shift
+    x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
+    for _ in range(_STEPS):
+        inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
+        terms = c * inverse * inverse
+        h = np.maximum(terms.sum(axis=1), 1e-300)
+        slope = np.maximum((terms * inverse).sum(axis=1), 1e-300)
+        x = np.maximum(x + (h * np.sqrt(h) - h) / slope, 0.0)
+    return least + x

@@ -25,10 +25,7 @@ from .ball import Ball, below, uncertain_ball
 Array = npt.NDArray[Any]
 Fit = Callable[..., Any]
 
-_FLOOR, _NOTHING = (
-    1e-14,
-    1e-30,
-)  # power relative to the largest below which a channel is level; power of a channel that is not there
+_FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level; power of a channel that is absent
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from ...core.linalg import adjoint
 from ...core.lti import StateSpace
 from .arcs import Enclosure, least_ratio
-from .ball import ball_of, below
+from .ball import Ball, below
 from .disturbance import Channels, Shaping, Spectrum, is_diagonal
 
 Array = npt.NDArray[Any]
@@ -86,7 +86,7 @@ class Everywhere:
             with np.errstate(invalid="ignore"):
                 distance = (distance + far * (size_M + distance) / np.maximum(room, 1e-300)) / (1 - nu)
             distance = np.where(room > 0, distance, np.inf)
-        root = np.sqrt(spectrum.power(ball_of(N, M, self.channels.problem.W_L.n_inputs), self.channels.nearest(theta)))
+        root = np.sqrt(spectrum.power(Ball.of(N, M, self.channels.problem.W_L.n_inputs), self.channels.nearest(theta)))
         if not spectrum.correlated:
             return np.maximum(root - distance[:, None], 0.0), root
         return root * _share_left(root, distance), root  # the whole matrix counts, not its diagonal alone

@@ -28,6 +28,7 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -113,19 +114,11 @@ def worst_case_h2(
 def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis:
     radius = problem.error_system(controller).largest_pole()
     if radius >= 1:
-        raise SynthesisError(
-            f"Worst-case H2 synthesis: the loop has spectral radius {radius:.9g}; add noise, or lower the order of "
-            "the weights."
-        )
-    return Synthesis(
-        method="worst_case_h2",
-        controller=controller,
-        status=Status.INACCURATE,
-        injection=problem.injection,
-        spectral_radius=radius,
-        solver="riccati",
-        notes=("A design alone, without certificate.",),
-    )
+        loop = f"the loop has spectral radius {radius:.9g}"
+        raise SynthesisError(f"Worst-case H2 synthesis: {loop}; add noise, or lower the order of the weights.")
+    facts: dict[str, Any] = {"injection": problem.injection, "spectral_radius": radius, "solver": "riccati"}
+    notes = ("A design alone, without certificate.",)
+    return Synthesis("worst_case_h2", controller, Status.INACCURATE, **facts, notes=notes)
 
 
 def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
@@ -152,11 +145,10 @@ def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order
     apart = Channels(channels.problem, channels.freqs_hz, apart=True)
     proofs, even = Everywhere(apart), symmetric(channels.problem)
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
-    bounds = []
-    for order in sorted({min(order, max_order) for order in _BOUND_ORDERS}):
-        for spectrum in spectra:
-            shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, order=order), "below"), spectrum)
-            plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
-            squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
-            bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))
+    orders, bounds = sorted({min(order, max_order) for order in _BOUND_ORDERS}), []
+    for order, spectrum in product(orders, spectra):
+        shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, order=order), "below"), spectrum)
+        plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
+        squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
+        bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))
     return [bound for bound in bounds if bound > 0]

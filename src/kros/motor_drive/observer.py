@@ -1,0 +1,143 @@
+r"""The load as one more hidden state: an estimator made from recordings of a few units under a known load.
+
+The load is the last state: zero in recordings without load, known in the others. Both kinds count alike, however many
+there are. The estimator is regressed on the part that can be seen (`without_level`) of the load and, since under load
+the level is missing there too, of the current:
+
+.. math:: \tau_s, \qquad i - (\tau - \tau_s).
+
+Its bank has one lag with the same forgetting: the integral of the tracking error, which the drive's controller holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from ..core.errors import DataError, DimensionError
+from ..data import EpisodeBatch
+from ..data.population import EpisodeKey
+from ..lifting import Lifting
+from ..observer import EstimatorSettings, Observer, Recordings, identify_estimator
+from .signals import low_passed, without_level
+
+Array = npt.NDArray[np.float64]
+LOAD = "load"
+
+
+@dataclass(frozen=True)
+class LoadSettings:
+    """How a known load is read.
+
+    Examples
+    --------
+    >>> from kros.motor_drive import LoadSettings
+    >>> LoadSettings(current=2, limit=1.0).level_s
+    10.0
+    """
+
+    current: int | None = None  # state that carries the load, in the load's unit; None where none does
+    level_s: float = 10.0  # s; time after which a constant load is forgotten
+    corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
+    limit: float | None = None  # of the current; episodes that reach it are left out
+    delays: int = 20  # of the estimator, in samples: few recordings have a known load
+
+
+def load_observer(
+    name: str,
+    lifting: Lifting,
+    measured: Sequence[int],
+    inputs: Sequence[str],
+    batch: EpisodeBatch,
+    load: Array,
+    settings: LoadSettings | None = None,
+) -> tuple[Observer, tuple[int, ...]]:
+    """Return the estimator of the recorded states and ``load``, which needs neither current nor load at run time.
+
+    Parameters
+    ----------
+    name : str
+    lifting : Lifting
+        Of the recorded states; its functions read measured ones alone.
+    measured : sequence of int
+    inputs : sequence of str
+    batch : EpisodeBatch
+        Recordings of equal length that start at rest, with and without load.
+    load : ndarray, shape (n_samples, batch)
+        Torque of the known load in any unit, zero in recordings without load.
+    settings : LoadSettings, optional
+
+    Returns
+    -------
+    observer : Observer
+        `load`, and under load the current, lack their level (`AngleLoad`).
+    left_out : tuple of int
+        Episodes in which the current reaches its limit.
+
+    Raises
+    ------
+    DimensionError, DataError
+        When shapes do not fit, recordings of a kind are missing, or all reach the limit.
+
+    Examples
+    --------
+    >>> import kros
+    >>> from kros.data import EpisodeBatch
+    >>> from kros.lifting import Lifting
+    >>> from kros.motor_drive import load_observer
+    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
+    >>> batch = EpisodeBatch.read(motors, motors.keys())
+    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
+    >>> observer, left_out = load_observer("motor/load", Lifting(motors.states), (0,), motors.inputs, batch, load)
+    >>> observer.recorded, left_out
+    (('position', 'velocity', 'current', 'load'), ())
+    """
+    settings = settings or LoadSettings()
+    if batch.states.shape[:2] != load.shape or LOAD in lifting.states:
+        raise DimensionError(
+            f"Load observer: states {batch.states.shape} and load {load.shape} should agree in (n_samples, batch), "
+            f"and no state be named {LOAD!r}, found {', '.join(lifting.states)}."
+        )
+    at_limit = _at_limit(batch, settings)
+    used = np.flatnonzero(~at_limit)
+    visible = _visible(batch.take(used.tolist()), load[:, used], int(at_limit.sum()), settings)
+    place = {key: i for i, key in enumerate(visible.keys)}
+    lengths = visible.lengths
+    recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
+    lag = settings.level_s / batch.sample_period_s
+    bank = {"dense": settings.delays, "longest": settings.delays}
+    estimator = EstimatorSettings(**bank, first_lag=lag, last_lag=lag / recordings.length)
+    with_load = replace(lifting, states=(*lifting.states, LOAD))
+    result = identify_estimator(
+        name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator
+    )
+    return result.observer, tuple(np.flatnonzero(at_limit).tolist())
+
+
+def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> npt.NDArray[np.bool_]:
+    """Episodes in which the current reaches its limit, where the controller does not do what its errors say."""
+    if settings.limit is None or settings.current is None:
+        return np.zeros(len(batch.keys), bool)
+    return np.asarray(np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit)
+
+
+def _visible(batch: EpisodeBatch, load: Array, left_out: int, settings: LoadSettings) -> EpisodeBatch:
+    """Recordings with the load as a state, both as far as they can be seen; the conditions are "loaded" and not."""
+    loaded = np.any(load != 0, axis=0)
+    if not loaded.any() or loaded.all():
+        raise DataError(
+            f"Load observer: needs recordings with and without load, found {int(loaded.sum())} and "
+            f"{int((~loaded).sum())}; {left_out} come to the current's limit; take a smaller load or slower moves."
+        )
+    dt = batch.sample_period_s
+    torque = load if settings.corner_hz is None else low_passed(load, settings.corner_hz, dt)
+    seen = without_level(torque, settings.level_s, dt)
+    states = np.concatenate([batch.states, seen[..., None]], axis=-1)
+    if settings.current is not None:
+        states[..., settings.current] -= load - without_level(load, settings.level_s, dt)
+    # Keys of one unit: units with a known load are too few to leave one out.
+    keys = tuple(EpisodeKey("", "loaded" if on else "unloaded", str(i)) for i, on in enumerate(loaded))
+    return replace(batch, keys=keys, states=states, shown=None, lost=None)

@@ -118,8 +118,8 @@ def simulate(truth, K, seconds=8.0, substeps=4, count=2 * np.pi / 4096):
         positions.append(x[0])
         torques.append(torque)
         for _ in range(substeps):
-            middle = x[1] + h / 2 * truth.acceleration(x[0], x[1], torque)
-            x = x + h * np.stack([middle, truth.acceleration(x[0] + h / 2 * x[1], middle, torque)])
+            middle = x + h / 2 * truth.rates(x[..., None], torque[:, None])[..., 0]
+            x = x + h * truth.rates(middle[..., None], torque[:, None])[..., 0]
     return np.array(positions), np.array(torques)
 
 

@@ -1,12 +1,15 @@
 """The guard against a slow observer written out, in a batch, sample by sample and in C."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from kros.core import StateSpace
 from kros.export import CompiledObserver, export_c
 from kros.lifting import Lifting
-from kros.observer import Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
+from kros.observer import FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
+from kros.observer.simulate import Course
 from kros.synthesis import Injection
 
 DT, SETTLE, BOUND = 0.01, 4, np.array([3.0, 5.0])
@@ -94,3 +97,42 @@ def test_a_batch_one_machine_and_c_agree(delay, guard, tmp_path):
         in_c, status_c = compiled.run(y[:, i], u[:, i])
         np.testing.assert_allclose(in_c, ahead, rtol=1e-6, atol=1e-9)
         np.testing.assert_array_equal(status_c & 16, status[:, i] & 16)
+
+
+@pytest.mark.parametrize("loops", [True, False])
+@pytest.mark.parametrize("delay", [0, 3])
+@pytest.mark.parametrize("kind", ["guard", "history", "bank"])
+def test_a_recording_in_blocks_is_run_as_a_whole(kind, delay, loops, monkeypatch):
+    """Gaps across the borders of blocks, restarts, delays, lost inputs, past values, filter banks."""
+    y, u = recordings(seed=4)
+    u[180:192] = np.nan  # held, then a new start
+    y[60:75], y[305:330] = np.nan, np.nan
+    y[100:170], y[340:] = np.sin(np.arange(70))[:, None, None], 0.5  # where nothing is missing
+    if kind == "history":
+        lifting = Lifting(("x", "v"), ("x[-2]*v", "tanh(v)"), (), ("u",), ("v*u[-1]",))
+        A_l, B_l = (
+            np.vstack([np.hstack([0.9 * np.eye(2), [[0.1, 0.05], [0.02, 0.1]]]), np.zeros((2, 4))]),
+            np.ones((4, 2)),
+        )
+        K_l = StateSpace(K.A, K.B, np.vstack([K.C, [[0.0], [0.0]]]), np.vstack([K.D, [[0.0], [0.0]]]), DT)
+        o = Observer("h", lifting, A_l, 0.01 * B_l, (0,), ("u",), K_l, Injection.STATE, DT, runtime=Runtime(delay))
+    elif kind == "bank":
+        A_b = np.zeros((7, 7))
+        A_b[:2, [0, 2]], A_b[2:4, 0], A_b[2:4, 2:4] = [[0.9, 0.1], [0.2, 0.5]], 0.1, np.diag([0.8, 0.5])
+        A_b[4, 4], A_b[5:, 4] = 0.9, 0.3
+        bank = FilterBank(2, 0.1 * np.ones((7, 8)), *(np.full(2, v) for v in (0.9, 20.0, 0.5)), np.array([0.2]))
+        lifting = Lifting(("x", "v", "z1", "z2", "w", "xu", "vu"))
+        still = StateSpace(np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((7, 0)), np.zeros((7, 1)), DT)
+        o = Observer("b", lifting, A_b, 0.1 * np.ones((7, 1)), (0,), ("u",), still, Injection.STATE, DT, bank=bank)
+    else:
+        o = unstable(runtime=Runtime(delay=delay, upper=np.array([2.5, np.inf])))
+    if not loops:
+        monkeypatch.setattr("kros.observer.simulate.library", lambda: None)
+    borders = [0, 1, 2, 5, 65, 66, 110, 150, 185, 200, 310, 350, 390, 400]
+    for i in range(y.shape[1]):
+        whole, status = run_with_status(o, y[:, i : i + 1], u[:, i : i + 1])
+        course = Course(o)
+        runs = [course.take(y[a:b, i : i + 1], u[a:b, i : i + 1]) for a, b in pairwise(borders)]
+        in_blocks = np.concatenate([run.estimates for run in runs])
+        np.testing.assert_allclose(in_blocks, whole, rtol=1e-12, atol=1e-12 * np.abs(whole).max())
+        np.testing.assert_array_equal(np.concatenate([run.status for run in runs]), status)

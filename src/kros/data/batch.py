@@ -69,14 +69,25 @@ class EpisodeBatch:
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
         pairs = [population.read_with_truths(key) for key in keys]
-        lengths = np.array([len(e[:max_samples]) for e, _ in pairs])
-        n = len(population.states)
-        values = _side_by_side([e[:max_samples] for e, _ in pairs], lengths)
-        true = _side_by_side([t[:max_samples] for _, t in pairs], lengths) if truths and population.truths else None
+        batch = cls.of(population, {k: e[:max_samples] for k, (e, _) in zip(keys, pairs, strict=True)}, parameters)
+        if not (truths and population.truths):
+            return batch
+        return replace(batch, truths=_side_by_side([t[:max_samples] for _, t in pairs], batch.lengths))
+
+    @classmethod
+    def of(
+        cls,
+        population: Population,
+        episodes: Mapping[EpisodeKey, Array],
+        parameters: Mapping[str, Mapping[str, float]] | None = None,
+    ) -> EpisodeBatch:
+        """Return episodes that were read, (n_samples, n_channels) each, or parts of them."""
+        keys, lengths, n = tuple(episodes), np.array([len(e) for e in episodes.values()]), len(population.states)
+        values = _side_by_side(list(episodes.values()), lengths)
         rows = [(parameters or {}).get(k.unit, {}) for k in keys]
         shared = {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
         inputs = np.ascontiguousarray(values[..., n:])
-        return cls(tuple(keys), lengths, values[..., :n], inputs, population.sample_period_s, shared, truths=true)
+        return cls(keys, lengths, values[..., :n], inputs, population.sample_period_s, shared)
 
     @property
     def units(self) -> tuple[str, ...]:

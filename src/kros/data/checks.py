@@ -33,26 +33,41 @@ class NonFiniteError(DataError):
 
 def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
-    if values.ndim != 2 or values.shape[1] != len(channels):
-        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared"
-        raise DataError(f"{title(key)}: {declared}, found an array of shape {values.shape}; transpose or correct it.")
-    if len(values) < CHECK.samples:
-        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
+    for _ in checked_blocks([values], key, channels, gaps=gaps):
+        pass
+
+
+def checked_blocks(
+    blocks: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
+) -> Iterator[Array]:
+    """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
+    count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
+    for values in blocks:
+        if values.ndim != 2 or values.shape[1] != len(channels):
+            declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
+            raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+        if not gaps and count + len(values) >= CHECK.samples and not usable(values).all():
+            check_finite(values, key, channels, first=count)
+        first = first if count else values[:1].ravel()
+        resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
+        count += len(values)
+        yield values
+    if count < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {count}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
-    if not gaps and not usable(values).all():
-        check_finite(values, key, channels)
-    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and is_constant(values[:, i])]
-    moving = [c.name for i, c in enumerate(channels) if still and i not in still and not is_constant(values[:, i])]
+    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
+    moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
     if moving:
-        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
+        stays = f"state {channels[still[0]].name!r} stays at {first[still[0]]:g} in all {count} samples"
         reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
         raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: Array) -> bool:
+def is_constant(column: Array, first: float | None = None) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    room = CHECK.constant * abs(column[0])
-    lower, upper = column[0] - room, column[0] + room
+    first = column[0] if first is None else first
+    room = CHECK.constant * abs(first)
+    lower, upper = first - room, first + room
     return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
 
 

@@ -268,6 +268,12 @@ class Population:
         channels = np.ascontiguousarray(values[:, :n]) if values.shape[1] > n else values
         return channels, values[:, n : n + len(self.truths)]
 
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
+        """Read one episode in blocks of at most `rows` samples, each of shape (n, n_channels), in as little memory."""
+        blocks = getattr(self.source, "blocks", None)
+        for values in [self.source(key)] if blocks is None else blocks(key, rows):
+            yield values[:, : len(self.channels)]
+
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
         """Read one episode as states (n_samples, n) and inputs (n_samples, m)."""
         values = self.read(key)

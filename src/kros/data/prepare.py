@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
 from typing import Any
@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from ..core.files import stamp_of
 from ..core.store import digest_of
-from .checks import check_episode, check_period, check_structure
+from .checks import check_episode, check_period, check_structure, checked_blocks
 from .population import (
     Channel,
     EpisodeKey,
@@ -53,6 +53,16 @@ class PreparedSource:
             signals = step.describe(signals)
         check_episode(recording.values, key, signals.channels, gaps=self.gaps)
         return recording.values
+
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
+        """Return one prepared episode in blocks of so many samples; read whole where steps or the format ask for it."""
+        blocks = None
+        if isinstance(self.recordings, Recordings) and not self.steps:
+            blocks = self.recordings.blocks(key, rows)
+        if blocks is not None:
+            return checked_blocks(blocks, key, self.channels, gaps=self.gaps)
+        values = self(key)
+        return (values[k : k + rows] for k in range(0, len(values), rows))
 
     def recorded(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""

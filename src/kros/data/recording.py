@@ -5,7 +5,7 @@ reader ── Recording ── steps ── Recording ── checks ── sampl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -61,6 +61,10 @@ class Recordings:
     def read(self, key: EpisodeKey, place: Any) -> Recording:
         """Return one episode as recorded."""
         raise NotImplementedError
+
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Float] | None:
+        """Return the samples of an episode in blocks; None where it can only be read whole."""
+        return None
 
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode, without a last sample that repeats the stamp before it, as stopped recorders write."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,22 +24,19 @@ class Arriving:
     y: Array
     u: Array
 
-    def parameters(self, observer: Observer, rows: list[int]) -> dict[str, Array]:
-        """Return the lifting parameters of some episodes."""
-        return {
-            name: np.asarray(values, dtype=float)[rows] for name, values in observer.own(self.batch.parameters).items()
-        }
+    def parameters(self, observer: Observer) -> dict[str, npt.ArrayLike]:
+        """Return the lifting parameters of all episodes."""
+        return observer.own(self.batch.parameters)
 
 
 def arriving(
     observer: Observer,
     population: Population,
-    keys: Sequence[EpisodeKey],
+    episodes: Mapping[EpisodeKey, Array],
     values: Mapping[str, Mapping[str, float]],
-    samples: int | None = None,
 ) -> Arriving:
-    """Read episodes, perhaps cut to some samples, with lifting parameters by unit."""
-    batch = EpisodeBatch.read(population, keys, samples, values)
+    """Return episodes that were read, or parts of them, with lifting parameters by unit."""
+    batch = EpisodeBatch.of(population, episodes, values)
     measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
     y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
     return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])

@@ -35,6 +35,7 @@ from ..data.survey import RecordingFacts
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
+_BLOCK = 100_000  # samples of one recording in memory
 
 
 @dataclass(frozen=True)
@@ -261,13 +262,12 @@ def _mark(facts: RecordingFacts, task: Task) -> str | None:
 
 
 def segments_of(task: Task) -> list[Segment]:
-    """Find the constant-velocity segments of some episodes."""
+    """Find the constant-velocity segments of some episodes, each read in blocks where it is very long."""
     population, keys, spec = task
     names = population.states + population.inputs
     angle, reference = (names.index(n) for n in (spec.angle, spec.reference))
     segments, dt = [], population.sample_period_s
-    for key in keys:
-        values = population.read(key)
+    for values in (block for key in keys for block in population.blocks(key, _BLOCK) if len(block) > 1):
         rate = values[:, names.index(spec.measured)] if spec.measured in names else np.gradient(values[:, angle], dt)
         segments += find_segments(values[:, angle], values[:, reference], rate, dt, spec)
     return segments

@@ -141,12 +141,16 @@ class Gaps:
             x[:, self.filters] += np.einsum("brq,bq->br", self.ramp, jump)
         x[:, self.measured] = np.where(missing, expected, y)
 
+    def apart(self, x: Array, y: Array) -> Array:
+        """Return the next offset from the fallback, after states (batch, n) and measurements, (batch, q)."""
+        last = x[:, : self.recorded].copy()
+        last[:, self.measured] = y
+        return np.asarray(self.bank.forget * (last - x[:, self.fallback]))
+
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
-        last = x[:, : self.recorded].copy()
-        last[:, self.measured] = np.where(missing, self.held, last[:, self.measured])
-        offset = bank.forget * (last - x[:, self.fallback])
+        offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))
         count = np.where(missing, self.count + 1, 0.0)
         recovered = np.where(some[:, None], self.age, bank.recovery * self.age)
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))

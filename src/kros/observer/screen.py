@@ -38,8 +38,7 @@ Whole = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
 _ANY = np.finfo(float).max
-
-
+_SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start
 
 
@@ -108,6 +107,17 @@ class Screened:
         held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
         y, u, at = self.y[:, members], self.u[:, members], (slice(None), members)
         return Screened(y, u, self.status[at], self.starts[at], self.complete[at], held)
+
+    def rows(self, part: slice) -> Screened:
+        """Return some samples of all members."""
+        y, u, status, starts, complete = (getattr(self, name)[part] for name in _SIGNALS)
+        return Screened(y, u, status, starts, complete, self.held)
+
+    def after(self, before: Screened) -> Screened:
+        """Return the samples behind earlier ones."""
+        both = (np.concatenate([getattr(before, name), getattr(self, name)]) for name in _SIGNALS)
+        y, u, status, starts, complete = both
+        return Screened(y, u, status, starts, complete, self.held)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
@@ -212,11 +222,11 @@ def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
     return screened(observer, y, u).status
 
 
-def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike) -> Screened:
-    """Return a batch of samples as an observer takes them."""
+def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
+    """Return a batch of samples as an observer takes them; `held` is known before the first."""
     y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
     require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
-    return Screen.of(observer).take(y, u)
+    return Screen.of(observer).take(y, u, held)
 
 
 def _bit(wrong: Flags, bit: SampleStatus) -> Bits:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -179,7 +179,8 @@ def _run(
     innovation = np.zeros(samples.y.shape)
     if loops is not None and len(machines):
         some = samples if len(machines) == batch else samples.of(machines)
-        run = _compiled(loops, observers, some, _of_machines(values, machines), innovations)
+        courses = [Course(o, len(machines), _of_machines(values, machines)) for o in observers]
+        run = _compiled(loops, courses, some, innovations)
         estimates, restarted[:, machines] = run.estimates, run.restarted
         if run.innovation is not None:
             innovation[:, machines] = run.innovation
@@ -193,11 +194,17 @@ def _run(
     for i, each in enumerate(observers):
         machines = np.flatnonzero(restarted[i])
         if len(machines):
-            result.take(i, machines, stepped(each, samples.of(machines), _of_machines(values, machines)))
-    for i in observer.runtime.limited_states(n):
+            course = Course(each, len(machines), _of_machines(values, machines))
+            result.take(i, machines, stepped(course, samples.of(machines)))
+    _limit(observer, estimates)
+    return result
+
+
+def _limit(observer: ObserverData, estimates: Array) -> None:
+    """Bring estimates, (..., n), within their limits, in place."""
+    for i in observer.runtime.limited_states(observer.lifting.n_states):
         low, high = (side if side is None else side[i] for side in (observer.runtime.lower, observer.runtime.upper))
         np.clip(estimates[..., i], low, high, out=estimates[..., i])
-    return result
 
 
 def _one_by_one(observer: ObserverData, samples: Screened) -> Flags:
@@ -240,58 +247,106 @@ class Restarts:
     """Counts down, over a batch of machines, until their starts have settled."""
 
     def __init__(self, guard: Guard | None, batch: int) -> None:
-        self._settle, self._left = 0 if guard is None else guard.settle, np.zeros(batch, dtype=int)
+        self._settle, self.left = 0 if guard is None else guard.settle, np.zeros(batch, dtype=int)
 
     def after(self, waiting: Flags) -> Flags:
         """Return which machines wait for a start after a step, or have not settled since."""
-        restarted = waiting | (self._left > 0)
-        self._left = np.where(waiting, self._settle, np.maximum(self._left - 1, 0))
+        restarted = waiting | (self.left > 0)
+        self.left = np.where(waiting, self._settle, np.maximum(self.left - 1, 0))
         return restarted
 
 
+class Course:
+    """An observer on its way through recordings that come in blocks: all that a block leaves for the next one."""
+
+    def __init__(
+        self, observer: ObserverData, batch: int = 1, parameters: Parameters | None = None, loop: Loop | None = None
+    ) -> None:
+        values: dict[str, Any] = observer.values(parameters, (batch,))
+        if loop is not None:
+            values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
+        self.observer, self.loop, self.values = observer, loop, values
+        self.steps, self.restarts = Steps(observer, batch, values), Restarts(observer.guard, batch)
+        self.since = np.full(batch, -1, dtype=np.intp)  # samples since a start, at most the delay
+        self._before: Screened | None = None  # as many samples as measurements are late
+
+    def take(self, y: Array, u: Array) -> Stepped:
+        """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
+        samples, loops = screened(self.observer, y, u, None if self._before is None else self._before.held), library()
+        run: Stepped | None = None
+        if loops is not None and self._even(samples):
+            result = _compiled(loops, [self], samples)
+            if not result.restarted.any():
+                rest = np.zeros(samples.status.shape, dtype=np.uint8), samples.starts, samples.starts
+                run = Stepped(result.estimates[0], np.empty(0), *rest, np.empty(0))
+        run = stepped(self, samples) if run is None else run
+        _limit(self.observer, run.estimates)
+        return replace(run, status=run.status | samples.status)
+
+    def _even(self, samples: Screened) -> bool:
+        """Whether the compiled loop can run on: nothing waits, settles, fills a gap or follows."""
+        gaps = self.steps.gaps
+        filled = gaps is not None and bool(gaps.age.any() or samples.starts[-1].any())
+        waits = bool(self.steps.waiting.any() or self.restarts.left.any() or _one_by_one(self.observer, samples).any())
+        return self.loop is None and not filled and not waits
+
+    def enter(self, samples: Screened) -> tuple[Screened, int]:
+        """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
+        if self._before is not None:
+            return samples.after(self._before), len(self._before.y)
+        self.steps.begin(samples.y[0], u=np.where(samples.starts[0][:, None], samples.u[0], 0.0))
+        later = samples.starts.copy()
+        later[0] = False
+        return replace(samples, starts=later), 0
+
+    def leave(self, samples: Screened) -> None:
+        """Hold what the next block needs of the samples that `enter` gave."""
+        last = samples.rows(slice(max(0, len(samples.y) - self.observer.runtime.delay), None))
+        self._before = replace(last, y=last.y.copy(), u=last.u.copy(), starts=np.zeros_like(last.starts))
+
+
 @np.errstate(over="ignore", invalid="ignore", divide="ignore")
-def stepped(observer: ObserverData, samples: Screened, values: dict[str, Any], loop: Loop | None = None) -> Stepped:
+def stepped(course: Course, samples: Screened) -> Stepped:
     """Step an observer, which starts again at the first complete sample after it left its bounds."""
-    (n_samples, batch), d = samples.starts.shape, observer.runtime.delay
-    steps, restarts = Steps(observer, batch, values), Restarts(observer.guard, batch)
+    samples, lead = course.enter(samples)
+    (n_samples, batch), observer, loop = samples.starts.shape, course.observer, course.loop
+    steps, values, d = course.steps, course.values, observer.runtime.delay
     x, nu = np.empty((n_samples, batch, observer.lifting.n_states)), np.zeros(samples.y.shape)
-    earlier = np.empty((n_samples, batch, len(observer.lifting.window.earlier)))
+    earlier = np.zeros((n_samples, batch, len(observer.lifting.window.earlier)))
     starts, moving, status = samples.starts.copy(), np.zeros(nu.shape[:2], dtype=bool), np.zeros(nu.shape[:2], np.uint8)
-    since, pending = np.zeros(batch, dtype=np.intp), np.zeros((n_samples, batch), dtype=np.intp)
-    followed = np.empty(nu.shape[:2])
-    steps.begin(samples.y[0])
-    steps.begin(samples.y[0], starts[0], samples.u[0])
-    for k, (y, u) in enumerate(zip(samples.y, samples.u, strict=True)):
-        if k:
-            starts[k] |= steps.waiting & samples.complete[k]
-            pending[k] = np.minimum(since + 1, d)
-            since = np.where(starts[k], 0, pending[k])
+    pending, followed = np.zeros((n_samples, batch), dtype=np.intp), np.empty(nu.shape[:2])
+    x[:lead] = steps.x
+    for k in range(lead, n_samples):
+        y, u = samples.y[k], samples.u[k]
+        starts[k] |= steps.waiting & samples.complete[k]
+        pending[k] = np.minimum(course.since + 1, d)
+        course.since = np.where(starts[k], 0, pending[k])
         x[k] = steps.x
         if d:
             earlier[k] = steps.earlier(samples.u[k - pending[k], np.arange(batch)])
-        if k and starts[k].any():
+        if starts[k].any():
             steps.begin(y, starts[k], u)
             if loop is not None:
                 loop.begin(starts[k])
         nu[k] = np.where(np.isfinite(y), steps.innovation(y), 0.0)
-        moving[k] = (since == d) & ~steps.waiting
+        moving[k] = (course.since == d) & ~steps.waiting
         if loop is None:
             steps.step(y, samples.u[max(k - d, 0)], moving[k])
         else:
             followed[k] = values[loop.name]
             values[loop.name] = loop.step(steps, y, u)
-        status[k][restarts.after(steps.waiting)] = SampleStatus.RESTARTED
+        status[k][course.restarts.after(steps.waiting)] = SampleStatus.RESTARTED
+    course.leave(samples)
     if d:
         _predict(observer, x, earlier, pending, samples, values)
-    return Stepped(x, nu, status, starts, moving, followed)
+    return Stepped(x[lead:], nu[lead:], status[lead:], starts[lead:], moving[lead:], followed[lead:])
 
 
-def _pending(starts: Flags, delay: int) -> Whole:
-    """Samples between a state and the row that it is recorded in, shape (n_samples, batch)."""
-    row = np.arange(len(starts))[:, None]
-    begun = np.maximum.accumulate(np.where(starts, row, 0), axis=0)
-    since = row - np.concatenate([begun[:1] * 0, begun[:-1]])
-    return np.minimum(since, delay)
+def _pending(starts: Flags, delay: int, since: npt.ArrayLike = -1) -> Whole:
+    """Samples between a state and the row that it is recorded in, (n_samples, batch); `since` before the first."""
+    row, first = np.arange(len(starts))[:, None], np.broadcast_to(-1 - np.asarray(since), (1, starts.shape[1]))
+    begun = np.maximum.accumulate(np.where(starts, row, first), axis=0)
+    return np.minimum(row - np.concatenate([first, begun[:-1]]), delay)
 
 
 def _predict(
@@ -318,62 +373,81 @@ class Compiled:
     restarted: Flags  # (observer, batch): whether a machine left its bounds, from where on it stands still
 
 
-def _compiled(
-    loops: Library, observers: Sequence[ObserverData], samples: Screened, values: Parameters, innovations: bool = False
-) -> Compiled:
-    """Run observers of one model in the compiled loop."""
-    observer, delay = observers[0], observers[0].runtime.delay
-    (n_samples, batch), n, m = samples.starts.shape, observer.lifting.n_states, samples.u.shape[2]
-    order, earlier = max(o.controller.n_states for o in observers), len(observer.lifting.window.earlier)
-    states, innovation = np.empty((n_samples, len(observers), n, batch)), None
-    waiting, restarted = np.zeros((2, len(observers), batch), np.uint8)
-    job: dict[str, Any] = {
-        "observers": len(observers),
-        "samples": n_samples,
-        "batch": batch,
-        "order": order,
-        "q": len(observer.measured),
-        "late": delay,
-        "overwrite": int(observer.bank is not None),
-        "map": np.stack([_padded(o, order) for o in observers]),
-        "y": samples.y.swapaxes(1, 2),
-        "u": samples.u.swapaxes(1, 2),
-        "measured": observer.measured,
-        "past": np.zeros((len(observers), batch, earlier)),
-        "fresh": np.ones(batch, np.uint8),
-        "waiting": waiting,
-        "restart": restarted,
-        "states": states,
-    }
-    job["column"] = np.zeros((len(observers), job["map"].shape[2], batch))
-    known = np.where(samples.starts[0][:, None], samples.u[0], 0.0)
-    job["column"][:, :n] = [o.initial(samples.y[0], values, known).T for o in observers]
-    job["low"], job["high"] = np.swapaxes([bounds(o.guard, n, order) for o in observers], 0, 1)
-    job |= _begins(observers, samples, values)
-    if innovations:
-        innovation = job["innovation"] = np.empty(samples.y.shape)
+def _compiled(loops: Library, courses: Sequence[Course], samples: Screened, innovations: bool = False) -> Compiled:
+    """Run observers of one model on in the compiled loop; those that leave their bounds stay where they were."""
+    (samples, lead), *_ = [course.enter(samples) for course in courses]
+    observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
+    (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
+    late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
+    pending, states = np.concatenate(late), np.empty((n_samples, len(observers), n, batch))
+    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
+    innovation = np.empty(samples.y.shape) if innovations else None
+    before = np.empty((n_samples, batch, job["past"].shape[-1]))
+    job |= {} if innovation is None else {"innovation": innovation}
     if delay:
-        pending, before = _pending(samples.starts, delay), np.empty((n_samples, batch, earlier))
         job |= {"moving": (pending == delay) & ~samples.starts, "before": before, "pending": pending}
-    tape = formulas(observer.lifting, tape_of(observer.lifting, m), values, m, batch)
+    tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
     loops.call("kros_relift", tape, ("relift_job", job))
-    estimates = states.transpose(1, 0, 3, 2)
+    estimates, restarted = states.transpose(1, 0, 3, 2), job["restart"].view(bool)
+    for i, course in enumerate(courses):
+        if not restarted[i].any():
+            course.since = np.where(samples.starts[-1], 0, pending[-1])
+            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], estimates[i, -1], samples)
     if delay:
         with np.errstate(over="ignore", invalid="ignore"):
             for o, x in zip(observers, estimates, strict=True):
                 _predict(o, x, before, pending, samples, values)
-    return Compiled(estimates, innovation, restarted.view(bool))
+    return Compiled(estimates[:, lead:], innovation, restarted)
+
+
+def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:
+    """Return what the compiled loop starts from."""
+    observer, order = courses[0].observer, max(c.observer.controller.n_states for c in courses)
+    (n_samples, batch), (n, nl) = samples.starts.shape, (observer.lifting.n_states, observer.lifting.n_lifted)
+    waiting, restarted = np.zeros((2, len(courses), batch), np.uint8)
+    job: dict[str, Any] = {
+        "observers": len(courses),
+        "samples": n_samples,
+        "batch": batch,
+        "order": order,
+        "q": len(observer.measured),
+        "late": observer.runtime.delay,
+        "overwrite": int(observer.bank is not None),
+        "map": np.stack([_padded(c.observer, order) for c in courses]),
+        "y": samples.y.swapaxes(1, 2),
+        "u": samples.u.swapaxes(1, 2),
+        "measured": observer.measured,
+        "past": np.stack([c.steps.past for c in courses]),
+        "fresh": courses[0].steps.fresh.astype(np.uint8),
+        "waiting": waiting,
+        "restart": restarted,
+    }
+    job["low"], job["high"] = np.swapaxes([bounds(c.observer.guard, n, order) for c in courses], 0, 1)
+    job["column"] = np.zeros((len(courses), job["map"].shape[2], batch))
+    for column, course in zip(job["column"], courses, strict=True):
+        column[:n], column[nl : nl + course.steps.x_c.shape[1]] = course.steps.x.T, course.steps.x_c.T
+    return job
+
+
+def _put(course: Course, left: Mapping[str, Array], fresh: Bits, last: Array, samples: Screened) -> None:
+    """Put what the compiled loop left into an observer; `last` is its estimate at the last sample, (batch, n)."""
+    steps, n, nl = course.steps, course.observer.lifting.n_states, course.observer.lifting.n_lifted
+    steps.x, steps.x_c = left["column"][:n].T.copy(), left["column"][nl : nl + steps.x_c.shape[1]].T.copy()
+    steps.past, steps.fresh = left["past"], fresh.view(bool)
+    if steps.gaps is not None:
+        steps.gaps.offset = steps.gaps.apart(last, samples.y[-1])
+    course.leave(samples)
 
 
 def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:
-    """Return the estimates of machines that start after the first sample, and which they are."""
-    rows, machines = np.nonzero(samples.starts[1:])
+    """Return the estimates of machines that start after the first sample of all, and which they are."""
+    rows, machines = np.nonzero(samples.starts)
     if not len(rows):
         return {}
     number = np.zeros(samples.starts.shape, dtype=np.int32)
-    number[rows + 1, machines] = 1 + np.arange(len(rows))
+    number[rows, machines] = 1 + np.arange(len(rows))
     each = {p: np.broadcast_to(np.asarray(v, dtype=float), number.shape[1:])[machines] for p, v in values.items()}
-    first = [o.initial(samples.y[rows + 1, machines], each, samples.u[rows + 1, machines]) for o in observers]
+    first = [o.initial(samples.y[rows, machines], each, samples.u[rows, machines]) for o in observers]
     return {"begin": number, "begun": np.stack(first), "begins": len(rows)}
 
 

@@ -25,33 +25,33 @@ class Steps:
         n = lifting.n_states
         self.observer, self.lifting, self.values = observer, lifting, values
         self._map, self._measured = observer.one_step, list(observer.measured)
-        self.x, self._x_c = np.zeros((batch, n)), np.zeros((batch, order))
-        self._earlier, self._fresh = np.zeros((batch, len(lifting.window.earlier))), np.ones(batch, dtype=bool)
+        self.x, self.x_c = np.zeros((batch, n)), np.zeros((batch, order))
+        self.past, self.fresh = np.zeros((batch, len(lifting.window.earlier))), np.ones(batch, dtype=bool)
         self._low, self._high = bounds(observer.guard, n, order)
         self.waiting = np.zeros(batch, dtype=bool)  # for a start: the next step would leave the bounds
-        self._gaps: Gaps | None = None
+        self.gaps: Gaps | None = None
         if observer.bank is not None:
-            self._gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
+            self.gaps = Gaps(observer.bank, observer.A[:n, :n], observer.measured, len(observer.recorded), batch)
 
     def begin(self, y: Array, machines: Flags | None = None, u: Array | None = None) -> None:
         """Start machines at measurements, (batch, q), and inputs where these are known, (batch, m)."""
         rows: Any = slice(None) if machines is None else machines
         self.x[rows] = self.observer.initial(y, self.values, u)[rows]
-        self._x_c[rows], self._fresh[rows], self.waiting[rows] = 0.0, True, False
-        if self._gaps is not None:
-            self._gaps.begin(rows)
+        self.x_c[rows], self.fresh[rows], self.waiting[rows] = 0.0, True, False
+        if self.gaps is not None:
+            self.gaps.begin(rows)
 
     def place(self, x: Array, earlier: Array) -> None:
         """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
-        self.x[...], self._x_c[...], self._earlier[...] = x, 0.0, earlier
-        self._fresh[:], self.waiting[:] = False, False
+        self.x[...], self.x_c[...], self.past[...] = x, 0.0, earlier
+        self.fresh[:], self.waiting[:] = False, False
 
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
-        if not self._fresh.any():
-            return self._earlier
+        if not self.fresh.any():
+            return self.past
         held = self.lifting.window.hold(self.x, np.broadcast_to(u, (len(self.x), u.shape[-1])))
-        return np.where(self._fresh[:, None], held, self._earlier)
+        return np.where(self.fresh[:, None], held, self.past)
 
     def innovation(self, y: Array) -> Array:
         """Return ``y - C x_hat``, shape (batch, q); not finite where y is not."""
@@ -61,21 +61,21 @@ class Steps:
         """Take measurements, shape (batch, q), not finite where one is missing, and inputs, shape (batch, m)."""
         n, missing = self.lifting.n_states, ~np.isfinite(y)
         u = np.broadcast_to(u, (len(self.x), u.shape[-1]))
-        if self._gaps is not None:
-            self._gaps.fill(self.x, y, missing)
+        if self.gaps is not None:
+            self.gaps.fill(self.x, y, missing)
         y = np.where(missing, self.x[:, self._measured], y)  # what is predicted corrects nothing
-        delays = self._earlier.shape[1] > 0
+        delays = self.past.shape[1] > 0
         window = np.concatenate([self.x, self.earlier(u)], axis=-1) if delays else self.x
         theta, inputs = self.lifting.lift(window, self.values), self.lifting.lift_inputs(u, window, self.values)
-        following = np.concatenate([theta, self._x_c, inputs, y], axis=-1) @ self._map.T
-        if self._gaps is not None:
-            self._gaps.follow(self.x, following[:, :n], missing)
+        following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
+        if self.gaps is not None:
+            self.gaps.follow(self.x, following[:, :n], missing)
         on = self._guarded(following, moving)[:, None]
         np.copyto(self.x, following[:, :n], where=on)
-        np.copyto(self._x_c, following[:, n:], where=on)
+        np.copyto(self.x_c, following[:, n:], where=on)
         if delays:
-            np.copyto(self._earlier, self.lifting.window.advance(window, u), where=on)
-            self._fresh &= ~on[:, 0]
+            np.copyto(self.past, self.lifting.window.advance(window, u), where=on)
+            self.fresh &= ~on[:, 0]
 
     def _guarded(self, following: Array, moving: Flags | None) -> Flags:
         """Return which machines take the step, shape (batch,): none that wait, and none that would leave the bounds."""

@@ -30,7 +30,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError
 from .data import ObserverData
 from .screen import screened
-from .simulate import run_observer, stepped
+from .simulate import Course, run_observer, stepped
 from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
@@ -182,9 +182,7 @@ def track_parameter(
     """
     batch = np.shape(y)[1]
     loop = PhaseLockedLoop(observer, name, batch, settle_s)
-    samples, values = screened(observer, y, u), observer.values(parameters, (batch,))
-    values = {k: np.broadcast_to(np.asarray(v, dtype=float), (batch,)).copy() for k, v in values.items()}
-    run = stepped(observer, samples, values, loop)
+    run = stepped(Course(observer, batch, parameters, loop), screened(observer, y, u))
     return Tracked(observer.runtime.clip_estimate(run.estimates), run.followed, run.status > 0)
 
 

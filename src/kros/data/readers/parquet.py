@@ -36,6 +36,7 @@ from ..checks import Look, check_period, check_structure, refuse_copies, usable_
 from ..population import Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
+from .tables import BLOCK
 
 logger = logging.getLogger(__name__)
 
@@ -99,20 +100,27 @@ class ParquetRecordings(Recordings):
         status = path.stat()
         version = (status.st_ino, status.st_size, status.st_mtime_ns)  # a file written anew is read anew
         known_by = (str(path), version, place, key, self.columns)
-        return Recording(key, _CACHE.take(known_by, lambda: self._values(key, path, version, place)))
+        return Recording(key, _CACHE.take(known_by, lambda: next(self._values(key, path, version, place))))
 
-    def _values(self, key: EpisodeKey, path: Path, version: Version, place: Place) -> Array:
-        """Return the samples of an episode from its file."""
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
+        """Return the samples of an episode in blocks, read one after the other."""
+        path, status = self.file(self.places[key]), self.file(self.places[key]).stat()
+        return self._values(key, path, (status.st_ino, status.st_size, status.st_mtime_ns), self.places[key], rows)
+
+    def _values(
+        self, key: EpisodeKey, path: Path, version: Version, place: Place, rows: int | None = None
+    ) -> Iterator[Array]:
+        """Return the samples of an episode from its file, whole or in blocks."""
         try:
-            table = _read_group(path, version, place, [*KEYS, *self.columns])
-            values = np.empty((table.num_rows, len(self.columns)))
-            for column, channel in enumerate(self.columns):
-                fill(values[:, column], table.column(channel))
-            table.select(KEYS).validate(full=True)
-            for name in KEYS:
-                expected, actual = getattr(key, name), table.column(name).unique().to_pylist()
-                _require(actual == [expected], path, f"the index says {name} {expected!r}, the samples say {actual!r}")
-            return values
+            for table in _read_group(path, version, place, [*KEYS, *self.columns], rows):
+                values = np.empty((table.num_rows, len(self.columns)))
+                for column, channel in enumerate(self.columns):
+                    fill(values[:, column], table.column(channel))
+                table.select(KEYS).validate(full=True)
+                for name in KEYS:
+                    wanted, actual = getattr(key, name), table.column(name).unique().to_pylist()
+                    _require(actual == [wanted], path, f"the index says {name} {wanted!r}, the samples say {actual!r}")
+                yield values
         except DataError:
             raise
         except _ARROW_ERRORS as error:
@@ -128,12 +136,14 @@ def _metadata(path: Path, version: Version) -> Any:
     return parquet.read_metadata(path)
 
 
-def _read_group(path: Path, version: Version, place: Place, columns: list[str]) -> Any:
-    """Read one row group after its length and the types of its columns, pages against their checksums."""
+def _read_group(path: Path, version: Version, place: Place, columns: list[str], rows: int | None) -> Iterator[Any]:
+    """Read one row group, perhaps in blocks, after its length and the types of its columns, pages against checksums."""
+    import pyarrow as pa
     from pyarrow import parquet
 
     _, group, samples = place
-    options: dict[str, Any] = {"memory_map": True, "pre_buffer": False, "page_checksum_verification": True}
+    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+    options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
     with parquet.ParquetFile(path, metadata=_metadata(path, version), **options) as file:
         actual = file.metadata.row_group(group).num_rows
         _require(actual == samples, path, f"{samples} samples are expected in row group {group}, found {actual}")
@@ -144,7 +154,11 @@ def _read_group(path: Path, version: Version, place: Place, columns: list[str]) 
             kind, wanted = str(file.schema_arrow.field(name).type), "text" if name in KEYS else "numbers of type double"
             fits = "string" in kind if name in KEYS else kind == "double"
             _require(fits, path, f"column {name!r} should hold {wanted}, found {kind}")
-        return file.read_row_group(group, columns=columns, use_threads=False)
+        if rows is None:
+            yield file.read_row_group(group, columns=columns, use_threads=False)
+            return
+        for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+            yield pa.Table.from_batches([part])
 
 
 def _require(condition: bool, path: Path, problem: str) -> None:

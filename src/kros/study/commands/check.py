@@ -18,7 +18,7 @@ from ...data.checks import check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer
+from ...observer import Observer, sample_status
 from ...observer.monitor import Monitor
 from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
@@ -33,6 +33,7 @@ from .field import (
     DEPLOYED,
     FieldRecordings,
     check_channels,
+    count_status,
     hidden_states,
     identify_on,
     load_calibration,
@@ -134,13 +135,13 @@ def monitored(recordings: FieldRecordings) -> Rows:
     missing = [name for name in observer.recorded if name not in population.states]
     monitor = observer.monitor
     for unit, condition, keys in population.groups():
-        counts: dict[str, dict[str, int]] = {}
-        judged, samples = Judged(), 0
+        counts, judged, samples = dict[str, int](), Judged(), 0
         for arrived in recordings.batches(keys):
             samples += int(arrived.batch.lengths.sum())
-            recordings.count_status(arrived, counts)
+            status = sample_status(observer, arrived.y, arrived.u)
+            count_status(counts, np.where(np.arange(len(status))[:, None] < arrived.batch.lengths, status, 0))
             if monitor is not None:
-                values = arrived.parameters(observer, list(range(len(arrived.batch.keys))))
+                values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
                 judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
         level = highest_level(monitor, judged, condition)
@@ -150,7 +151,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
         row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "episodes": len(keys), "left_out": []}
         row |= {"recorded_s": samples * population.sample_period_s, "missing": missing}
         row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}
-        rows.append(row | {"samples": counts.get(unit, {}), "parameters": recordings.sources.get(unit)})
+        rows.append(row | {"samples": counts, "parameters": recordings.sources.get(unit)})
     return rows
 
 

@@ -20,10 +20,10 @@ from ...data.population import EpisodeKey
 from ...observer.units import recorded_channel, recorded_factors
 from ..config import Stage
 from ..engine.run_folder import open_finished
-from .field import FieldRecordings
+from .field import FieldRecordings, count_status
 
 Array = npt.NDArray[np.float64]
-Write = Callable[[EpisodeKey, Array], None]
+Write = Callable[[EpisodeKey, int, Array], None]
 ENDINGS = (".parquet", ".csv")
 KEYS = ("unit", "condition", "episode", "k")
 
@@ -41,13 +41,11 @@ def estimate_recordings(
         recordings = FieldRecordings.open(config, store, data, given, track)
         counts: dict[str, dict[str, int]] = {}
         with writer(out, facts_of(recordings)) as write:
-            for arrived in recordings.batches():
-                estimates, followed, status = recordings.estimates(arrived)
-                estimates /= recorded_factors(recordings.observer, recordings.observer.recorded)
-                columns = estimates if followed is None else np.concatenate([estimates, followed[..., None]], axis=-1)
-                for i, key in enumerate(arrived.batch.keys):
-                    write(key, columns[: arrived.batch.lengths[i], i])
-                recordings.count_status(arrived, counts, status)
+            factors = recorded_factors(recordings.observer, recordings.observer.recorded)
+            for key, start, columns, status in recordings.estimates():
+                columns[:, : len(factors)] /= factors
+                write(key, start, columns)
+                count_status(counts.setdefault(key.unit, {}), status)
     count = len(recordings.population.episodes)
     return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
 
@@ -74,7 +72,7 @@ def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
 
 @contextmanager
 def writer(out: Path, facts: dict[str, Any]) -> Iterator[Write]:
-    """Give a function that writes one episode's estimates; the file appears whole or not at all."""
+    """Give a function that writes an episode's estimates from a sample on; the file appears whole or not at all."""
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.partial")
     try:
@@ -94,8 +92,8 @@ def _csv(path: Path, facts: dict[str, Any]) -> Iterator[Write]:
     with path.open("w", newline="") as file:
         rows = csv.writer(file)
         rows.writerow([*KEYS, *facts["columns"]])
-        yield lambda key, values: rows.writerows(
-            [key.unit, key.condition, key.episode, k, *(repr(v) for v in row)] for k, row in enumerate(values.tolist())
+        yield lambda key, start, values: rows.writerows(
+            [key.unit, key.condition, key.episode, k, *map(repr, row)] for k, row in enumerate(values.tolist(), start)
         )
 
 
@@ -118,13 +116,14 @@ def _parquet(path: Path, facts: dict[str, Any]) -> Iterator[Write]:
     schema = pa.schema([*labels, *columns], metadata=metadata)
     with parquet.ParquetWriter(path, schema, write_page_checksum=True) as file:
 
-        def write(key: EpisodeKey, values: Array) -> None:
+        def write(key: EpisodeKey, start: int, values: Array) -> None:
             zeros = pa.array(np.zeros(len(values), np.int32))
             labelled = [
                 pa.DictionaryArray.from_arrays(zeros, pa.array([t])) for t in (key.unit, key.condition, key.episode)
             ]
             numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
-            table = pa.Table.from_arrays([*labelled, pa.array(np.arange(len(values))), *numbers], schema=schema)
+            samples = pa.array(np.arange(start, start + len(values)))
+            table = pa.Table.from_arrays([*labelled, samples, *numbers], schema=schema)
             file.write_table(table, row_group_size=max(len(table), 1))
 
         yield write

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterator, Mapping
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +22,9 @@ from ...data.survey import RecordingFacts
 from ...evaluate.arriving import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import segments_of
-from ...observer import Observer, run_with_status, track_parameter
-from ...observer.screen import Bits, SampleStatus, sample_status
+from ...observer import Observer
+from ...observer.screen import Bits, SampleStatus
+from ...observer.simulate import Course
 from ...observer.tracking import PhaseLockedLoop, least_innovation
 from ..config import StudyConfig, validate_config
 from ..engine.store import Store
@@ -29,8 +33,10 @@ from ..stages.read import ARRAYS
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
+# Episode, first sample, columns of estimates and of the parameter that is followed, bits: of an episode or a block of it
+Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
-_BATCH, _SAMPLES = 64, 200_000  # episodes at a time, and their samples
+_BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
@@ -214,55 +220,72 @@ class FieldRecordings:
 
     def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
-        chosen, seen = list[EpisodeKey](), 0
+        chosen, values = dict[EpisodeKey, Array](), self.values[unit]
         for key in self.population.keys(unit)[:_BATCH]:
-            if seen < samples:
-                chosen, seen = [*chosen, key], seen + len(self.population.read(key))
-        values = self.values[unit]
-        arrived = arriving(self.observer, self.population, tuple(chosen), {unit: values}, samples)
+            if sum(map(len, chosen.values())) < samples:
+                chosen[key] = next(self.population.blocks(key, samples))
+        arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
         coarse = least_innovation(*signals, np.arange(phases) * step)
         return float(np.mod(least_innovation(*signals, coarse + np.linspace(-1, 1, 9) * step), 2 * np.pi))
 
-    def batches(self, keys: tuple[EpisodeKey, ...] | None = None) -> Iterator[Arriving]:
+    @cached_property
+    def _parameters(self) -> Values:
+        return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
+
+    def batches(self, keys: tuple[EpisodeKey, ...]) -> Iterator[Arriving]:
         """Read episodes, long ones one by one, so that memory does not grow with their number."""
-        keys = keys or self.population.episodes
-        values = {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
         start, count = 0, 1
         while start < len(keys):
-            batch = arriving(self.observer, self.population, keys[start : start + count], values)
+            episodes = {key: self.population.read(key) for key in keys[start : start + count]}
+            batch = arriving(self.observer, self.population, episodes, self._parameters)
             start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
             yield batch
 
-    def estimates(self, arrived: Arriving) -> tuple[Array, Array | None, Bits]:
-        """Run the observer; return estimates, the parameter that is followed, and the bits of every sample's status."""
-        observer, n, units = self.observer, len(self.observer.recorded), arrived.batch.units
-        estimates, status = np.empty((*arrived.y.shape[:2], n)), sample_status(observer, arrived.y, arrived.u)
-        rows = [i for i, unit in enumerate(units) if unit in self.followed]
-        others = [i for i in range(len(units)) if i not in rows]
-        if others:
-            parameters = arrived.parameters(observer, others)
-            x, status[:, others] = run_with_status(observer, arrived.y[:, others], arrived.u[:, others], parameters)
-            estimates[:, others] = x[..., :n]
-        if self.name is None:
-            return estimates, None, status
-        followed = np.tile(arrived.batch.parameters[self.name], (len(arrived.y), 1))
-        if rows:
-            parameters = arrived.parameters(observer, rows)
-            tracked = track_parameter(observer, arrived.y[:, rows], arrived.u[:, rows], parameters, self.name)
-            estimates[:, rows], followed[:, rows] = tracked.estimates[..., :n], tracked.values
-            status[:, rows] |= np.where(tracked.restarted, np.uint8(SampleStatus.RESTARTED), np.uint8(0))
-        return estimates, followed, status
+    def estimates(self) -> Iterator[Estimated]:
+        """Run the observer over all episodes: short ones side by side, long ones in blocks."""
+        short: dict[EpisodeKey, Array] = {}
+        for key in self.population.episodes:
+            blocks = self.population.blocks(key, _BLOCK)
+            first, second = next(blocks), next(blocks, None)
+            full = (len(short) + 1) * max(len(first), *map(len, short.values()), 0) > _SAMPLES or len(short) == _BATCH
+            others = any((key.unit in self.followed) != (other.unit in self.followed) for other in short)
+            if short and (second is not None or full or others):
+                yield from self._run(tuple(short), [list(short.values())])
+                short = {}
+            if second is None:
+                short[key] = first
+            else:
+                yield from self._run((key,), ([block] for block in chain((first, second), blocks)))
+        if short:
+            yield from self._run(tuple(short), [list(short.values())])
 
-    def count_status(self, arrived: Arriving, counts: dict[str, dict[str, int]], status: Bits | None = None) -> None:
-        """Add to the samples of every unit that are missing, invalid, beyond limits, or restart the observer."""
-        status = sample_status(self.observer, arrived.y, arrived.u) if status is None else status
-        for i, (unit, length) in enumerate(zip(arrived.batch.units, arrived.batch.lengths, strict=True)):
-            of_unit = counts.setdefault(unit, {})
-            for bit in SampleStatus:
-                if number := int(np.count_nonzero(status[:length, i] & bit)):
-                    of_unit[str(bit.name)] = of_unit.get(str(bit.name), 0) + number
+    def _run(self, keys: tuple[EpisodeKey, ...], blocks: Iterable[list[Array]]) -> Iterator[Estimated]:
+        """Run over episodes, block by block, each behind the samples that late measurements are read from."""
+        observer, n, start, course = self.observer, len(self.observer.recorded), 0, None
+        loop = PhaseLockedLoop(observer, str(self.name), len(keys)) if keys[0].unit in self.followed else None
+        late = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0))
+        before = [np.empty((0, len(self.population.channels)))] * len(keys)
+        for block in blocks:
+            values, lead = [np.concatenate(pair) for pair in zip(before, block, strict=True)], len(before[0])
+            arrived = arriving(observer, self.population, dict(zip(keys, values, strict=True)), self._parameters)
+            course = course or Course(observer, len(keys), arrived.parameters(observer), loop)
+            run = course.take(arrived.y[lead:], arrived.u[lead:])
+            columns = run.estimates[..., :n]
+            if self.name is not None:
+                known = arrived.batch.parameters[self.name] if loop is None else run.followed
+                columns = np.concatenate([columns, np.broadcast_to(known, columns.shape[:2])[..., None]], axis=-1)
+            for i, key in enumerate(keys):
+                yield key, start, columns[: len(block[i]), i], run.status[: len(block[i]), i]
+            start, before = start + len(block[0]), [part[max(0, len(part) - late) :] for part in values]
+
+
+def count_status(counts: dict[str, int], status: Bits) -> None:
+    """Add to the samples that are missing, invalid, beyond limits, or restart the observer."""
+    for bit in SampleStatus:
+        if number := int(np.count_nonzero(status & bit)):
+            counts[str(bit.name)] = counts.get(str(bit.name), 0) + number
 
 
 def _trackable(observer: Observer, name: str) -> bool:

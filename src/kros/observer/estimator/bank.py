@@ -1,10 +1,10 @@
-r"""The bank: delays and first-order lags of channels, and decaying impulses at the start.
+r"""The bank: delays and first-order lags of channels, and the decaying values of the first sample.
 
 For a channel v the bank holds
 
 .. math:: v_k, \quad m_i - m_{i+1}, \quad l_k = a l_{k-1} + (1 - a) v_k, \quad a = e^{-1/\tau},
 
-with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau}`. Before the first
+with blocks of delays :math:`0 = t_0 < t_1 < \dots`, and for the start :math:`e^{-k/\tau} [1, v_0]`. Before the first
 sample everything is taken to equal it. As a system with all delays, :math:`\xi_k = A \xi_{k-1} + B v_k`,
 :math:`\xi_{-1} = S v_0` (v ends with the constant channel 1), it is stable.
 """
@@ -48,14 +48,20 @@ class Bank:
 
     def __len__(self) -> int:
         moving = self.channels - 1
-        return moving + self.delayed * (len(self.taps) - 2) + moving * len(self.lags) + len(self.starts) + 1
+        return (
+            moving
+            + self.delayed * (len(self.taps) - 2)
+            + moving * len(self.lags)
+            + self.channels * len(self.starts)
+            + 1
+        )
 
     @property
     def channel(self) -> npt.NDArray[np.int64]:
         """Channel of every entry, shape (len(self),)."""
-        moving, last = np.arange(self.channels - 1), np.array([self.channels - 1])
+        every, moving = np.arange(self.channels), np.arange(self.channels - 1)
         blocks = [moving[: self.delayed]] * (len(self.taps) - 2)
-        return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[last] * (len(self.starts) + 1)])
+        return np.concatenate([moving, *blocks, *[moving] * len(self.lags), *[every] * len(self.starts), every[-1:]])
 
     def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
@@ -70,19 +76,27 @@ class Bank:
         for tau in self.lags:
             a = np.exp(-1 / tau)
             parts.append(lfilter([1 - a], [1, -a], moving, axis=0, zi=a * moving[:1])[0][at])
-        parts += [np.exp(-at / tau)[:, None] for tau in self.starts]
+        parts += [np.exp(-at / tau)[:, None] * v[0] for tau in self.starts]
         return np.hstack([*parts, np.ones((len(at), 1))])
+
+    def sizes(self, rms: Array) -> Array:
+        """Return the sizes of entries, their RMS; for the start that of its constant, since machines start at rest."""
+        size, count = rms.copy(), len(self.starts) * self.channels
+        size[-1 - count : -1] = np.repeat(rms[-1 - count : -1].reshape(-1, self.channels)[:, -1], self.channels)
+        return np.maximum(size, 1e-9 * size.max())
 
     def trust(self, settings: EstimatorSettings) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
         linear = np.arange(self.channels - 1) < self.linear
         own = np.where(linear, 0.0, settings.nonlinear_trust)
+        first = np.append(np.where(linear, settings.linear_trust, settings.start_trust), 0.0)
         parts = [
             own,
             *[own[: self.delayed]] * (len(self.taps) - 2),
             *[own] * len(self.lags),
+            *[first] * len(self.starts),
         ]
-        return np.concatenate([*parts, np.zeros(len(self.starts) + 1)])
+        return np.concatenate([*parts, [0.0]])
 
     @property
     def fine(self) -> Bank:
@@ -119,7 +133,8 @@ class Bank:
             A[rows, rows], B[rows, range(moving)], S[rows, range(moving)] = a, 1 - a, 1.0
             place += moving
         for tau in self.starts:
-            A[place, place], S[place, -1] = np.exp(-1 / tau), np.exp(1 / tau)
-            place += 1
+            rows, a = np.arange(place, place + c), np.exp(-1 / tau)
+            A[rows, rows], S[rows, range(c)] = a, 1 / a
+            place += c
         B[-1, -1] = S[-1, -1] = 1.0
         return A, B, S

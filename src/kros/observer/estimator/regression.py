@@ -206,8 +206,7 @@ class Whitening:
     def of(cls, design: Design) -> Whitening:
         """Find the directions from thinned rows."""
         X, weights = design.sample()
-        size = np.sqrt(weights @ (X * X))
-        size = np.maximum(size, 1e-9 * size.max())
+        size = design.bank.sizes(np.sqrt(weights @ (X * X)))
         trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
             moved = (design.sample(bias)[0] - X) / size * np.sqrt(weights)[:, None]

@@ -109,7 +109,8 @@ def load_observer(
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     bank = {"dense": settings.delays, "longest": settings.delays}
-    estimator = EstimatorSettings(**bank, first_lag=lag, last_lag=lag / recordings.length)
+    lags = {"first_lag": lag, "last_lag": lag / recordings.length}
+    estimator = EstimatorSettings(**bank, **lags, linear_trust=1e-6, start_trust=1e-2)  # the start shows the friction
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator

@@ -72,14 +72,13 @@ def tried(run: Path, observer: Observer, settle: int, seed: int) -> tuple[np.nda
     population, identified = read_parquet(run / facts["recordings"]), IdentifiedModels.load(run)
     keys = [key for key in identified.facts.test if key.unit in identified.parameters]
     rng = np.random.default_rng(seed)
-    chosen = [keys[i] for i in rng.integers(0, len(keys), AT_ONCE)]
-    batch = EpisodeBatch.read(population, chosen, LONGEST, identified.parameters)
-    batch = batch.head(int(batch.lengths.min()))
+    batch = EpisodeBatch.read(population, keys, LONGEST, identified.parameters)
+    batch = batch.head(int(batch.lengths.min())).take(rng.integers(0, len(keys), AT_ONCE).tolist())
     n, y = len(population.states), batch.states[..., list(observer.measured)]
     samples, first = len(y), len(y) // 2
     again = 1 + -(-max(0, settle + 1 - first) // samples)  # the episode follows itself, until the observer has settled
     y, u = (np.tile(signals, (again, 1, 1)) for signals in (y, batch.inputs))
-    lost = np.stack([pattern(rng, len(y), first) for _ in chosen], axis=1)
+    lost = np.stack([pattern(rng, len(y), first) for _ in range(AT_ONCE)], axis=1)
     values = observer.own(batch.parameters)
     undisturbed = run_observer(observer, y, u, values)
     estimate = run_observer(observer, np.where(lost[..., None], np.nan, y), u, values)

@@ -194,22 +194,20 @@ def ranges_of(
     return found
 
 
-def first_estimate(channels: Channels, recordings: Recordings) -> tuple[Array, Array]:
-    """Return the maps (n, channels) to the first state from all channels of the first sample, and from inputs alone."""
-    blind = channels.without_measurements()
-    v, w, x = [], [], []
+def first_estimate(channels: Channels, recordings: Recordings) -> Array:
+    """Return the map (n, channels) from all channels of the first sample to the first state."""
+    v, x = [], []
     for key in recordings.keys:
         batch = recordings.read(key)
         y, u = batch.measurements(channels.measured)[0], batch.inputs[0]
         v.append(channels.signals(y, u, batch.parameters)[0])
-        w.append(blind.signals(y, u, batch.parameters)[0])
         x.append(batch.states[0, 0])
     units = np.array([key.unit for key in recordings.keys])
     some = np.array([*range(channels.linear), len(channels) - 1])
     found = np.zeros((x[0].size, len(channels)))
     found[:, some] = _ridge(np.array(v)[:, some], np.array(x), units).T
     found[list(channels.measured)] = np.eye(len(channels.measured), len(channels))
-    return found, _ridge(np.array(w), np.array(x), units).T
+    return found
 
 
 def _ridge(X: Array, T: Array, units: npt.NDArray[Any]) -> Array:
@@ -239,7 +237,7 @@ def assembled(
     channels: Channels,
     filters: Filters,
     fallback: Filters,
-    first: tuple[Array, Array],
+    first: Array,
     sample_period_s: float,
     parameters: Mapping[str, float],
     reach: Array,
@@ -263,10 +261,10 @@ def assembled(
     ):
         model[rows[:, None], states], model[rows[:, None], np.array(inputs_of)] = system
     for rows, inputs_of, first_of in (
-        (x, places, first[0]),
+        (x, places, first),
         (z, places, filters.S),
         (w, blind, fallback.S),
-        (u, blind, first[1]),
+        (u, blind, fallback.C @ fallback.S + fallback.D),  # as if it had run before: no step at the start
     ):
         start[rows[:, None], np.array(inputs_of)] = first_of
     model[at, at] += 1.0

@@ -33,15 +33,11 @@ def training(
     return states, shown, inputs, {k: np.concatenate([b.parameters[k] for b in batches]) for k in names}
 
 
-def forgetting(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> Array:
-    """Return the factor rho of every recorded state by which its distance from the estimate of inputs alone decays."""
-    states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
-    n, at = len(observer.recorded), list(observer.measured)
-    estimates = run_observer(observer, shown[..., at], inputs, observer.own(parameters))
-    apart = states - estimates[..., -n:]
-    lags = np.unique(np.geomspace(1, max(2, len(states) // 4), 12).round().astype(int))
-    rhos = np.append(np.exp(-1 / np.geomspace(1, 4 * len(states), 40)), 1.0)
-    score = np.zeros((len(rhos), n))
+def forgetting(apart: Array) -> Array:
+    """Return the factors (n,) by which distances (n_samples, batch, n) from the estimate of inputs alone decay."""
+    lags = np.unique(np.geomspace(1, max(2, len(apart) // 4), 12).round().astype(int))
+    rhos = np.append(np.exp(-1 / np.geomspace(1, 4 * len(apart), 40)), 1.0)
+    score = np.zeros((len(rhos), apart.shape[-1]))
     for lag in lags:
         now, later = apart[:-lag], apart[lag:]
         a, b, c = (np.mean(x, axis=(0, 1)) for x in (later * later, later * now, now * now))
@@ -72,18 +68,17 @@ def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSet
     missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
     half = np.full(n, _NEVER)
     half[at] = settings.half * longest
-    forget, recovery = (
-        forgetting(observer, recordings, settings),
-        np.exp(-1 / (longest * np.array(settings.recoveries))),
-    )
-    silent = replace(observer, bank=replace(bank, forget=forget, half=half))
-    y = np.where(missing[..., None], np.nan, shown[..., at])
-    estimates = run_observer(silent, y, inputs, observer.own(parameters))
+    y, own = shown[..., at], observer.own(parameters)
+    forget = forgetting(states - run_observer(observer, y, inputs, own)[..., -n:])
+    recovery = np.exp(-1 / (longest * np.array(settings.recoveries)))
+    bank = replace(bank, forget=forget, half=half)
+    lost = np.where(missing[..., None], np.nan, y)
+    estimates = run_observer(replace(observer, bank=bank), lost, inputs, own)
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(longest * np.array(settings.halves), recovery))
     errors = blended_errors(states, estimates[..., :n], estimates[..., -n:], missing, forget, T, mu)
     best = np.argmin(errors, axis=0)
     half, recovery = np.where(half == _NEVER, T[best, 0], half), mu[best, 0]
-    return replace(bank, forget=forget, half=half, recovery=recovery)
+    return replace(bank, half=half, recovery=recovery)
 
 
 def blended_errors(

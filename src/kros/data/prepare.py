@@ -55,7 +55,7 @@ class PreparedSource:
         return recording.values
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
-        """Return one prepared episode in blocks of so many samples; read whole where steps or the format ask for it."""
+        """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
         blocks = None
         if isinstance(self.recordings, Recordings) and not self.steps:
             blocks = self.recordings.blocks(key, rows)

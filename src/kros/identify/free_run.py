@@ -1,4 +1,4 @@
-"""Free run of lifted models: from a first state and recorded inputs alone, retracted and re-lifted at every step.
+"""Simulation of lifted models from a first state and recorded inputs alone, retracted and re-lifted at every step.
 
 The definition is the *local error* of the paper's section III: the lifted state always has the structure of a lifting.
 """

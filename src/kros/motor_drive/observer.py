@@ -44,6 +44,7 @@ class LoadSettings:
     corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
     limit: float | None = None  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
+    start_trust: float = 1e-6  # of the estimator; the load of the first sample is in its tracking error
 
 
 def load_observer(
@@ -109,8 +110,8 @@ def load_observer(
     recordings = Recordings.of(visible.keys, lambda k: visible.take([place[k]]).head(int(lengths[place[k]])))
     lag = settings.level_s / batch.sample_period_s
     bank = {"dense": settings.delays, "longest": settings.delays}
-    lags = {"first_lag": lag, "last_lag": lag / recordings.length}
-    estimator = EstimatorSettings(**bank, **lags, linear_trust=1e-6, start_trust=1e-2)  # the start shows the friction
+    lags = {"first_lag": lag, "last_lag": lag / recordings.length, "start_trust": settings.start_trust}
+    estimator = EstimatorSettings(**bank, **lags)
     with_load = replace(lifting, states=(*lifting.states, LOAD))
     result = identify_estimator(
         name, with_load, tuple(measured), inputs, recordings, batch.sample_period_s, None, estimator

@@ -61,7 +61,7 @@ class Number:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What stands at the head of the report."""
+    """The head of the report."""
 
     status: Status
     sentence: str

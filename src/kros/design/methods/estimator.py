@@ -18,7 +18,7 @@ from ..task import Design, DesignTask, Method
 
 @dataclass(frozen=True)
 class Estimator(Method):
-    """Regression on filtered measurements and inputs; declared sensors are in its training episodes, a bias in its errors."""
+    """Regression on filtered measurements and inputs; it is trained with the declared sensors."""
 
     name: ClassVar[str] = "estimator"
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)

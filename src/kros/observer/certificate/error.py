@@ -164,7 +164,8 @@ class ErrorSystem:
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' of the frozen response to the rest of the error.
 
-        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p``, ``p = d (M r + E p + q')``.
+        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p`` with
+        ``p = d (M r + E p + q')``.
         """
         width = self.L.shape[1]
         return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
@@ -255,7 +256,7 @@ class _Assembly:
         return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, start)
 
     def late(self, after: Array) -> list[Array]:
-        """Return what follows with a delay: the measured error, its residuals, the latest first, and the predicted one."""
+        """Return what follows with a delay: measured error, its residuals, latest first, and predicted error."""
         width, inside = len(self.slots), [i for i in self.slots if i < self.n]
         held = [self.rows(0, self.h + self.order + i * width, width) for i in range(self.delay)]
         enters, arriving = np.eye(self.h)[:, self.slots], np.zeros((width, sum(self.sizes)))

@@ -8,7 +8,3 @@ Examples
 >>> EstimatorSettings(first_lag=500.0).lags(6000)
 (300.0, 600.0)
 """
-
-from .build import Identified
-
-__all__ = ["Identified"]

@@ -89,7 +89,7 @@ class Bank:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
         linear = np.arange(self.channels - 1) < self.linear
         own = np.where(linear, 0.0, settings.nonlinear_trust)
-        first = np.append(np.where(linear, settings.linear_trust, settings.start_trust), 0.0)
+        first = np.append(np.full(self.channels - 1, settings.start_trust), 0.0)
         parts = [
             own,
             *[own[: self.delayed]] * (len(self.taps) - 2),

@@ -28,22 +28,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """An estimator with its readout, its family of channels, and facts for the records.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import EstimatorSettings, Recordings, identify_estimator
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> recordings = Recordings.of(list(motors.keys()), lambda key: EpisodeBatch.read(motors, [key]))
-    >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
-    >>> lifting = Lifting(motors.states)
-    >>> found = identify_estimator("motor", lifting, (0,), motors.inputs, recordings, 0.001, settings=few)
-    >>> sorted(found.facts["left_out_percent"])
-    ['current', 'velocity']
-    """
+    """An estimator with its readout, its family of channels, and facts for the records."""
 
     observer: Observer
     readout: Readout
@@ -92,8 +77,8 @@ def identify_estimator(
     >>> few = EstimatorSettings(rows=2000, sample=1000, dense=4, longest=8)
     >>> lifting = Lifting(motors.states)
     >>> found = identify_estimator("motor", lifting, (0,), motors.inputs, recordings, 0.001, settings=few)
-    >>> found.observer.recorded
-    ('position', 'velocity', 'current')
+    >>> found.observer.recorded, sorted(found.facts["left_out_percent"])
+    (('position', 'velocity', 'current'), ['current', 'velocity'])
     """
     settings, measured = settings or EstimatorSettings(), tuple(measured)
     n = lifting.n_states

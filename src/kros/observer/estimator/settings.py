@@ -47,12 +47,11 @@ class EstimatorSettings(Settings):
     directions: int = Field(
         400, ge=10, description="principal directions of the bank that the regression sees, at most"
     )
-    linear_trust: float = Field(1.0, ge=0, description="relative error of a linear start value: rows with target zero")
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )
     start_trust: float = Field(
-        1.0, ge=0, description="relative error of a nonlinear start value: rows with target zero"
+        1.0, ge=0, description="relative error of a value of the first sample: rows with target zero"
     )
     order: int | None = Field(
         None, ge=1, description="states of the filters after reduction; by default as `loss` needs"

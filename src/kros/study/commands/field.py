@@ -33,7 +33,7 @@ from ..stages.read import ARRAYS
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
-# Episode, first sample, columns of estimates and of the parameter that is followed, bits: of an episode or a block of it
+# Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
 _BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer

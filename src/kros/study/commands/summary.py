@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from ...core.artifacts import load_artifact, read_json
+from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.verdict import judge
 from ..config import Stage
@@ -36,12 +37,16 @@ def ranking(facts: Facts) -> list[str]:
     lines = ["observers by mean error on held-out episodes, percent of the largest value:", head]
     for name in names:
         cells = [table.cells[name].get(c) for c in hidden]
-        texts = ["–" if c is None else "diverged" if c.mean is None else f"{c.mean:.4g}" for c in cells]
+        texts = ["–" if c is None else _error(c) for c in cells]
         mark = "  <- deployed" if name == facts.deployed else ""
         lines.append(
             f"{name:<{width}}  " + "".join(f"{t:>{wide[c]}}" for t, c in zip(texts, hidden, strict=True)) + mark
         )
     return lines
+
+
+def _error(cell: ErrorCell) -> str:
+    return "diverged" if cell.mean is None else f"{cell.mean:.4g}"
 
 
 def list_run(run: Path) -> list[str]:

@@ -281,7 +281,9 @@ def coupled(future: Signals, past: Signals) -> float:
     best = 0.0
     for _ in range(30):
         # The signals that are worst at the level that is proven prove a higher one (a Rayleigh quotient).
-        form = cross + Z / best if best > 0 else cross if cross.any() else Z
+        form = cross if cross.any() else Z
+        if best > 0:
+            form = cross + Z / best
         c = root @ np.linalg.eigh(root.T @ form @ root)[1][:, -1]
         c *= np.sign(c @ cross @ c) or 1.0
         inner = max(float(c @ cross @ c / 2 - np.abs(c[:r]) @ rounding @ np.abs(c[r:])), 0.0)

@@ -75,8 +75,9 @@ clean:  ## remove .venv and everything that was built
 	find src tests benchmarks examples -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # --upgrade: the newest versions that hold for every supported Python, not those locked before.
+# --no-strip-extras: pip takes a pin of "coverage" for none of "coverage[toml]", and a newer coverage for it.
 LOCK = $(CLEAN_ENV) "$$uv" pip compile -q --upgrade --universal --fork-strategy fewest --python-version 3.11 --generate-hashes \
-	--no-emit-index-url --no-emit-find-links --custom-compile-command "make lock" pyproject.toml
+	--no-emit-index-url --no-emit-find-links --no-strip-extras --custom-compile-command "make lock" pyproject.toml
 
 # Sets the shell variable `python`, or says what to install. A launcher on the PATH may exist and yet not run, so each is tried.
 PYTHONS = $(if $(PYTHON),"$(PYTHON)",python3.13 python3.12 python3.11 python3 python)

@@ -30,7 +30,7 @@ def test_slopes_are_those_of_finite_differences() -> None:
     sections, tau = some_sections(), np.geomspace(1e-3, 1e3, 40)
     owner = sections.owner
     far = (-50.0, 50.0)
-    slope = differences(lambda x: sections.moved(x, far).logs(tau)[owner].ravel(), len(owner)).reshape(
+    slope = differences(lambda x: sections.at(sections.parameters + x, far).logs(tau)[owner].ravel(), len(owner)).reshape(
         len(owner), len(owner), 40
     )
     np.testing.assert_allclose(np.einsum("iif->if", slope), sections.slopes(tau), atol=1e-8)

@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.uncertainty import fit_magnitude
-from kros.uncertainty.weights.pencils import invert
+from kros.uncertainty.weights.proof import invert
 
 DT = 1e-3
 FREQS = np.geomspace(500e-6, 500.0, 1000)

@@ -18,7 +18,7 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
-from .weights.certificate import Method
+from .weights.proof import Method
 from .weights.cover import Cover
 from .weights.weight import Weight
 

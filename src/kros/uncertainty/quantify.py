@@ -17,15 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
-from ..core.errors import IdentificationError
+from ..core.errors import ConfigError, IdentificationError
 from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .bounded import Options, bound_responses, bound_systems
+from .bounded import bound_responses, bound_systems
 from .forms import Form, as_form, residual
-from .inputs import read_response_data
+from .inputs import Options, read_response_data
 from .model import ResponseUncertainty, UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel
@@ -195,11 +195,11 @@ def quantify(
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
     if isinstance(models, list | tuple) and models and all(hasattr(model, "frdata") for model in models):
-        models, freqs_hz = read_response_data(models, freqs_hz, options)
-    read = Options.of(options)
-    if isinstance(models, np.ndarray):
-        return bound_responses(models, as_form(form), freqs_hz, read)
-    return bound_systems(models, as_form(form), freqs_hz, read)
+        if freqs_hz is not None:
+            raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
+        models, freqs_hz = read_response_data(models, options)
+    bound = bound_responses if isinstance(models, np.ndarray) else bound_systems
+    return bound(models, as_form(form), freqs_hz, Options.of(options))
 
 
 def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:

@@ -21,7 +21,7 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
 from .settings import SET
-from .weights.cover import Cover, cover_ratio
+from .weights.cover import Cover
 from .weights.entries import fit_entries
 from .weights.weight import Weight
 
@@ -87,7 +87,7 @@ def unit_residuals(
         raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
-    sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
+    sizes, ratio = np.abs(E), cover.ratio(E)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
     rows = np.flatnonzero(inside)  # at most 200 of the covered units, evenly spread, and all others
     some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, dense_response, gain
-from .certificate import Method
 from .cover import Cover
+from .proof import Method
 
 Array = npt.NDArray[Any]
 
@@ -39,7 +39,7 @@ class Weight:
     within_tolerance : bool
         Whether the overbound of the weight as returned is within the tolerance at every frequency of the grid.
     method : Method
-        How the bound between grid points is known, see `certificate`.
+        How the bound between grid points is known, see `proof`.
 
     Examples
     --------

@@ -104,7 +104,7 @@ Flagged units are no longer dropped by a study itself; name them under data.excl
 Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions and uncertainty_to_control for the result.
     kros.interop.quantify_models
-Variation and noise are no longer an object; use noise_share, or the noise_share of a run.
+Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
     kros.uncertainty.VariationAndNoise kros.uncertainty.variation_and_noise
 What the fit of a weight is made of is no longer public; use quantify.
     kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover

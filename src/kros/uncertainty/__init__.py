@@ -20,7 +20,6 @@ from .nominal import NominalChoice, choose_nominal
 from .outliers.model import OutlierModel, score_outliers
 from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
-from .variation import VariationAndNoise, variation_and_noise
 from .weights.cover import Cover
 from .weights.magnitude import FittedMagnitude, fit_magnitude
 from .weights.weight import Weight
@@ -35,7 +34,6 @@ __all__ = [
     "ResponseUncertainty",
     "UncertainModel",
     "UncertainModels",
-    "VariationAndNoise",
     "Weight",
     "bounds",
     "choose_nominal",
@@ -46,7 +44,6 @@ __all__ = [
     "residual",
     "score_outliers",
     "sigma_max",
-    "variation_and_noise",
 ]
 
 __getattr__ = refusing(__name__)

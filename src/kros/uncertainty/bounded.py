@@ -64,7 +64,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
         (base, units),
         proven=axis is None,
     )
-    bound = _bound(residuals, freqs, axis or system.dt, options)
+    bound = _bound(residuals, freqs, axis, system.dt, options)
     return UncertainModel(nominal_system=chosen, **_fields(ids, index, freqs, scales, choices, bound))
 
 
@@ -88,12 +88,12 @@ def bound_responses(
     choices = {other: choose_nominal(units, other) for other in Form}
     index = -1 if given else options.row(ids, choices[form].index)
     chosen = np.asarray(nominal) if given else G[index]
-    base, time = (chosen / scales[0][:, None] * scales[1])[None], dt or BilinearAxis.over(freqs)
-    at = freqs if dt else time.discrete_hz(freqs)
+    base, axis = (chosen / scales[0][:, None] * scales[1])[None], None if dt else BilinearAxis.over(freqs)
+    at = freqs if axis is None else axis.discrete_hz(freqs)
     residuals = Residuals(
         form, lambda f: _between(at, base, f)[0], lambda f, rows: _between(at, units[rows], f), np.arange(len(ids))
     )
-    fields = _fields(ids, index, freqs, scales, choices, _bound(residuals, freqs, time, options))
+    fields = _fields(ids, index, freqs, scales, choices, _bound(residuals, freqs, axis, dt, options))
     fields["certificate"], fields["unresolved_hz"] = _certificate(freqs, fields["bounds"][form])
     return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, **fields)
 
@@ -124,25 +124,25 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
     return np.asarray(values[:, left] * (1 - share) + values[:, right] * share)
 
 
-def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, options: Options) -> dict[str, Any]:
+def _bound(
+    residuals: Residuals, freqs_hz: Array, axis: BilinearAxis | None, dt: float, options: Options
+) -> dict[str, Any]:
     """Return bound, cover, weight, misfit, and cover and weight of the remainder where the form leaves one."""
-    axis = time if isinstance(time, BilinearAxis) else None
     freqs = freqs_hz if axis is None else axis.discrete_hz(freqs_hz)
-    target = Target(time if axis is None else axis.period_s, options.max_order, options.tolerance_db)
+    target = Target(dt if axis is None else axis.period_s, options.max_order, options.tolerance_db)
     weight, cover = fit_weight(residuals, freqs, target)
     G, ratios, largest, form = residuals.nominal(freqs), [], [], residuals.form
     for rows in residuals.blocks():
         E = residuals.of(rows).at(freqs)
         ratios.append(misfit(form, G, residuals.units(freqs, rows), E))
         largest.append(sigma_max(E).max(axis=0))
-    bound = {"bound": np.max(largest, axis=0), "cover": cover, "weight": weight, "misfit": np.concatenate(ratios)}
+    bound: dict[str, Any] = {"form": form, "bound": np.max(largest, axis=0), "misfit": np.concatenate(ratios)}
+    bound |= {"weight": weight, "cover": cover}
     if _leaves_out(form, bound["misfit"]):
-        remainder, bound["remainder_cover"] = fit_weight(replace(residuals, remainder=True), freqs, target)
-        bound["remainder"] = remainder
+        bound["remainder"], bound["remainder_cover"] = fit_weight(replace(residuals, remainder=True), freqs, target)
     if axis is not None:
-        weights = {name: bound[name].mapped(axis.continuous) for name in ("weight", "remainder") if name in bound}
-        bound |= weights
-    return bound | {"form": form}
+        bound |= {name: bound[name].mapped(axis.continuous) for name in ("weight", "remainder") if name in bound}
+    return bound
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:

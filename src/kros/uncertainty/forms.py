@@ -211,12 +211,10 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     return ratio
 
 
-def completion(
-    form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None
-) -> tuple[Array, Array]:
+def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> tuple[Array, Array]:
     """Return residuals, zero where an inverse form is near singular, and the remainder."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
-    E = residual(form, G, Gp) if E is None else E
+    E = residual(form, G, Gp)
     if form.inverse:
         regular = condition_number(inverted_matrix(form, G, E)) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)

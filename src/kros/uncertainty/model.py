@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
-from .weights.proof import Method
 from .weights.cover import Cover
+from .weights.proof import Method
 from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
@@ -161,7 +161,8 @@ class UncertainModel(Uncertainty):
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
         arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
-        arrays |= _pack_system("nominal", self.nominal_system) | _pack_weight("weight", self.weight, self.cover)
+        arrays |= {f"nominal_{x}": getattr(self.nominal_system, x) for x in "ABCD"}
+        arrays |= _pack_weight("weight", self.weight, self.cover)
         content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
@@ -187,12 +188,17 @@ class UncertainModel(Uncertainty):
         if content["remainder"] is not None:
             facts["remainder"], facts["remainder_cover"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
         facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
-        return cls(nominal_system=_unpack_system("nominal", arrays, dt), cover=cover, weight=weight, **facts)
+        return cls(
+            nominal_system=_unpack_system("nominal", arrays, dt),
+            cover=cover,
+            weight=weight,
+            **facts,
+        )
 
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "within_tolerance", "method")
+_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "method")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
@@ -204,18 +210,15 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
 
 
-def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
-    return {f"{name}_{x}": getattr(system, x) for x in "ABCD"}
-
-
 def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace:
     A, B, C, D = (arrays[f"{name}_{x}"] for x in "ABCD")
     return StateSpace(A, B, C, D, dt)
 
 
 def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
-    packed = _pack_system(f"{name}_left", weight.left) | _pack_system(f"{name}_right", weight.right)
-    return packed | {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+    packed: dict[str, Array] = {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+    sides = (("left", weight.left), ("right", weight.right))
+    return packed | {f"{name}_{side}_{x}": getattr(system, x) for side, system in sides for x in "ABCD"}
 
 
 def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:

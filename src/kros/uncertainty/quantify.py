@@ -7,18 +7,17 @@ model
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.errors import ConfigError, IdentificationError
-from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
@@ -26,7 +25,7 @@ from ..identify.identified import IdentifiedModels, Stored
 from .bounded import bound_responses, bound_systems
 from .forms import Form, as_form, residual
 from .inputs import Options, read_response_data
-from .model import ResponseUncertainty, UncertainModel
+from .model import UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
@@ -35,7 +34,7 @@ from .settings import QuantifySettings
 Array = npt.NDArray[Any]
 
 _KIND = "choice"
-_FACTS = ("nominal", "worst_off_nominal", "max_order", "pooled")
+_FACTS = ("nominal", "worst_off_nominal")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,10 +53,6 @@ class UncertainModels:
         Outlier scores, one row a unit and condition.
     outliers : mapping of str to OutlierModel
         By place of the models in `models.sets`.
-    max_order : int
-        Highest order of a weight.
-    pooled : bool
-        Whether observers whose nominal need not be a unit may have the mean of the units' models.
 
     Examples
     --------
@@ -74,8 +69,6 @@ class UncertainModels:
     sets: Mapping[str, UncertainModel]
     scores: tuple[dict[str, Any], ...] = ()
     outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
-    max_order: int = 4
-    pooled: bool = True
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
@@ -115,19 +108,6 @@ class UncertainModels:
         return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
 
 
-@overload
-def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels: ...
-@overload
-def quantify(
-    models: Array, form: Form | str = ..., freqs_hz: npt.ArrayLike | None = None, **options: Any
-) -> ResponseUncertainty: ...
-@overload
-def quantify(
-    models: StateSpace | ModelSet | Sequence[Any] | Mapping[str, Any],
-    form: Form | str = ...,
-    freqs_hz: npt.ArrayLike | None = None,
-    **options: Any,
-) -> UncertainModel: ...
 def quantify(
     models: Any,
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
@@ -222,8 +202,6 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         sets=sets,
         scores=tuple(scores),
         outliers=outliers,
-        max_order=settings.max_order,
-        pooled=settings.nominal is None,
     )
 
 

@@ -30,10 +30,7 @@ class UncertaintySettings(Settings):
 class QuantifySettings(UncertaintySettings):
     """What `kros.quantify` takes beside models; a study has the defaults of what is no key of it."""
 
-    nominal: str | None = Field(
-        None,
-        description="a unit; by default the best one, and observers that are free to may have the mean of the units",
-    )
+    nominal: str | None = Field(None, description="a unit; by default the one with the lowest peak residual")
     max_order: int = Field(4, ge=1, le=8, description="largest order of an entry of a weight")
     tolerance_db: float = Field(1.0, gt=0, description="how far a weight may be above the bound of the residuals")
     false_alarm_rate: float = Field(1e-2, gt=0, lt=1, description="probability that a unit like the others is flagged")
@@ -119,7 +116,6 @@ class OutlierRule:
     largest_percent: float = 900.0  # change of gain, ten times as large, at which a unit has to show
     percent: float = 1.0  # change of an entry from which the smallest change that shows is extrapolated
     changed: int = 12  # units at most, whose entries are changed
-    same: float = 1e-9  # relative difference of the Gram matrices of one recording, read twice
     recorded: float = 0.5  # of the middle unit's samples: the variance of an estimate is at most twice the usual one
 
 

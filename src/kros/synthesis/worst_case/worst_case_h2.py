@@ -147,7 +147,9 @@ def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
     orders, bounds = sorted({min(order, max_order) for order in _BOUND_ORDERS}), []
     for order, spectrum in product(orders, spectra):
-        shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, max_order=order, tolerance_db=0.0), "below"), spectrum)
+        shaping = proofs.lowered(
+            apart.shaping(spectrum, partial(fit, max_order=order, tolerance_db=0.0), "below"), spectrum
+        )
         plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
         squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
         bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))

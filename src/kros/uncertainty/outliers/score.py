@@ -7,11 +7,20 @@ flagged; where that is more than anybody would call a defect, nothing is said ab
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from ..forms import Form
 from ..settings import OUTLIER
+from .distances import Distances, scaled_levels
+from .tail import Flags, excesses
+
+Array = npt.NDArray[Any]
 
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
 FEWEST_UNITS = OUTLIER.fewest
@@ -47,18 +56,15 @@ class OutlierScore:
     outlier : bool
     freq_hz : float, Hz
         Where the unit's level is largest.
-    entry : tuple of int
-        Row and column of the residual's largest entry there, relative to its typical size.
     excess_db : float, dB
         What the unit's largest level has beyond the largest of the other inliers; negative for all units but one
         inlier.
     lowest_db, highest_db : float, dB
         Range of the excess over all choices of one nominal unit.
     status : Status
-    detectable_db : float, dB
-        What the excess would have to be for the unit to be flagged; infinite where nothing could be.
     detectable_percent : float
-        Smallest change of gain of one entry of the response that is an excess of that size somewhere, to first order.
+        Smallest change of gain of one entry of the response by which the unit would be flagged, to first order;
+        infinite where nothing could be.
     detectable_hz : float, Hz, or None
         Where that is; None where `detectable_percent` is infinite.
     detectable_entry : tuple of int
@@ -83,12 +89,10 @@ class OutlierScore:
     threshold_db: float
     outlier: bool
     freq_hz: float
-    entry: tuple[int, int]
     excess_db: float
     lowest_db: float
     highest_db: float
     status: Status = Status.CANNOT_TELL
-    detectable_db: float = float("inf")
     detectable_percent: float = float("inf")
     detectable_hz: float | None = None
     detectable_entry: tuple[int, int] = (0, 0)
@@ -96,9 +100,78 @@ class OutlierScore:
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
-        """Return a score as it was before it became JSON, which knows neither infinity nor tuples."""
+        """Return a score as it was before it became JSON, which has neither infinity nor tuples."""
         values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
-        unknown = [name for name, value in values.items() if value is None and name != "detectable_hz"]
-        values |= dict.fromkeys(unknown, float("inf"))
-        values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
-        return cls(**values | {"threshold_db": threshold_db, "status": Status(content["status"])})
+        if values["detectable_percent"] is None:
+            values["detectable_percent"] = float("inf")
+        entry, status = tuple(values["detectable_entry"]), Status(values["status"])
+        return cls(**values | {"threshold_db": threshold_db, "status": status, "detectable_entry": entry})
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Units and their distances; units are scored against the inliers among them.
+
+    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
+    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
+    first order, so what it takes to reach the bound follows in percent.
+    """
+
+    form: Form
+    responses: Array  # (unit, frequency, p, m), scaled
+    freqs_hz: Array
+    distances: Distances
+    inliers: Flags
+
+    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
+        """Return scores of the units with margins, whose names are given."""
+        levels, units = self.distances.levels, np.array(list(margin_db))
+        excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))
+        lowest, highest = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)
+        freqs, scores = self.freqs_hz[levels.argmax(axis=1)], []
+        for unit, name in zip(units, ids, strict=True):
+            value, margin = float(excess[unit]), margin_db[int(unit)]
+            known = bool(np.isfinite(threshold) and np.isfinite(margin))
+            score = OutlierScore(
+                unit=name,
+                score_db=threshold + margin if known else value,
+                threshold_db=threshold,
+                outlier=known and margin > 0,
+                freq_hz=float(freqs[unit]),
+                excess_db=value,
+                lowest_db=float(lowest[unit]),
+                highest_db=float(highest[unit]),
+            )
+            scores.append(self._detectable(score, int(unit), value - margin) if known else score)
+        return tuple(scores)
+
+    def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
+        """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
+        cover = float(self.distances.levels[unit].max()) - score.excess_db
+        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
+        i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
+        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
+        if score.outlier:
+            status = Status.OUTLIER
+        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
+            status = Status.OK
+        return replace(
+            score,
+            status=status,
+            detectable_percent=smallest,
+            detectable_hz=float(self.freqs_hz[row]),
+            detectable_entry=(i, j),
+        )
+
+    @cached_property
+    def _changes(self) -> Array:
+        """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
+        G = self.responses[self.inliers]
+        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
+        levels = np.empty((*G.shape[2:], G.shape[1]))
+        for i, j in np.ndindex(*G.shape[2:]):
+            changed = G.copy()
+            changed[:, :, i, j] *= 1 + OUTLIER.percent / 100
+            shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
+            levels[i, j] = np.median(shifted, axis=0)
+        return levels

@@ -50,7 +50,7 @@ def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[W
         weight, proof = fit.again(missed), None
     proof = proof or _proven(residuals, weight, fit.checked_hz)
     cover = _raised(fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz)), residuals, freqs_hz)
-    return _lifted(weight, proof).measured(freqs_hz, cover, target.tolerance_db), cover
+    return _lifted(weight, proof).measured(freqs_hz, cover), cover
 
 
 def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:

@@ -231,7 +231,10 @@ class _Grid:
             spread = float(ratio.max() / ratio.min())
             if spread >= gamma * MAGNITUDE.settled:
                 break
-            best, settled = RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots), spread < MAGNITUDE.exact
+            best, settled = (
+                RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots),
+                spread < MAGNITUDE.exact,
+            )
             gamma, scale = spread, d
         return best
 

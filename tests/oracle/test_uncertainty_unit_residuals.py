@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from kros.uncertainty import Cover, Form
+from kros.uncertainty import Form
 from kros.uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from kros.uncertainty.weights.cover import Cover
 from kros.uncertainty.weights.entries import fit_entries
 
 DT = 1e-2

@@ -101,6 +101,10 @@ max_order, tolerance_db and false_alarm_rate.
     uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate
 Flagged units are no longer dropped by a study itself; name them under data.exclude.
     uncertainty.drop_outliers
+Classes of single results of quantification are no longer public; use what quantify, choose_nominal, fit_magnitude and
+score_outliers return.
+    kros.uncertainty.Cover kros.uncertainty.FittedMagnitude kros.uncertainty.NominalChoice kros.uncertainty.OutlierScore
+    kros.uncertainty.Weight
 Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions and uncertainty_to_control for the result.
     kros.interop.quantify_models

@@ -16,25 +16,17 @@ from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
 from .forms import Form, bounds, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal import NominalChoice, choose_nominal
+from .nominal import choose_nominal
 from .outliers.model import OutlierModel, score_outliers
-from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
-from .weights.cover import Cover
-from .weights.magnitude import FittedMagnitude, fit_magnitude
-from .weights.weight import Weight
+from .weights.magnitude import fit_magnitude
 
 __all__ = [
-    "Cover",
-    "FittedMagnitude",
     "Form",
-    "NominalChoice",
     "OutlierModel",
-    "OutlierScore",
     "ResponseUncertainty",
     "UncertainModel",
     "UncertainModels",
-    "Weight",
     "bounds",
     "choose_nominal",
     "fit_magnitude",

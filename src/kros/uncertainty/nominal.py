@@ -19,19 +19,10 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class NominalChoice:
-    """Best nominal of one form: the row of the chosen unit, and the largest residual over the others, (frequency,).
+    """Best nominal of one form."""
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import choose_nominal
-    >>> choice = choose_nominal(np.array([0.8, 1.0, 1.1]).reshape(3, 1, 1, 1), "additive")
-    >>> choice.index, choice.bound.round(9).tolist()
-    (1, [0.2])
-    """
-
-    index: int
-    bound: Array
+    index: int  # row of the chosen unit
+    bound: Array  # (frequency,): largest residual over the other units
 
 
 def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
@@ -46,6 +37,7 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     Returns
     -------
     NominalChoice
+        With ``index``, the row of the unit, and ``bound``, the largest residual over the others, shape (frequency,).
 
     Raises
     ------
@@ -59,8 +51,9 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     >>> import numpy as np
     >>> from kros.uncertainty import choose_nominal
     >>> gains = np.array([1.0, 2.0, 9.0]).reshape(3, 1, 1, 1) + 0j
-    >>> choose_nominal(gains, "additive").index
-    1
+    >>> choice = choose_nominal(gains, "additive")
+    >>> choice.index, choice.bound.tolist()
+    (1, [7.0])
     """
     form, G = as_form(form), check_responses(responses)
     broken = ~np.isfinite(G).all(axis=(1, 2, 3))

@@ -39,20 +39,7 @@ _FACTS = ("nominal", "worst_off_nominal")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainModels:
-    """What `kros.quantify` returns.
-
-    Parameters
-    ----------
-    models : IdentifiedModels
-        Where it comes from, with the recordings.
-    nominal, worst_off_nominal : str
-        Units: the one that all others are compared with, and the one farthest from it.
-    sets : mapping of str to UncertainModel
-        By kind of model.
-    scores : tuple of dict
-        Outlier scores, one row a unit and condition.
-    outliers : mapping of str to OutlierModel
-        By place of the models in `models.sets`.
+    """What `kros.quantify` returns for models of `kros.identify`.
 
     Examples
     --------
@@ -63,12 +50,12 @@ class UncertainModels:
     (['linear_edmd'], True)
     """
 
-    models: IdentifiedModels
-    nominal: str
-    worst_off_nominal: str
-    sets: Mapping[str, UncertainModel]
-    scores: tuple[dict[str, Any], ...] = ()
-    outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
+    models: IdentifiedModels  # with the recordings
+    nominal: str  # unit that all others are compared with
+    worst_off_nominal: str  # the unit farthest from it
+    sets: Mapping[str, UncertainModel]  # by kind of model
+    scores: tuple[dict[str, Any], ...] = ()  # outlier scores, one row a unit and condition
+    outliers: Mapping[str, OutlierModel] = field(default_factory=dict)  # by place of the models in `models.sets`
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)

@@ -8,9 +8,10 @@ import numpy as np
 
 from ...core.errors import ConfigError
 from ...identify import ModelSet
-from ...uncertainty import Cover, Form, UncertainModel, bounds
+from ...uncertainty import Form, UncertainModel, bounds
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals
+from ...uncertainty.weights.cover import Cover
 from ..canvas import (
     Array,
     Axes,

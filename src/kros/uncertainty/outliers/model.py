@@ -8,16 +8,14 @@ the largest of the others:
     level_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
     excess_i   = max_f level_i(f) - max_(k != i) max_f level_k(f),    dB
 
-No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is
-computed with every unit as the only nominal, as the paper states its criterion: the range over the nominals, and the
-share of them under which the unit is conspicuous.
+No single nominal decides; beside the excess stands its range over every unit as the only nominal, as the paper states
+its criterion.
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold
 rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
-extrapolation, and labelled as such. Units are taken out one at a time while they are beyond (`separation`), up to a
-third of the units. Fewer than eight units flag nothing and decide nothing; two units are refused. All this compares
-estimates that are equally good: units that were recorded for too little are told apart before (`recorded`). What a
-score would have shown stands beside it (`scoring`, `score`).
+extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
+units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
+recorded for too little are left open before (`recorded`). What a score would have shown stands beside it (`score`).
 """
 
 from __future__ import annotations
@@ -72,11 +70,9 @@ class OutlierModel:
     --------
     >>> import numpy as np
     >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> model = score_outliers(responses[:, :, None, None], freqs_hz)
-    >>> model.score("new", 1.5 * responses[0][:, None, None]).outlier
+    >>> gains = 1 + 0.02 * np.random.default_rng(0).normal(size=(20, 1, 1, 1))
+    >>> responses = gains / (1 + 1j * np.geomspace(0.1, 40, 20)[:, None, None])
+    >>> score_outliers(responses, np.geomspace(0.1, 40, 20)).score("new", 1.5 * responses[0]).outlier
     True
     """
 
@@ -94,30 +90,13 @@ class OutlierModel:
     def score(
         self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
     ) -> OutlierScore:
-        """Score a new unit.
+        """Score a new unit by its response (frequency, p, m) at `freqs_hz`, in physical units.
 
-        Parameters
-        ----------
-        unit : str
-        response : array_like, shape (frequency, p, m), complex
-            At `freqs_hz`, in physical units.
-        without : collection of str
-            Inliers that are not compared with, such as the unit itself.
-        motion_db : ndarray, shape (frequency,), dB, optional
-            Level by which responses of one unit differ between motions (`motion_levels`), where the unit was moved
-            otherwise than the inliers: it is taken from the unit's levels, in amplitude, and a unit that is beyond its
-            bound without this alone has the status ``other motions``.
-
-        Returns
-        -------
-        OutlierScore
-
-        Raises
-        ------
-        DimensionError
-            When the response does not have the shape of the population's.
-        DataError
-            When it is not finite, or fewer than two inliers are left.
+        Inliers that are named in `without`, such as the unit itself, are not compared with. Where the unit was moved
+        otherwise than the inliers, the level by which responses of one unit differ between motions, `motion_levels`, is
+        taken from the unit's levels, in amplitude: a unit that is beyond its bound without this alone has the status
+        ``other motions``. Raises a `DimensionError` or `DataError` for a response that is not finite or not like the
+        population's, and where fewer than two inliers are left.
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < 2:
@@ -232,10 +211,10 @@ def score_outliers(
     --------
     >>> import numpy as np
     >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = np.append(1 + 0.02 * rng.normal(size=20), 1.5), 5 + 0.2 * rng.normal(size=21)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> [score.unit for score in score_outliers(responses[:, :, None, None], freqs_hz).scores if score.outlier]
+    >>> gains, freqs_hz = np.random.default_rng(0).normal(1, 0.02, size=(21, 1, 1, 1)), np.geomspace(0.1, 40, 20)
+    >>> gains[20] = 1.5
+    >>> model = score_outliers(gains / (1 + 1j * freqs_hz[:, None, None]), freqs_hz)
+    >>> [score.unit for score in model.scores if score.outlier]
     ['20']
     """
     G, ids, freqs = _population(responses, unit_ids, freqs_hz)

@@ -46,57 +46,23 @@ class Status(StrEnum):
 class OutlierScore:
     """How far one unit exceeds the others.
 
-    Parameters
-    ----------
-    unit : str
-    score_db : float, dB
-        The excess, referred to the threshold: the thresholds of units that went out earlier in the search differ, and
-        the difference is added to their excess, so that one threshold serves all units.
-    threshold_db : float, dB
-    outlier : bool
-    freq_hz : float, Hz
-        Where the unit's level is largest.
-    excess_db : float, dB
-        What the unit's largest level has beyond the largest of the other inliers; negative for all units but one
-        inlier.
-    lowest_db, highest_db : float, dB
-        Range of the excess over all choices of one nominal unit.
-    status : Status
-    detectable_percent : float
-        Smallest change of gain of one entry of the response by which the unit would be flagged, to first order;
-        infinite where nothing could be.
-    detectable_hz : float, Hz, or None
-        Where that is; None where `detectable_percent` is infinite.
-    detectable_entry : tuple of int
-        Output and input of the entry.
-    more_data : float
-        How many times as long the unit would have to be recorded; one where the recordings suffice.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> score = score_outliers(responses[:, :, None, None], freqs_hz).scores[0]
-    >>> score.unit, score.score_db < score.threshold_db, score.outlier
-    ('0', True, False)
+    The thresholds of units that went out earlier in the search differ; the difference is added to their excess, so that
+    one threshold serves all units.
     """
 
     unit: str
-    score_db: float
+    score_db: float  # the excess, referred to the threshold
     threshold_db: float
     outlier: bool
-    freq_hz: float
-    excess_db: float
-    lowest_db: float
+    freq_hz: float  # where the unit's level is largest
+    excess_db: float  # of the largest level over that of the other inliers; negative for all units but one inlier
+    lowest_db: float  # range of the excess over all choices of one nominal unit
     highest_db: float
     status: Status = Status.CANNOT_TELL
-    detectable_percent: float = float("inf")
-    detectable_hz: float | None = None
-    detectable_entry: tuple[int, int] = (0, 0)
-    more_data: float = 1.0
+    detectable_percent: float = float("inf")  # smallest change of gain of one entry that would be flagged, first order
+    detectable_hz: float | None = None  # where that is; None where nothing could be flagged
+    detectable_entry: tuple[int, int] = (0, 0)  # output and input
+    more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:

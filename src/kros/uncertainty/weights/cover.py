@@ -34,24 +34,10 @@ _STEP = np.cbrt(np.finfo(float).eps)  # nepers, of differences
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """Magnitudes of a cover.
+    """Magnitudes of a cover; one right entry is one at every frequency: the scale between left and right is free."""
 
-    Parameters
-    ----------
-    left : ndarray, shape (frequency, p')
-    right : ndarray, shape (frequency, m')
-        One entry is one at every frequency: the scale between left and right is free.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import Cover
-    >>> Cover(left=np.array([[0.2]]), right=np.array([[1.0]])).entries().ravel().tolist()
-    [0.2]
-    """
-
-    left: Array
-    right: Array
+    left: Array  # (frequency, p')
+    right: Array  # (frequency, m')
 
     def at(self, rows: Array) -> Cover:
         """Return the cover at some frequencies."""

@@ -40,31 +40,15 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class FittedMagnitude:
-    """A system whose magnitude bounds data.
+    """A system whose magnitude bounds data."""
 
-    Parameters
-    ----------
-    system : StateSpace
-        One input, one output, stable and minimum phase.
-    order : int
-    overbound_db : float, dB
-        Largest distance between the system's magnitude and the data; the smallest is zero.
-    within_tolerance : bool
-        Whether `overbound_db` is within the tolerance.
+    system: StateSpace  # one input, one output, stable and minimum phase
+    overbound_db: float  # largest distance between the system's magnitude and the data; the smallest is zero
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import fit_magnitude
-    >>> freqs_hz = np.geomspace(0.1, 50, 30)
-    >>> fit_magnitude(freqs_hz, 1 / (1 + freqs_hz / 5), 0.01, max_order=2).within_tolerance
-    True
-    """
-
-    system: StateSpace
-    order: int
-    overbound_db: float
-    within_tolerance: bool
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.system.n_states
 
 
 def fit_magnitude(
@@ -92,6 +76,8 @@ def fit_magnitude(
     Returns
     -------
     FittedMagnitude
+        With ``system``, ``order`` and ``overbound_db``. The bound holds at the given frequencies, for the system as
+        returned; between them the fit is smooth, and positive.
 
     Raises
     ------
@@ -101,10 +87,6 @@ def fit_magnitude(
         A negative order, or frequencies that are no grid.
     KrosError
         When no program of any order could be solved.
-
-    Notes
-    -----
-    The bound holds at the given frequencies, for the system as returned. Between them the fit is smooth, and positive.
 
     Examples
     --------
@@ -121,11 +103,11 @@ def fit_magnitude(
     if max_order < 0:
         raise ConfigError(f"Magnitude fit: max_order should not be negative, found {max_order}.")
     if not values.any():
-        return FittedMagnitude(gain([[0.0]], dt), 0, 0.0, True)
+        return FittedMagnitude(gain([[0.0]], dt), 0.0)
     for bound in rising_bounds(bilinear_squared(freqs, dt), values, max_order):
-        fitted = _touching(bound, freqs, values, dt, tolerance_db)
+        fitted = _touching(bound, freqs, values, dt)
         best = fitted if best is None or fitted.overbound_db < best.overbound_db else best
-        if best.within_tolerance:
+        if best.overbound_db <= tolerance_db:
             break
     if best is None:
         raise KrosError("Magnitude fit: no program of any order was solved; look at the magnitudes.")
@@ -162,13 +144,13 @@ def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Boun
             break
 
 
-def _touching(bound: Bound, freqs: Array, values: Array, dt: float, tolerance_db: float) -> FittedMagnitude:
+def _touching(bound: Bound, freqs: Array, values: Array, dt: float) -> FittedMagnitude:
     """Return the system of a bound, scaled until it touches the values as evaluated."""
     (system,) = bound.sections.systems(dt)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
-    touch, overbound_db = (1 + 1e-12) / ratio.min(), float(20 * np.log10(ratio.max() / ratio.min()))
+    touch = (1 + 4 * np.finfo(float).eps) / ratio.min()
     lifted = StateSpace(system.A, system.B, system.C * touch, system.D * touch, dt)
-    return FittedMagnitude(lifted, system.n_states, overbound_db, overbound_db <= tolerance_db)
+    return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
 
 
 def _best(tau: Array, targets: Array, order: int, gamma: float) -> RationalMagnitude | None:

@@ -21,43 +21,15 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False)
 class Weight:
-    """Stable, minimum-phase diagonal weights that cover a set of residuals.
+    """Stable, minimum-phase diagonal weights that cover a set of residuals."""
 
-    Parameters
-    ----------
-    left : StateSpace
-        W_L, p' inputs and outputs.
-    right : StateSpace
-        W_R, m' inputs and outputs.
-    left_orders, right_orders : tuple of int
-        Order of every diagonal entry.
-    cover_max : float
-        Largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid, for the weights as used; at most one.
-    overbound_db_max : float, dB
-        Largest excess over the grid of `mean_i log left_i + mean_j log right_j`, by which covers are compared, over the
-        optimal cover.
-    method : Method
-        How the bound between grid points is known, see `proof`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import StateSpace
-    >>> from kros.uncertainty import quantify
-    >>> gains = np.array([0.9, 1.0, 1.2])[:, None, None]
-    >>> units = StateSpace(np.full((3, 1, 1), 0.5), gains, np.ones((3, 1, 1)), np.zeros((3, 1, 1)), 0.01)
-    >>> weight = quantify(units, "output_multiplicative").weight
-    >>> weight.left_orders, weight.cover_max <= 1
-    ((0,), True)
-    """
-
-    left: StateSpace
-    right: StateSpace
-    left_orders: tuple[int, ...]
+    left: StateSpace  # W_L, p' inputs and outputs
+    right: StateSpace  # W_R, m' inputs and outputs
+    left_orders: tuple[int, ...]  # of every diagonal entry
     right_orders: tuple[int, ...]
-    cover_max: float
-    overbound_db_max: float
-    method: Method = Method.GRID
+    cover_max: float  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid, as used; at most one
+    overbound_db_max: float  # dB: largest excess of `Cover.cost_db` over the optimal cover
+    method: Method = Method.GRID  # how the bound between grid points is known, see `proof`
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""

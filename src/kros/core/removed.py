@@ -105,6 +105,8 @@ Classes of single results of quantification are no longer public; use what quant
 score_outliers return.
     kros.uncertainty.Cover kros.uncertainty.FittedMagnitude kros.uncertainty.NominalChoice kros.uncertainty.OutlierScore
     kros.uncertainty.Weight
+Bounds of residuals over every nominal are no longer a function; use sigma_max of residual, or choose_nominal.
+    kros.uncertainty.bounds
 Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions and uncertainty_to_control for the result.
     kros.interop.quantify_models

@@ -14,7 +14,7 @@ Examples
 
 from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
-from .forms import Form, bounds, misfit, rebuild, residual
+from .forms import Form, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel, score_outliers
@@ -27,7 +27,6 @@ __all__ = [
     "ResponseUncertainty",
     "UncertainModel",
     "UncertainModels",
-    "bounds",
     "choose_nominal",
     "fit_magnitude",
     "misfit",

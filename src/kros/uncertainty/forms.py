@@ -21,7 +21,6 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
@@ -142,38 +141,6 @@ def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) 
     form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
     product = E @ G if form is Form.INVERSE_ADDITIVE else E
     return np.eye(product.shape[-1]) - product
-
-
-def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals: Sequence[int] | None = None) -> Array:
-    """Return the largest residual over the other units, for every nominal asked for.
-
-    Parameters
-    ----------
-    form : Form or str
-    responses : ndarray, shape (unit, frequency, p, m), complex
-        In scaled coordinates.
-    paper : bool
-        The published pipeline's variants.
-    nominals : sequence of int, optional
-        All units by default.
-
-    Returns
-    -------
-    ndarray, shape (nominal, frequency)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import bounds
-    >>> responses = np.array([1.0, 1.1, 0.8]).reshape(3, 1, 1, 1)  # unit, frequency, output, input
-    >>> bounds("additive", responses).round(9).ravel().tolist()
-    [0.2, 0.3, 0.3]
-    """
-    form, G = as_form(form), check_responses(responses)
-    rows = range(len(G)) if nominals is None else nominals
-    others = (np.delete(G, j, axis=0) for j in rows)
-    sizes = (sigma_max(residual(form, G[j], Gp, paper=paper)) for j, Gp in zip(rows, others, strict=True))
-    return np.array([size.max(axis=0, initial=0.0) for size in sizes])
 
 
 def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None = None) -> Array:

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
-from ..core.small_matrices import squared
+from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, residual
 from .settings import OUTLIER, SET
@@ -40,6 +40,7 @@ class NoiseShare:
     freqs_hz: Array  # (frequency,), Hz
     total: Array  # (frequency,): mean squared Frobenius norm of residuals between units
     noise: Array  # (frequency,): the same between resampled models of one unit
+    largest: Array  # (frequency,): largest singular value of the residuals against the nominal unit
 
     @property
     def ratio(self) -> Array:
@@ -47,8 +48,8 @@ class NoiseShare:
         return np.divide(self.noise, self.total, out=np.where(self.noise > 0, np.inf, 0.0), where=self.total > 0)
 
     def facts(self) -> dict[str, float]:
-        """Return the median share, and the share where units differ most."""
-        share, top = np.minimum(self.ratio, 1.0), int(self.total.argmax())
+        """Return the median share, and the share where units differ most from the nominal one."""
+        share, top = np.minimum(self.ratio, 1.0), int(self.largest.argmax())
         return {"median": float(np.median(share)), "at_peak": float(share[top]), "peak_hz": float(self.freqs_hz[top])}
 
     def save(self, folder: Path) -> None:
@@ -56,7 +57,9 @@ class NoiseShare:
         save_artifact(Path(folder), "noise_share", self.facts())
 
 
-def noise_share(models: ModelSamples, scale: Array, freqs_hz: Array, sample_period_s: float, form: Form) -> NoiseShare:
+def noise_share(
+    models: ModelSamples, scale: Array, freqs_hz: Array, sample_period_s: float, form: Form, nominal: int = 0
+) -> NoiseShare:
     """Compare the residuals between units with those between resampled models, of responses divided by `scale`."""
     (units, draws, _, n), m = models.samples.A.shape, models.samples.B.shape[-1]
     if units < 2 or draws < 2:
@@ -74,7 +77,8 @@ def noise_share(models: ModelSamples, scale: Array, freqs_hz: Array, sample_peri
             noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
     nominals = np.unique(np.linspace(0, units - 1, min(units, SET.nominals)).round().astype(int))
     between = np.mean([_mean_square(residual(form, G[k], G)) for k in nominals], axis=0)
-    return NoiseShare(freqs_hz, between * units / (units - 1), noise)
+    largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)
+    return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)
 
 
 def _mean_square(E: Array) -> Array:

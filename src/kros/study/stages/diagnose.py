@@ -74,21 +74,23 @@ def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
 
 
 def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], NoiseShare]]:
-    """Compare variation and noise over some units; not with single episodes."""
+    """Compare variation and noise over some units, the nominal one among them; not with single episodes."""
     units = uncertain.unit_ids
-    chosen = [units[k] for k in np.unique(np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).astype(int))]
+    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
+    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
     models = context.identified.models(name)
     try:
         samples = resampling(context, name, chosen)
     except KrosError as error:
         log.info("%s: variation and noise are not separated: %s", name, error)
         return
-    yield partial(_compared, samples, models, uncertain.form)
+    yield partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
 
 
-def _compared(samples: Callable[[], Any], models: ModelSet, form: Form) -> NoiseShare:
+def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
     scale = models.output_scale[:, None] / models.input_scale
-    return noise_share(samples(), scale, models.frequencies(DEFAULT.noise_points), models.sample_period_s, form)
+    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
+    return noise_share(samples(), scale, freqs, dt, form, nominal)
 
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:

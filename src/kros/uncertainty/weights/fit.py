@@ -39,16 +39,16 @@ def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[W
     """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`."""
     few, grid = residuals.deciding(freqs_hz), checking_grid(freqs_hz, target.sample_period_s)
     fit = _Fit(few, residuals, freqs_hz, few.modes_hz(grid), target)
-    weight, proof = fit.start(), None
+    weight = fit.start()
+    proof = _proven(residuals, weight, fit.checked_hz)
     for _ in range(FIT.rounds):
-        missed = fit.missed(weight)
-        if not missed.size:
-            proof = _proven(residuals, weight, fit.checked_hz)
-            if proof.bound <= FIT.deficit:
-                break
-            missed = proof.missed_hz
-        weight, proof = fit.again(missed), None
-    proof = proof or _proven(residuals, weight, fit.checked_hz)
+        if proof.bound <= FIT.deficit:
+            break
+        weight = fit.again(proof.missed_hz)
+        proof = _proven(residuals, weight, fit.checked_hz)
+    else:
+        weight = weight.scaled(proof.bound)
+        proof = _proven(residuals, weight, fit.checked_hz)
     cover = _raised(fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz)), residuals, freqs_hz)
     return _lifted(weight, proof).measured(freqs_hz, cover), cover
 
@@ -100,17 +100,6 @@ class _Fit:
         self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db)
         return self._weight(self.fitted)
 
-    def missed(self, weight: Weight) -> Array:
-        """Return the frequencies, Hz, at which the weight is exceeded, or by a twentieth of the tolerance too large."""
-        if not weight.left.D.any():
-            return np.zeros(0)
-        bends = np.arctan(np.exp(self.fitted.sections.corner / 2)) / (np.pi * self.target.sample_period_s)
-        where = joined(self.checked_hz, bends)
-        exceeded = weight.magnitudes(where).ratio(self.residuals.at(where)).max(axis=0)
-        cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
-        excess = 10 ** (np.nan_to_num(cost, posinf=0.0) / 20 - self.target.tolerance_db / 400)
-        return np.append(where[_peaks(exceeded / FIT.deficit)], self.freqs_hz[_peaks(excess)])
-
     def again(self, missed_hz: Array) -> Weight:
         """Fit again, with the largest residuals of all units at further frequencies."""
         self.problem = self.problem.joined(self._problem(np.unique(missed_hz), self.everyone)[0])
@@ -160,7 +149,8 @@ def _proven(residuals: Residuals, weight: Weight, grid: Array) -> _Proof:
             return weight.magnitudes(freqs_hz).ratio(some.at(freqs_hz))
 
         known = ratio(claimed)
-        pencils = realised.ratios(weight.left, weight.right) if realised and known.any() else []
+        sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
+        pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
         certificate = certify(ratio, claimed, known, pencils, weight.left.dt)
         missed = np.append(claimed[_peaks(known.max(axis=0))], certificate.freq_hz)
         proofs.append(_Proof(certificate, float(known.max()), missed))

@@ -198,10 +198,8 @@ class _Reader:
             raise self._error(f"there is no {written}; only {known} have earlier values.")
         negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
         amount = index.operand if isinstance(index, ast.UnaryOp) else index
-        if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
-            raise self._error(f"the delay in {written} should be a whole number of samples, such as {name}[-1].")
-        if not negative or amount.value == 0:
-            raise self._error(f"{written} is not an earlier value; write {name}[-1] for one sample before.")
+        if not negative or not isinstance(amount, ast.Constant) or type(amount.value) is not int or not amount.value:
+            raise self._error(f"{written} is no earlier value; give a whole number of samples, such as {name}[-1].")
         if amount.value > MAX_DELAY:
             raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
         return sp.Symbol(delayed_name(name, amount.value), real=True)

@@ -27,46 +27,22 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """A bound on how the units of a population differ from a nominal one.
-
-    Parameters
-    ----------
-    form : Form
-    unit_ids : tuple of str
-        Units that the weights cover.
-    nominal : int
-        Row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one).
-    nominal_id : str
-    freqs_hz : ndarray, shape (frequency,), Hz
-    output_scale : ndarray, shape (p,)
-    input_scale : ndarray, shape (m,)
-    bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units for the best nominal of each form, and for the nominal of `form`.
-    nominals : dict of Form to str
-        Unit behind each of these bounds.
-    cover : Cover
-        Optimal cover of the residuals, frequency by frequency.
-    weight : Weight
-    misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular.
-    remainder : Weight or None
-        Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
-    remainder_cover : Cover or None
-    """
+    """A bound on how the units of a population differ from a nominal one."""
 
     form: Form
-    unit_ids: tuple[str, ...]
-    nominal: int
+    unit_ids: tuple[str, ...]  # units that the weights cover
+    nominal: int  # row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one)
     nominal_id: str
-    freqs_hz: Array
-    output_scale: Array
-    input_scale: Array
+    freqs_hz: Array  # (frequency,), Hz
+    output_scale: Array  # (p,)
+    input_scale: Array  # (m,)
+    # (frequency,): largest residual over the other units for the best nominal of each form, and that of `form`
     bounds: dict[Form, Array]
-    nominals: dict[Form, str]
-    cover: Cover
+    nominals: dict[Form, str]  # unit behind each of these bounds
+    cover: Cover  # optimal cover of the residuals, frequency by frequency
     weight: Weight
-    misfit: Array
-    remainder: Weight | None = None
+    misfit: Array  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
+    remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
     remainder_cover: Cover | None = None
 
     @property
@@ -105,8 +81,8 @@ class ResponseUncertainty(Uncertainty):
     certificate : str
         Where the bound holds.
     unresolved_hz : ndarray, shape (n,), Hz
-        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the
-        grid does not resolve, and that may be higher beside it. All other fields are those of `Uncertainty`.
+        Local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not
+        resolve, and that may be higher beside it. All other fields are those of `UncertainModel`.
 
     Examples
     --------
@@ -132,7 +108,13 @@ class UncertainModel(Uncertainty):
     Parameters
     ----------
     nominal_system : StateSpace
-        In physical units; all others are those of `Uncertainty`.
+        In physical units.
+    form, unit_ids, nominal, nominal_id, freqs_hz, output_scale, input_scale : see `quantify`
+    bounds, nominals, cover, misfit : dict, dict, Cover, ndarray of shape (unit, frequency)
+        Largest residuals of every form and the nominals behind them; magnitudes that no diagonal weight is below; what
+        the form cannot rebuild of every unit.
+    weight, remainder : Weight, Weight or None
+        Diagonal systems ``left`` and ``right``, of the residuals and of what the form leaves out.
 
     Examples
     --------

@@ -93,7 +93,7 @@ class BandRule:
     at_once: int = 2_000_000  # lags of signals in memory
     block: int = 2048  # lags whose weights are in memory
     iterations: int = 60  # at most
-    turns: int = 10  # after which bands that are done are left
+    turns: int = 10  # between looks at whether all bands are done
     enough: float = 1.002  # ratio to the least multiple that covers, which ends the iteration
     regular: float = 1e-14  # of the largest eigenvalue: smaller ones are rounding
     ridge: float = 1e-6  # of the largest energy, in every direction: the iteration needs its square above rounding

@@ -4,8 +4,9 @@ Uncertainty of models you have: lists of python-control systems
 
 I have a model of every machine. What are the nominal model and the weights for robust control?
 
-The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss``,
-``control.tf`` or ``control.frd``, continuous or discrete. Nominal and weights are returned as systems of python-control.
+The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss`` or
+``control.frd``, continuous or discrete (``kros.interop.from_control`` converts a ``control.tf``). Nominal and weights are
+returned as systems of python-control.
 """
 
 # %%

@@ -59,14 +59,6 @@ def test_three_resonances_at_order_six() -> None:
     assert (measured(fit) >= rippled * (1 - 1e-9)).all()
 
 
-def test_order_one_overbound_of_a_two_level_step_is_half_of_it_in_log() -> None:
-    """Order zero must bound data of two levels by the larger: the overbound is their ratio; no smaller constant exists."""
-    data = np.where(FREQS < 1.0, 2.0, 1.0)
-    fit = fit_magnitude(FREQS, data, DT, max_order=0)
-    assert fit.order == 0
-    assert fit.overbound_db == pytest.approx(20 * np.log10(2.0))
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_bounds_random_smooth_data_as_used(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -133,9 +133,8 @@ def _bound(
     weight, cover = fit_weight(residuals, freqs, target)
     G, ratios, largest, form = residuals.nominal(freqs), [], [], residuals.form
     for rows in residuals.blocks():
-        E = residuals.of(rows).at(freqs)
-        ratios.append(misfit(form, G, residuals.units(freqs, rows), E))
-        largest.append(sigma_max(E).max(axis=0))
+        ratios.append(misfit(form, G, residuals.units(freqs, rows)))
+        largest.append(sigma_max(residuals.of(rows).at(freqs)).max(axis=0))
     bound: dict[str, Any] = {"form": form, "bound": np.max(largest, axis=0), "misfit": np.concatenate(ratios)}
     bound |= {"weight": weight, "cover": cover}
     if _leaves_out(form, bound["misfit"]):

@@ -19,7 +19,7 @@ from ...core.lti import block_diagonal, gain
 from ..settings import FIT, PROOF
 from .cover import Cover, optimal_cover
 from .joint import JointFit, JointProblem, fit_jointly, refit
-from .proof import Certificate, Method, certify
+from .proof import Method, certify
 from .residuals import Residuals
 from .weight import Weight
 
@@ -127,21 +127,17 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Proof:
-    """The certificate with the largest bound over blocks of units, the largest ratio on their grids."""
+    """What all blocks of units are within."""
 
-    certificate: Certificate
-    on_grid: float
+    method: Method
+    bound: float  # largest ratio
+    on_grid: float  # of those, largest one on the grids
     missed_hz: Array  # where units are beyond the weight
-
-    @property
-    def bound(self) -> float:
-        """Largest ratio."""
-        return max(self.certificate.bound, self.on_grid)
 
 
 def _proven(residuals: Residuals, weight: Weight, grid: Array) -> _Proof:
     """Certify a weight for all units, in blocks, so that memory does not grow with their number."""
-    proofs = []
+    proofs, on_grid, missed = [], [], []
     for some in map(residuals.of, residuals.blocks()):
         claimed, realised = joined(grid, some.modes_hz(grid)), some.realised if some.proven else None
 
@@ -151,13 +147,11 @@ def _proven(residuals: Residuals, weight: Weight, grid: Array) -> _Proof:
         known = ratio(claimed)
         sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
         pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
-        certificate = certify(ratio, claimed, known, pencils, weight.left.dt)
-        missed = np.append(claimed[_peaks(known.max(axis=0))], certificate.freq_hz)
-        proofs.append(_Proof(certificate, float(known.max()), missed))
-    worst = max(proofs, key=lambda proof: proof.certificate.bound).certificate
-    if any(proof.certificate.method is Method.GRID for proof in proofs):
-        worst = replace(worst, method=Method.GRID, peak=worst.bound)
-    return _Proof(worst, max(p.on_grid for p in proofs), np.concatenate([p.missed_hz for p in proofs]))
+        proofs.append(certify(ratio, claimed, known, pencils, weight.left.dt))
+        on_grid.append(float(known.max()))
+        missed.append(np.append(claimed[_peaks(known.max(axis=0))], proofs[-1].freq_hz))
+    method = Method.GRID if any(proof.method is Method.GRID for proof in proofs) else Method.LEVEL_SETS
+    return _Proof(method, max(*(p.bound for p in proofs), *on_grid), max(on_grid), np.concatenate(missed))
 
 
 def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array) -> Cover:
@@ -170,10 +164,10 @@ def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array) -> Cover:
 
 def _lifted(weight: Weight, proof: _Proof) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift, method = proof.bound * (1 + PROOF.rounding), proof.certificate.method
+    lift = proof.bound * (1 + PROOF.rounding)
     if not lift > 0:
-        return replace(weight, cover_max=0.0, method=method)
-    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=method)
+        return replace(weight, cover_max=0.0, method=proof.method)
+    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=proof.method)
 
 
 def _peaks(ratio: Array) -> Array:

@@ -109,12 +109,12 @@ class UncertainModel(Uncertainty):
     ----------
     nominal_system : StateSpace
         In physical units.
-    form, unit_ids, nominal, nominal_id, freqs_hz, output_scale, input_scale : see `quantify`
-    bounds, nominals, cover, misfit : dict, dict, Cover, ndarray of shape (unit, frequency)
-        Largest residuals of every form and the nominals behind them; magnitudes that no diagonal weight is below; what
-        the form cannot rebuild of every unit.
-    weight, remainder : Weight, Weight or None
-        Diagonal systems ``left`` and ``right``, of the residuals and of what the form leaves out.
+
+    Notes
+    -----
+    ``bounds`` and ``nominals`` are the largest residuals of every form and the units behind them, ``weight`` has the
+    diagonal systems ``left`` and ``right``, ``cover`` the magnitudes that no diagonal weight is below, ``misfit`` is
+    what the form cannot rebuild of every unit, and ``remainder`` the weights of that; the rest is as in `quantify`.
 
     Examples
     --------

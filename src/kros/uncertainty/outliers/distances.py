@@ -3,8 +3,8 @@
 responses (unit, frequency, p, m) --residuals from every nominal--> scaled to typical entries of one --sigma_max,
 smoothed--> levels in dB
 
-Entries are scaled by their typical size over all pairs (Sinkhorn scaling of the median squared magnitudes), so that
-every row and column of the residual counts alike, at every frequency by itself.
+Entries are scaled by their typical size over all pairs, frequency by frequency (Sinkhorn scaling of the median squared
+magnitudes), so that every row and column of the residual counts alike.
 """
 
 from __future__ import annotations

@@ -25,8 +25,10 @@ def score_population(
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
-    scored = {condition: identified for condition, identified in known.items() if len(identified.unit_ids) >= 3}
-    for condition in known.keys() - scored.keys():
+    scored = {
+        condition: identified for condition, identified in known.items() if len(identified.unit_ids) >= LEAST_SCORES
+    }
+    for condition in sorted(known.keys() - scored.keys()):
         log.info("%s: outlier scores need at least three units", condition)
     tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
     rows: list[dict[str, Any]] = []

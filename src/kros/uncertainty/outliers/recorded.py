@@ -2,10 +2,9 @@
 
     factors of episodes --brought to one number of samples--> EDMD --> response of a unit
 
-Tikhonov's alpha stands against a Gram matrix that grows with the recording: at one alpha a unit that was recorded less
-is drawn further towards zero, which looks like another machine. For scores every unit counts as recorded as long as the
-middle one of the study. A shorter recording scatters more, too: of a unit recorded for less than half as long nothing
-is said.
+At one alpha of Tikhonov a unit that was recorded less is drawn further towards zero, which looks like another machine.
+For scores every unit counts as recorded as long as the middle one of the study; of a unit recorded for less than half
+as long nothing is said, because shorter recordings scatter more.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What is said about one unit: how far it exceeds the others, and what would have been seen had it differed.
 
-A score below the threshold means little by itself. Beside it stands what the unit would have to differ by to be
-flagged; where that is more than anybody would call a defect, nothing is said about the unit instead of "ok".
+Beside a score stands what the unit would have to differ by to be flagged; where that is more than a defect would be,
+nothing is said about the unit instead of "ok".
 """
 
 from __future__ import annotations

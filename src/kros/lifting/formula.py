@@ -77,17 +77,10 @@ class Formula:
         """Names that the formula depends on, those of earlier values among them."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
-    @cached_property
-    def _program(self) -> Program:
-        return Program.of([self.expression])
-
-    def __call__(self, **values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Evaluate at arrays that broadcast against each other."""
-        return self.evaluate({name: np.asarray(value, dtype=float) for name, value in values.items()})
-
-    def evaluate(self, values: Mapping[str, npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
-        """Evaluate at arrays by name."""
-        return np.asarray(self._program.run(values)[0])
+    def evaluate(self, values: Mapping[str, npt.ArrayLike]) -> npt.NDArray[np.float64]:
+        """Evaluate at arrays by name that broadcast against each other."""
+        arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
+        return np.asarray(Program.of([self.expression]).run(arrays)[0])
 
     def derivative(self, name: str) -> Any:
         """Return the SymPy tree of the partial derivative with respect to one name."""

@@ -94,12 +94,12 @@ def bound_responses(
         form, lambda f: _between(at, base, f)[0], lambda f, rows: _between(at, units[rows], f), np.arange(len(ids))
     )
     fields = _fields(ids, index, freqs, scales, choices, _bound(residuals, freqs, axis, dt, options))
-    fields["certificate"], fields["unresolved_hz"] = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, **fields)
+    certificate = _certificate(freqs, fields["bounds"][form])
+    return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, certificate=certificate, **fields)
 
 
-def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
-    """Return where a bound of responses holds, in words, and the frequencies of peaks that are not resolved."""
+def _certificate(freqs: Array, bound: Array) -> str:
+    """Return where a bound of responses holds, and which of its peaks the frequencies do not resolve."""
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
     top = (middle >= bound[:-2]) & (middle >= bound[2:])
@@ -112,7 +112,7 @@ def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
             "may be larger beside them; measure more densely there.",
             some,
         )
-    return text, unresolved
+    return text
 
 
 def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
@@ -138,7 +138,7 @@ def _bound(
     bound: dict[str, Any] = {"form": form, "bound": np.max(largest, axis=0), "misfit": np.concatenate(ratios)}
     bound |= {"weight": weight, "cover": cover}
     if _leaves_out(form, bound["misfit"]):
-        bound["remainder"], bound["remainder_cover"] = fit_weight(replace(residuals, remainder=True), freqs, target)
+        bound["remainder"] = fit_weight(replace(residuals, remainder=True), freqs, target)[0]
     if axis is not None:
         bound |= {name: bound[name].mapped(axis.continuous) for name in ("weight", "remainder") if name in bound}
     return bound

@@ -43,7 +43,6 @@ class Uncertainty:
     weight: Weight
     misfit: Array  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
     remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
-    remainder_cover: Cover | None = None
 
     @property
     def peak_db(self) -> dict[Form, float]:
@@ -80,9 +79,11 @@ class ResponseUncertainty(Uncertainty):
         Zero for continuous time.
     certificate : str
         Where the bound holds.
-    unresolved_hz : ndarray, shape (n,), Hz
-        Local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the grid does not
-        resolve, and that may be higher beside it. All other fields are those of `UncertainModel`.
+
+    Notes
+    -----
+    Local maxima of the bound that fall by more than 3 dB to a neighbouring frequency are named in the certificate: the
+    grid does not resolve these peaks, which may be higher beside it. All other fields are those of `UncertainModel`.
 
     Examples
     --------
@@ -98,7 +99,6 @@ class ResponseUncertainty(Uncertainty):
     nominal_response: Array
     sample_period_s: float
     certificate: str
-    unresolved_hz: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -144,15 +144,15 @@ class UncertainModel(Uncertainty):
         arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
         arrays |= {f"nominal_{x}": getattr(self.nominal_system, x) for x in "ABCD"}
-        arrays |= _pack_weight("weight", self.weight, self.cover)
+        arrays |= _pack_weight("weight", self.weight) | {"cover_left": self.cover.left, "cover_right": self.cover.right}
         content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
             "weight": {name: getattr(self.weight, name) for name in _OF_WEIGHT},
             "remainder": None,
         }
-        if self.remainder is not None and self.remainder_cover is not None:
-            arrays |= _pack_weight("remainder", self.remainder, self.remainder_cover)
+        if self.remainder is not None:
+            arrays |= _pack_weight("remainder", self.remainder)
             content["remainder"] = {name: getattr(self.remainder, name) for name in _OF_WEIGHT}
         save_artifact(Path(folder), "uncertain_model", content, arrays)
 
@@ -164,11 +164,14 @@ class UncertainModel(Uncertainty):
         axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {}, Path(folder))
         dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
-        weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
+        weight, cover = (
+            _unpack_weight("weight", content["weight"], arrays, dt),
+            Cover(arrays["cover_left"], arrays["cover_right"]),
+        )
         facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
         if content["remainder"] is not None:
-            facts["remainder"], facts["remainder_cover"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
+            facts["remainder"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
         facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
         return cls(
             nominal_system=_unpack_system("nominal", arrays, dt),
@@ -197,14 +200,12 @@ def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace
     return StateSpace(A, B, C, D, dt)
 
 
-def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
-    packed: dict[str, Array] = {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+def _pack_weight(name: str, weight: Weight) -> dict[str, Array]:
     sides = (("left", weight.left), ("right", weight.right))
-    return packed | {f"{name}_{side}_{x}": getattr(system, x) for side, system in sides for x in "ABCD"}
+    return {f"{name}_{side}_{x}": getattr(system, x) for side, system in sides for x in "ABCD"}
 
 
-def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
+def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> Weight:
     orders = {side: tuple(facts[side]) for side in ("left_orders", "right_orders")}
     left, right = (_unpack_system(f"{name}_{side}", arrays, dt) for side in ("left", "right"))
-    weight = Weight(left, right, **facts | orders | {"method": Method(facts["method"])})
-    return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
+    return Weight(left, right, **facts | orders | {"method": Method(facts["method"])})

@@ -97,7 +97,7 @@ def magnitude(freqs: int) -> Work:
 
 def uncertain_model(units: int) -> Work:
     systems = problems.lags(units)
-    return lambda: quantify(systems, max_max_order=3, tolerance_db=0.0)
+    return lambda: quantify(systems, max_order=3, tolerance_db=0.0)
 
 
 CURVES: dict[str, dict[str, tuple[Callable[[int], Work], tuple[int, ...]]]] = {

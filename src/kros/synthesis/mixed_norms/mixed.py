@@ -25,7 +25,7 @@ from numpy.linalg import LinAlgError
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
-from ..assumptions import require, require_plant
+from ..assumptions import h2_violations, require, require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
@@ -33,7 +33,9 @@ from ..reduction import truncate
 from ..result import Status, Synthesis, enclosed
 from ..riccati.equations import absorb_feedthrough
 from ..riccati.h2 import h2
-from ..riccati.hinf import proven_bound
+from ..riccati.hinf import hinf
+from ..riccati.hinf_level import scale
+from ..riccati.parrott import frequency_bound
 from ..worst_case.certificate import certified
 from .barrier import Ending, minimise
 from .improvement import improved
@@ -111,7 +113,7 @@ def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limi
         note = "The H2 optimum meets the constraint: it is the optimum of the mixed problem."
         return replace(free, method="mixed", hinf_norm=peak, notes=(note,))
     two = plant.uncertainty
-    least = proven_bound(two, max(peak, 2 * gamma)) if two.D11.size else 0.0
+    least = _least(two) if two.D11.size else 0.0
     if least >= gamma:
         raise _infeasible(gamma, least)
     bare = replace(plant, D22=np.zeros_like(plant.D22))
@@ -126,6 +128,13 @@ def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limi
     lower, gap, notes = enclosed(_cost(result), proven)
     controller = absorb_feedthrough(result.controller, plant.D22)
     return replace(result, controller=controller, lower_bound=lower, gap_percent=gap, notes=(*result.notes, *notes))
+
+
+def _least(plant: GeneralizedPlant) -> float:
+    """Return an H-infinity norm that no controller is below; of a singular plant what single frequencies prove."""
+    if h2_violations(plant, proper=False):
+        return frequency_bound(scale(plant))
+    return hinf(plant).lower_bound or 0.0
 
 
 def _cost(candidate: Synthesis) -> float:

@@ -66,9 +66,9 @@ Worst-case H-infinity observers and gains are no longer part of kros; use worst_
 member too.
     kros.synthesis.worst_case_hinf kros.synthesis.robust_gain kros.synthesis.RobustGain
     synthesis.methods=worst_case_hinf
-Controllers are no longer polished by descent; use reduce_controller, which truncates in balanced coordinates and
-certifies the result.
-    kros.synthesis.polish synthesis.max_states synthesis.tune
+Controllers are no longer polished or reduced in order; use balred of python-control, and close the plant's loop with
+the result for its norms.
+    kros.synthesis.polish kros.synthesis.reduce_controller synthesis.max_states synthesis.tune
 Placed poles are no longer part of kros; use kalman.
     kros.synthesis.luenberger
 Random members of the uncertain set are no longer drawn in a study; the certificate bounds all of them, and the report

@@ -27,8 +27,7 @@ from ...core.linalg import balancing
 from ...core.lti import StateSpace, dense_response, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.filter_bound import predictor_bound
-from ..riccati.kalman import kalman
+from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
@@ -186,13 +185,12 @@ class _Scaled:
         A = np.block([[self.A, shaping.C], [np.zeros((shaping.n_states, len(self.A))), shaping.A]])
         return A, np.vstack([shaping.D, shaping.B]), np.hstack([self.C, np.zeros((len(self.C), shaping.n_states))])
 
-    def lower_bound(self, shaping: StateSpace) -> float | None:
-        """Root mean square of the scaled error that no correction falls below; None where none is proven."""
+    def lower_bound(self, shaping: StateSpace) -> float:
+        """Root mean square of the scaled error that no correction falls below."""
         A, G, C = self.shaped(shaping)
         (n, k), q = G.shape, len(C)
         B, D = np.hstack([G, np.zeros((n, q))]), np.hstack([np.zeros((q, k)), np.diag(self.noise)])
-        squared = predictor_bound(A, B, C, D, np.eye(len(self.A), n))
-        return None if squared is None else float(np.sqrt(squared))
+        return float(np.sqrt(predictor_bound(A, B, C, D, np.eye(len(self.A), n))))
 
     def correction(self, shaping: StateSpace) -> StateSpace:
         """Kalman gains of plant and shaping filter as a correction filter."""

@@ -125,10 +125,6 @@ class PhaseCalibration:
         units = {unit: UnitPhase(**phase) for unit, phase in content["units"].items()}
         return cls(PhaseSpec(**content["spec"]), content["lag_rad"], units)
 
-    def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
-        """Calibrate a new unit on the population's branch."""
-        return unit_phase(segments, unit, self.spec).on_branch_of(self.lag_rad)
-
 
 def wrap(angle: float) -> float:
     """Return an angle in [0, 2 pi)."""
@@ -228,7 +224,6 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})
 
 
-log = logging.getLogger(__name__)
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 

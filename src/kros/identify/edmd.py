@@ -123,14 +123,6 @@ def relative_pivots(R: Array) -> Array:
     return np.asarray(np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size)
 
 
-def residual_covariance(R: Array, n_lifted: int, matrices: KoopmanMatrices, n_samples: npt.ArrayLike) -> Array:
-    """Return the covariance of the one-step residual of given models, shape (..., n_lifted, n_lifted)."""
-    p = R.shape[-1] - n_lifted
-    U = np.concatenate([matrices.A, matrices.B], axis=-1)
-    rest = R[..., :, p:] - R[..., :, :p] @ np.swapaxes(U, -1, -2)
-    return np.swapaxes(rest, -1, -2) @ rest / np.asarray(n_samples, dtype=float)[..., None, None]
-
-
 def smallest_stabilising_alpha(
     factors: list[tuple[Array, int]], margin: float = 0.0, search: AlphaSearch | None = None
 ) -> float:

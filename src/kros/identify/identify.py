@@ -25,13 +25,13 @@ from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
-from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
 from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation, require_independent
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
 from .refine import Refinement, RefineOptions, refine_population
-from .refine.metric import peak_residual_db
+from .refine.metric import peak_residual
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 
 log = logging.getLogger(__name__)
@@ -227,7 +227,6 @@ class _Reduced:
             A=nothing,
             B=nothing,
             parameters=self.parameters if lifting.parameters else {},
-            residual_covariance=nothing,
             output_scale=ranges.outputs,
             input_scale=ranges.inputs,
         )
@@ -259,8 +258,11 @@ class _Reduced:
 
         def refining() -> Result:
             kinds, refined = kinds_for(base.lifting, refined=True), results()
-            of = zip(kinds, starts, refined, factors, strict=True)
-            models = [_with_matrices(start, kind.name, matrices, factor) for kind, start, (matrices, _), factor in of]
+            of = zip(kinds, starts, refined, strict=True)
+            models = [
+                replace(start, name=kind.name, A=m.A, B=m.B, status=("ok",) * len(self.units))
+                for kind, start, (m, _) in of
+            ]
             return models, {kind.name: facts for kind, (_, facts) in zip(kinds, refined, strict=True)}
 
         return refining
@@ -271,23 +273,16 @@ def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     matrices = models.fit(factor.R)
     radius = models.ranges.normalise(matrices).spectral_radius()
     status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
-    return replace(_with_matrices(models, models.name, matrices, factor), status=status)
-
-
-def _with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, factor: Factor) -> ModelSet:
-    """Return a model set with the scales, phases and regularisation of the one that it starts from."""
-    covariance = residual_covariance(factor.R, start.lifting.n_lifted, matrices, factor.n_samples)
-    status = ("ok",) * len(start.unit_ids)
-    return replace(start, name=name, A=matrices.A, B=matrices.B, residual_covariance=covariance, status=status)
+    return replace(models, A=matrices.A, B=matrices.B, status=status)
 
 
 def alpha_factor(shared: list[tuple[Array, int]], edge: float, search: AlphaSearch | None = None) -> float:
     """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
-    search, limit = search or AlphaSearch(), 20 * np.log10(RefineOptions().largest_residual)
+    search, limit = search or AlphaSearch(), RefineOptions().largest_residual
     for doubled in range(search.doublings if edge > 0 else 0):
         factor = search.factor * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
-        if not any(peak_residual_db(m.A, m.B, search.points) > limit for m in models):
+        if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
             return factor
     return search.factor
 

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -62,16 +61,6 @@ class TrainingData:
             )
 
 
-@dataclass(frozen=True)
-class TradeOff:
-    """Accuracy and uncertainty at one strength of the prior."""
-
-    strength: float
-    held_out_percent: tuple[float, ...]
-    score: float
-    peak_db: float
-
-
 @dataclass(frozen=True, eq=False)
 class Refinement:
     """What a refinement is known by beside the models of its units.
@@ -87,7 +76,6 @@ class Refinement:
 
     pooled: KoopmanMatrices  # A (n, n) and B (n, m) of the model fitted to all pooled units at once
     strength: float  # of the prior, as chosen on held-out training episodes
-    trade_off: tuple[TradeOff, ...]  # of the pooled model alone (strength infinite), then by strength, strongest first
     sigma: Array  # (n_states,), errors that count as one
     converged: npt.NDArray[np.bool_]  # (unit,); the others ran out of iterations, and are no less valid
     information: Array  # (unit, P, P), Gauss-Newton matrix of every unit's cost for V with ``[A B] = V T^T``
@@ -106,11 +94,10 @@ class Refinement:
         )
 
     def save(self, folder: Path) -> None:
-        """Write ``refinement.json`` and ``arrays.npz``; an infinite strength becomes null."""
+        """Write ``refinement.json`` and ``arrays.npz``."""
         arrays = {name: getattr(self, name) for name in ("sigma", "converged", "information", "whitening")}
         arrays |= {"A": self.pooled.A, "B": self.pooled.B}
-        content = {"strength": self.strength, "trade_off": [asdict(row) for row in self.trade_off]}
-        save_artifact(folder, "refinement", content, arrays)
+        save_artifact(folder, "refinement", {"strength": self.strength}, arrays)
 
     @classmethod
     @loader
@@ -119,10 +106,4 @@ class Refinement:
         content, arrays = load_artifact(folder, "refinement")
         check_shapes(arrays, {"A": "nn", "B": "nm", "converged": "u", "information": "uPP"}, {}, Path(folder))
         pooled = KoopmanMatrices(arrays.pop("A"), arrays.pop("B"))
-        return cls(pooled, content["strength"], tuple(_row(row) for row in content["trade_off"]), **arrays)
-
-
-def _row(row: dict[str, Any]) -> TradeOff:
-    """A row as it was: null in JSON stands for a strength, an error or a peak without bound."""
-    unbounded = {name: np.inf if row[name] is None else row[name] for name in ("strength", "score", "peak_db")}
-    return TradeOff(held_out_percent=tuple(np.inf if v is None else v for v in row["held_out_percent"]), **unbounded)
+        return cls(pooled, content["strength"], **arrays)

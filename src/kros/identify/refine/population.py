@@ -23,8 +23,8 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor, Ranges
 from ..free_run import free_run
-from .metric import ResponsePrior, peak_residual_db
-from .model import Refinement, TradeOff, TrainingData
+from .metric import ResponsePrior, peak_residual
+from .model import Refinement, TrainingData
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import Evaluate, GaussNewton, RefineOptions, Solution
 from .segments import Segments, held_segments, read_segments
@@ -101,20 +101,20 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     fitted = segments.first(count - held_segments(count, data.keys))
     start, problem, error = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
-    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V, np.inf).score)
+    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V)[0])
     problem = _around(problem, one_model, common)
-    path, rows = _path(data, problem, common)
-    choice = _choose(rows, options)
-    log.info("prior of strength %g chosen, held-out score %.4g", rows[choice].strength, rows[choice].score)
-    final = replace(problem, segments=segments).with_prior(rows[choice].strength)
-    solution = _settle(final, path[choice])
+    path, scores, peaks = _path(data, problem, common)
+    choice = _choose(scores, peaks, options)
+    strength = _falling(options)[choice]
+    log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
+    final = replace(problem, segments=segments).with_prior(strength)
+    solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
     models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
     return models, Refinement(
         pooled=problem.matrices(common),
-        strength=rows[choice].strength,
-        trade_off=(trade_off(data, problem, common, np.inf), *rows),
+        strength=strength,
         sigma=problem.sigma,
         converged=solution.converged,
         information=solution.matrix[:, :-1, :-1],
@@ -129,22 +129,31 @@ def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Ar
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
-def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], list[TradeOff]]:
-    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty."""
+def _falling(options: RefineOptions) -> list[float]:
+    """Return the strengths of the prior, strongest first."""
+    return sorted(options.strengths, reverse=True)
+
+
+def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
+    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty.
+
+    Returns their parameters, held-out scores and peak residuals.
+    """
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
-    rows: list[TradeOff] = []
-    for strength in sorted(options.strengths, reverse=True):
+    rows: list[tuple[float, float]] = []
+    for strength in _falling(options):
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
-        rows.append(trade_off(data, problem, V, strength))
-        log.debug("prior of strength %g: score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
-        earlier = rows[-1 - options.patience].score if len(rows) > options.patience else np.inf
-        if rows[-1].score > (1 - options.tolerance / 2) * earlier or _too_uncertain(rows[-1], options):
+        rows.append(trade_off(data, problem, V))
+        log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
+        earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
+        if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
             break
-    return path, rows
+    scores, peaks = np.array(rows).T
+    return path, scores, peaks
 
 
 def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
@@ -156,38 +165,21 @@ def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
     return search.minimise(problem.evaluate, problem.admissible, V, narrowed)
 
 
-def _settle(problem: RefinementProblem, V: Array) -> Solution:
-    """Fit all units to the end: those that have not converged continue by themselves."""
-    search = problem.options.search
-    solution = _fit(problem, V, search)
-    for _ in range(problem.options.restarts):
-        rows = np.flatnonzero(~solution.converged)
-        if not rows.size:
-            break
-        solution = solution.updated(rows, _fit(problem.of_units(rows), solution.V[rows], search))
-    return solution
-
-
-def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
-    return row.peak_db > 20 * np.log10(options.largest_residual)
-
-
-def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
+def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:
     """Return the strongest prior about as good as the best, or a weaker and better one that costs nothing.
 
     Uncertainty costs nothing while the peak residual is negligible. Only the last of the rows may be too uncertain.
     """
-    usable = [row for row in rows if not _too_uncertain(row, options)] or list(rows)
-    best = min(row.score for row in usable)
+    usable = peaks <= options.largest_residual
+    best = float(np.min(scores[usable] if usable.any() else scores))
     if not np.isfinite(best):
         raise IdentificationError(
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add "
-            f"strengths above {max(row.strength for row in rows):g}."
+            f"strengths above {max(options.strengths):g}."
         )
-    choice = next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
-    negligible = 20 * np.log10(options.negligible_residual)
-    free = [i for i, row in enumerate(rows) if i >= choice and row.peak_db <= negligible]
-    return min(free, key=lambda i: rows[i].score, default=choice)
+    choice = int(np.argmax(scores <= (1 + options.tolerance) * best))
+    free = [i for i in range(choice, len(scores)) if peaks[i] <= options.negligible_residual]
+    return min(free, key=lambda i: scores[i], default=choice)
 
 
 def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:
@@ -308,10 +300,10 @@ def free_run_errors(
     parameters: Mapping[str, Array],
     population: Population,
     keys: Sequence[EpisodeKey],
-) -> tuple[Array, Array, Array]:
-    """Return RMS errors of free runs, and the largest recorded and reached values, all (episode, n)."""
+) -> tuple[Array, Array]:
+    """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
     shape = len(keys), lifting.n_states
-    rms, top, reached = np.full(shape, np.inf), np.zeros(shape), np.full(shape, np.inf)
+    rms, reached = np.full(shape, np.inf), np.full(shape, np.inf)
     for start in range(0, len(keys), _TOGETHER):
         episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
         by_length: dict[int, list[int]] = {}
@@ -320,22 +312,21 @@ def free_run_errors(
         for rows in by_length.values():
             values = {name: given[rows] for name, given in parameters.items()}
             part = KoopmanMatrices(models.A[rows], models.B[rows])
-            rms[rows], top[rows], reached[rows] = _errors(part, lifting, values, [episodes[row] for row in rows])
-    return rms, top, reached
+            rms[rows], reached[rows] = _errors(part, lifting, values, [episodes[row] for row in rows])
+    return rms, reached
 
 
 def _errors(
     models: KoopmanMatrices, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array]:
     """Do the same for episodes of one length."""
     n, h, recorded = lifting.n_states, lifting.history, np.stack(episodes)
     x = recorded[..., :n]
     run = free_run(models.A, models.B, lifting, parameters, x[:, : h + 1], recorded[..., n:])
     with np.errstate(over="ignore", invalid="ignore"):
         rms = np.sqrt(np.mean((run - x) ** 2, axis=1))
-        sizes = rms, np.abs(run).max(axis=1)
-    rms, reached = (np.where(np.isfinite(values), values, np.inf) for values in sizes)
-    return rms, np.abs(x).max(axis=1), reached
+        reached = np.abs(run).max(axis=1)
+    return np.where(np.isfinite(rms), rms, np.inf), np.where(np.isfinite(reached), reached, np.inf)
 
 
 def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:
@@ -344,20 +335,18 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     keys = [key for episodes in data.keys.values() for key in episodes]
     values = {name: given[rows] for name, given in data.parameters.items()}
     each = KoopmanMatrices(models.A[rows], models.B[rows])
-    _, _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
+    _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
     for which, state in np.argwhere(~(reached <= bound)):
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
         raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
 
 
-def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:
-    """Return accuracy on held-out training episodes, and uncertainty, of models (unit, n_lifted, p) or one for all."""
+def trade_off(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple[float, float]:
+    """Return the error on held-out training episodes and the peak residual of models (unit, n_lifted, p) or of one."""
     rows, count = data.rows, len(data.keys)
     models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
     last = [episodes[-1] for episodes in data.keys.values()]
     values = {name: given[rows] for name, given in data.parameters.items()}
-    rms, top, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
-    percent = np.median(100 * rms / np.where(top > 0, top, 1.0), axis=0)  # a state may rest at zero in the last episode
-    score = np.mean((rms / problem.sigma) ** 2)
-    return TradeOff(strength, tuple(percent.tolist()), float(score), peak_residual_db(models.A, models.B))
+    rms, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
+    return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)

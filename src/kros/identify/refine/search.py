@@ -29,12 +29,6 @@ class Solution:
         """Sum of squared residuals, shape (problem,)."""
         return self.matrix[:, -1, -1]
 
-    def updated(self, rows: Rows, part: Solution) -> Solution:
-        """Return the solution with some problems as another search left them."""
-        V, matrix, converged = self.V.copy(), self.matrix.copy(), self.converged.copy()
-        V[rows], matrix[rows], converged[rows] = part.V, part.matrix, part.converged
-        return Solution(V, matrix, self.iterations + part.iterations, converged)
-
 
 @dataclass(frozen=True)
 class GaussNewton:
@@ -166,8 +160,8 @@ class RefineOptions:
     negligible_residual: float = 0.1  # peak up to which accuracy alone decides
 
     # Search
-    search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon, and of the units at the strength chosen
-    restarts: int = 4  # searches in which units that have not converged continue
+    search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon
+    final_iterations: int = 75  # of the units at the strength chosen, at most
     path_iterations: int = 8  # at each strength before one is chosen; each starts where the stronger prior ended
 
     def __post_init__(self) -> None:

@@ -13,7 +13,7 @@ from kros.data.prepare import scale_population
 from kros.identify import Factor, PhaseSpec, combine, edmd, smallest_stabilising_alpha
 from kros.identify.calibration import find_segments
 from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation
-from kros.identify.refine import GaussNewton, RefineOptions, refine_population
+from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
 from kros.plants import DcMotorPopulation, HarmonicDrivePopulation
 
@@ -22,9 +22,7 @@ SCALINGS = [{name: factor} for name in CHANNELS for factor in (1e-9, 1e9)]
 SCALINGS.append({"position": 1e9, "velocity": 1e-9, "current": 1e-9, "voltage": 1e9})
 QUICK = RefineOptions(
     horizons=(5, 60),
-    starts=((5, 0.65),),
     strengths=(10.0, 1.0),
-    search=GaussNewton(iterations=6),
     path_iterations=3,
     segments=4,
 )

@@ -10,7 +10,7 @@ held-out training episodes: the strongest one whose error is as good as the best
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -99,9 +99,9 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     count, longest = options.segments, max(options.horizons)
     segments = read_segments(data.population, data.keys, longest, count, options.seed, data.lifting.history)
     fitted = segments.first(count - held_segments(count, data.keys))
-    start, problem, error = start_pooled(data, fitted, options)
+    start, problem = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
-    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V)[0])
+    common = refine_pooled(start, one_model)
     problem = _around(problem, one_model, common)
     path, scores, peaks = _path(data, problem, common)
     choice = _choose(scores, peaks, options)
@@ -191,10 +191,8 @@ def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> No
             )
 
 
-def start_pooled(
-    data: TrainingData, segments: Segments, options: RefineOptions
-) -> tuple[Array, RefinementProblem, Array]:
-    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
+def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), and the problem of all units."""
     lifting, rows = data.lifting, data.rows
     n, nl = lifting.n_states, lifting.n_lifted
     R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
@@ -208,72 +206,41 @@ def start_pooled(
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
     error = np.clip(np.where(np.isfinite(error), error, 1.0), options.least_error, 1.0)
-    return V, replace(problem, sigma=error**options.balance), error
+    return V, replace(problem, sigma=error**options.balance)
 
 
-def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Callable[[Array], float]) -> Array:
-    """Fit one model to all units, horizons growing, from every start; shape (n_lifted, p)."""
+def refine_pooled(V: Array, problem: RefinementProblem) -> Array:
+    """Fit one model to all units, on some of the segments and then on all; shape (n_lifted, p)."""
     options = problem.options
     count = max(2, -(-options.pooled_segments // problem.segments.n_units))
     few = replace(problem, segments=problem.segments.first(count))
-    briefly = replace(options.search, iterations=options.trial_iterations)
-    ends: list[tuple[float, float, Array]] = []
-    sigma = problem.sigma
-    for first, balance in options.starts:
-        inside = _stable_end(V, few, error**balance, first)
-        if inside is not None:
-            sigma = sigma if ends else normalised(few, inside).sigma
-            edged = replace(few, sigma=sigma, edged=True)
-            end = briefly.minimise(edged.evaluate, edged.admissible, inside)
-            ends.append((score(end.V[0]), float(end.cost[0]), end.V))
-            log.debug("pooled model from horizon %d, balance %g: score %.6g, cost %.6g", first, balance, *ends[-1][:2])
-    if not ends:
+    inside = _stable_end(V, few)
+    if inside is None:
         raise IdentificationError(
-            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
-            "or the model is unstable; omit lifting functions that grow, or set identify.refine = false."
+            f"Refinement of the pooled model: free runs over {options.horizons[-1]} samples diverge or the model is "
+            "unstable; omit lifting functions that grow, or set identify.refine = false."
         )
-    edged = replace(problem, sigma=sigma, edged=True)
-    best = min(ends, key=lambda row: row[:2])[2]
-    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, best).V[0])
+    edged = replace(problem, sigma=normalised(few, inside).sigma, edged=True)
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, inside).V[0])
 
 
-def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
-    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
+def _stable_end(V: Array, problem: RefinementProblem) -> Array | None:
+    """Minimise at growing horizons, then bring the model inside by a growing penalty; None where that fails."""
     options = problem.options
-    stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
-    for stage in (*stages, problem):
-        solution = options.search.minimise(stage.evaluate, problem.finite, V)
+    for horizon in options.horizons:
+        solution = options.search.minimise(problem.at(horizon).evaluate, problem.finite, V)
         if not np.isfinite(solution.cost).all():
             return None
         V = solution.V
-    return _stabilise(V, problem)
-
-
-def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
-    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
-    n, options = problem.lifting.n_states, problem.options
-    shortened = []
-    for share in np.linspace(1.0, 0.0, options.shortenings + 1):
-        shortened.append(V.copy())
-        shortened[-1][:, n:] *= share
-    for margin in (max(options.guard, options.margin), options.margin):
-        for trial in shortened:
-            if problem.admissible(trial, margin).all():
-                return trial
-    V = min(shortened, key=lambda trial: float(problem.matrices(trial).spectral_radius().max()))
     for heavier in 10.0 ** np.arange(options.penalties):
-
-        def evaluate(trial: Array, weight: float = heavier) -> Array:
-            edge = stability_barrier(trial, problem.T, options.guard, problem.edge_weight)
-            return problem.evaluate(trial) + weight * edge
-
-        solution = options.search.minimise(evaluate, problem.finite, V)
-        if not np.isfinite(solution.cost).all():
-            return None
-        V = solution.V
         if problem.admissible(V).all():
             return V
-    return None
+
+        def evaluate(trial: Array, weight: float = heavier * problem.edge_weight) -> Array:
+            return problem.evaluate(trial) + stability_barrier(trial, problem.T, options.guard, weight)
+
+        V = options.search.minimise(evaluate, problem.finite, V).V
+    return V if problem.admissible(V).all() else None
 
 
 def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:

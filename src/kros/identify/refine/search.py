@@ -129,7 +129,7 @@ class RefineOptions:
     """
 
     # Data of the search
-    horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)  # of the free runs; the last one is minimised
+    horizons: tuple[int, ...] = (320, 1000)  # of the free runs, one after the other; the last one is minimised
     segments: int = 24  # stretches of recordings of every unit, spread over its training episodes
     pooled_segments: int = 120  # of all units together, from which the pooled model is sought; it is finished on all
     compared: int = 64  # residuals of a state in a segment, at least: neighbouring errors of a long run say the same
@@ -137,8 +137,6 @@ class RefineOptions:
 
     # Pooled model
     alpha_factor: float = 4.0  # its EDMD start has this times the smallest alpha that stabilises it
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))  # first horizon, balance: there are several minima
-    trial_iterations: int = 4  # within the edge of stability, before whole free runs compare the ends of the starts
     balance: float = 0.65  # errors count in units of error**balance of EDMD: 0 weighs ranges, 1 the improvement
     least_error: float = 1e-6  # of a state's free run by EDMD: exact data have none to scale by
     row_weight: float = 0.1  # of a lifted function's one-step error, which does not enter free runs
@@ -146,8 +144,7 @@ class RefineOptions:
     # Stability
     margin: float = 1e-5  # stable means a spectral radius below one less this
     guard: float = 2e-3  # radii above one less this are penalised: the search slides along the edge of stability
-    shortenings: int = 20  # steps in which an unstable model's rows of lifted functions are shortened
-    penalties: int = 8  # decades over which the weight of the edge of stability then grows
+    penalties: int = 8  # decades over which the weight of the edge of stability grows for an unstable model
     bound: float = 10.0  # largest value of a free run on training episodes
 
     # Prior
@@ -170,7 +167,6 @@ class RefineOptions:
             "horizons": min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
             "pooled_segments": self.pooled_segments >= 1,
-            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "balance": 0 <= self.balance <= 1,
             "strengths": min(self.strengths, default=0.0) > 0,
             "margin": 0 <= self.margin < 1,

@@ -89,7 +89,6 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
             "overbound_db": round(weight["overbound_db_max"], 2),
             "structure": weight["structure"],
             "strength": refined[name].strength,
-            "converged": int(refined[name].converged.sum()),
         }
     return found
 

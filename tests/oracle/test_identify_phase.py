@@ -74,8 +74,7 @@ def test_a_new_unit_follows_the_stored_branch(tmp_path):
     calibration.save(tmp_path)
     loaded = PhaseCalibration.load(tmp_path)
     shift = np.angle(np.exp(1j * (calibration.units["2"].phase_rad - 2)))
-    new = unit_phase(find_segments(*recording(3.3, -1.62, seed=9), DT, SPEC), "new", SPEC)
-    found = new.on_branch_of(loaded.lag_rad)
+    found = loaded.calibrate(find_segments(*recording(3.3, -1.62, seed=9), DT, SPEC), "new")
     assert np.abs(np.angle(np.exp(1j * (found.phase_rad - 3.3 - shift)))) < 5e-3
 
 

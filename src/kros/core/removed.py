@@ -35,7 +35,7 @@ estimator or residual_h2.
     kros.observer.tune_observer kros.observer.in_sizes
 Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.
     kros.observer.EstimateKind
-Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.
+Refined models of resampled episodes are no longer part of kros; use bootstrap_edmd, or the noise_share of a run.
     kros.identify.bootstrap_refined
 Disturbed measurements of every observer, unit and condition are no longer part of a study; use evaluate.robustness =
 true.

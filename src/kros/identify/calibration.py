@@ -125,6 +125,10 @@ class PhaseCalibration:
         units = {unit: UnitPhase(**phase) for unit, phase in content["units"].items()}
         return cls(PhaseSpec(**content["spec"]), content["lag_rad"], units)
 
+    def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
+        """Calibrate a new unit on the population's branch."""
+        return unit_phase(segments, unit, self.spec).on_branch_of(self.lag_rad)
+
 
 def wrap(angle: float) -> float:
     """Return an angle in [0, 2 pi)."""

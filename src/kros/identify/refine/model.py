@@ -29,7 +29,7 @@ class TrainingData:
     keys: Keys
     lifting: Lifting
     parameters: Mapping[str, Array]  # (unit,)
-    factor: Factor  # batch over units, or over units and episodes
+    factor: Factor  # batch over units
     pooled: npt.NDArray[np.bool_]  # (unit,)
 
     @property
@@ -47,11 +47,10 @@ class TrainingData:
             factor=ranges.factor(self.factor),
         )
 
-    def require_factors(self, batch: tuple[int, ...]) -> None:
+    def require_factors(self) -> None:
         """Refuse factors, parameters and marks that are not those of the units."""
-        m = len(self.population.inputs) + len(self.lifting.input_functions)
-        shape = (*batch, *[2 * self.lifting.n_lifted + m] * 2)
-        units = (len(self.keys),)
+        m, units = len(self.population.inputs) + len(self.lifting.input_functions), (len(self.keys),)
+        shape = (*units, *[2 * self.lifting.n_lifted + m] * 2)
         wrong = [name for name in self.lifting.parameters if np.shape(self.parameters.get(name, 0.0)) != units]
         if self.factor.R.shape != shape or wrong or self.pooled.shape != units or not self.pooled.any():
             raise DimensionError(
@@ -70,40 +69,21 @@ class Refinement:
     >>> import kros
     >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=3, seconds=1.0, seed=3).simulate().population
     >>> refinement = kros.identify(motors).refined["linear"]
-    >>> refinement.pooled.A.shape, refinement.strength > 0, refinement.converged.shape
-    ((3, 3), True, (2,))
+    >>> refinement.pooled.A.shape, refinement.strength > 0
+    ((3, 3), True)
     """
 
     pooled: KoopmanMatrices  # A (n, n) and B (n, m) of the model fitted to all pooled units at once
     strength: float  # of the prior, as chosen on held-out training episodes
-    sigma: Array  # (n_states,), errors that count as one
-    converged: npt.NDArray[np.bool_]  # (unit,); the others ran out of iterations, and are no less valid
-    information: Array  # (unit, P, P), Gauss-Newton matrix of every unit's cost for V with ``[A B] = V T^T``
-    whitening: Array  # (p, p), T
-
-    def divided_by(self, ranges: Ranges) -> Refinement:
-        """Return the same for channels divided by ranges; `Ranges.inverse` is the way back."""
-        x, u = ranges.outputs, ranges.inputs
-        row = np.repeat(x, len(self.whitening))  # of the parameters V, row after row
-        return replace(
-            self,
-            pooled=ranges.normalise(self.pooled),
-            sigma=self.sigma / x[: len(self.sigma)],
-            information=self.information * row * row[:, None],
-            whitening=self.whitening * np.concatenate([x, u])[:, None],
-        )
 
     def save(self, folder: Path) -> None:
         """Write ``refinement.json`` and ``arrays.npz``."""
-        arrays = {name: getattr(self, name) for name in ("sigma", "converged", "information", "whitening")}
-        arrays |= {"A": self.pooled.A, "B": self.pooled.B}
-        save_artifact(folder, "refinement", {"strength": self.strength}, arrays)
+        save_artifact(folder, "refinement", {"strength": self.strength}, {"A": self.pooled.A, "B": self.pooled.B})
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> Refinement:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "refinement")
-        check_shapes(arrays, {"A": "nn", "B": "nm", "converged": "u", "information": "uPP"}, {}, Path(folder))
-        pooled = KoopmanMatrices(arrays.pop("A"), arrays.pop("B"))
-        return cls(pooled, content["strength"], **arrays)
+        check_shapes(arrays, {"A": "nn", "B": "nm"}, {}, Path(folder))
+        return cls(KoopmanMatrices(arrays["A"], arrays["B"]), content["strength"])

@@ -88,10 +88,10 @@ def refine_population(
     marks = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters if name in parameters}
     data = TrainingData(population, keys, lifting, values, factor, marks)
-    data.require_factors((len(keys),))
+    data.require_factors()
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
     models, refinement = _refine(data.divided_by(ranges), options or RefineOptions())
-    return ranges.restore(models), refinement.divided_by(ranges.inverse)
+    return ranges.restore(models), replace(refinement, pooled=ranges.restore(refinement.pooled))
 
 
 def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices, Refinement]:
@@ -112,14 +112,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
-    return models, Refinement(
-        pooled=problem.matrices(common),
-        strength=strength,
-        sigma=problem.sigma,
-        converged=solution.converged,
-        information=solution.matrix[:, :-1, :-1],
-        whitening=problem.T,
-    )
+    return models, Refinement(problem.matrices(common), strength)
 
 
 def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
@@ -269,31 +262,23 @@ def free_run_errors(
     keys: Sequence[EpisodeKey],
 ) -> tuple[Array, Array]:
     """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
-    shape = len(keys), lifting.n_states
-    rms, reached = np.full(shape, np.inf), np.full(shape, np.inf)
-    for start in range(0, len(keys), _TOGETHER):
-        episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
-        by_length: dict[int, list[int]] = {}
-        for row, episode in episodes.items():
-            by_length.setdefault(len(episode), []).append(row)
-        for rows in by_length.values():
-            values = {name: given[rows] for name, given in parameters.items()}
-            part = KoopmanMatrices(models.A[rows], models.B[rows])
-            rms[rows], reached[rows] = _errors(part, lifting, values, [episodes[row] for row in rows])
-    return rms, reached
-
-
-def _errors(
-    models: KoopmanMatrices, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
-) -> tuple[Array, Array]:
-    """Do the same for episodes of one length."""
-    n, h, recorded = lifting.n_states, lifting.history, np.stack(episodes)
-    x = recorded[..., :n]
-    run = free_run(models.A, models.B, lifting, parameters, x[:, : h + 1], recorded[..., n:])
-    with np.errstate(over="ignore", invalid="ignore"):
-        rms = np.sqrt(np.mean((run - x) ** 2, axis=1))
-        reached = np.abs(run).max(axis=1)
-    return np.where(np.isfinite(rms), rms, np.inf), np.where(np.isfinite(reached), reached, np.inf)
+    n, h = lifting.n_states, lifting.history
+    errors = []
+    for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
+        episodes = [population.read(key) for key in keys[part]]
+        recorded = np.zeros((len(episodes), max(map(len, episodes)), episodes[0].shape[1]))
+        for row, episode in enumerate(episodes):
+            recorded[row, : len(episode)] = episode
+        values = {name: given[part] for name, given in parameters.items()}
+        first, u = recorded[:, : h + 1, :n], recorded[..., n:]
+        runs = free_run(models.A[part], models.B[part], lifting, values, first, u)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for episode, run in zip(episodes, runs, strict=True):
+                x, reached = episode[:, :n], run[: len(episode)]
+                errors.append((np.sqrt(np.mean((reached - x) ** 2, axis=0)), np.abs(reached).max(axis=0)))
+    both = np.array(errors)
+    both[~np.isfinite(both)] = np.inf
+    return both[:, 0], both[:, 1]
 
 
 def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:

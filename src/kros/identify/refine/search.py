@@ -20,14 +20,7 @@ class Solution:
     """Where the search ended."""
 
     V: Array  # (problem, rows, columns)
-    matrix: Array  # [J r]^T [J r] at V, (problem, P + 1, P + 1)
-    iterations: int
-    converged: npt.NDArray[np.bool_]  # (problem,)
-
-    @property
-    def cost(self) -> Array:
-        """Sum of squared residuals, shape (problem,)."""
-        return self.matrix[:, -1, -1]
+    cost: Array  # sum of squared residuals, (problem,)
 
 
 @dataclass(frozen=True)
@@ -97,7 +90,7 @@ class GaussNewton:
             mu = np.where(better, mu / self.factor, mu * self.factor)
             damping[rows] = np.clip(mu, self.least_damping, self.most_damping)
             used += 1
-        return Solution(V, matrix, used, done)
+        return Solution(V, matrix[:, -1, -1])
 
 
 def _step(matrix: Array, mu: Array) -> Array:

@@ -48,10 +48,6 @@ class Segments:
         """Return the first segments of every unit."""
         return self._each(lambda values: values[..., :count])
 
-    def one_by_one(self) -> Segments:
-        """Return every segment as a unit with one segment."""
-        return self._each(lambda values: values.reshape(*values.shape[:-2], -1, 1))
-
     def cut(self, horizon: int) -> Segments:
         """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
         length = min(horizon, self.horizon) + 1
@@ -81,7 +77,8 @@ def read_segments(
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
         rng = np.random.default_rng([seed, row])
-        owners = segment_owners(keys, count)[row]
+        earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
+        owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):
             samples = _read(population, episodes[episode], history)
             for column in np.flatnonzero(owners == episode):
@@ -99,16 +96,6 @@ def _read(population: Population, key: EpisodeKey, history: int) -> Array:
         problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
         raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
     return samples
-
-
-def segment_owners(keys: Keys, count: int) -> npt.NDArray[np.int64]:
-    """Return which episode of its unit each segment comes from, shape (unit, segment)."""
-    held = held_segments(count, keys)
-    owners = np.empty((len(keys), count), dtype=np.int64)
-    for row, episodes in enumerate(keys.values()):
-        earlier = max(1, len(episodes) - 1)
-        owners[row] = [*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held]
-    return owners
 
 
 def held_segments(count: int, keys: Keys) -> int:

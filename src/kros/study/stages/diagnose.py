@@ -1,6 +1,6 @@
 """What the report says about the uncertainty beside its weights; later stages use nothing of it.
 
-models of resampled episodes    --> which share of the residuals finite recordings make    uncertainty/<model>/noise
+EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
 residuals of all units          --> beside the weights                                     uncertainty/<model>/units
 the most conspicuous unit       --> against the cover of all the others                    outliers/<models>/others
 """
@@ -55,7 +55,7 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     tasks: list[Task] = [
         (folder / kind / "noise", noise)
         for kind, one in sets.items()
-        if one.nominal >= 0
+        if one.nominal >= 0 and kind in models.edmd_kinds
         for noise in _noise(context, kind, one)
     ]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare

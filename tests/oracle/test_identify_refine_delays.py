@@ -101,7 +101,7 @@ def rows(models: KoopmanMatrices) -> np.ndarray:
 
 def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     population, keys, factor, W = machines(2, 0.0, seed=5, spread=0.0)
-    models, _ = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
     shift = np.concatenate([models.A, models.B], axis=-1)[:, 3]
     np.testing.assert_allclose(

@@ -90,8 +90,8 @@ Parts of the phase calibration are no longer public; kros.identify calibrates, a
     kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase
 Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.
     kros.identify.lifted_factor kros.identify.reduce_episode
-Refined models have no class apart from others; refine_population returns their matrices and a Refinement.
-    kros.identify.refine.RefinedModels
+Refined models have no class apart from others; refine_population returns their matrices.
+    kros.identify.refine.RefinedModels kros.identify.refine.Refinement
 Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).
     kros.lifting.concatenate
 TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).

@@ -24,10 +24,9 @@ from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor, Ranges
 from ..free_run import free_run
 from .metric import ResponsePrior, peak_residual
-from .model import Refinement, TrainingData
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import Evaluate, GaussNewton, RefineOptions, Solution
-from .segments import Segments, held_segments, read_segments
+from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -42,7 +41,7 @@ def refine_population(
     factor: Factor,
     pooled: npt.NDArray[np.bool_] | None = None,
     options: RefineOptions | None = None,
-) -> tuple[KoopmanMatrices, Refinement]:
+) -> KoopmanMatrices:
     """Refine the models of a population on free-run error.
 
     Parameters
@@ -60,9 +59,8 @@ def refine_population(
 
     Returns
     -------
-    models : KoopmanMatrices
+    KoopmanMatrices
         Stable linear models with a bounded re-lifted free run on every training episode.
-    refinement : Refinement
 
     Raises
     ------
@@ -81,7 +79,7 @@ def refine_population(
     >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
     >>> factor = combine(episode_factors(motors, keys, Lifting(motors.states)))
     >>> options = RefineOptions(horizons=(20,), segments=4, search=GaussNewton(iterations=3), path_iterations=3)
-    >>> models, refinement = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
+    >>> models = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
     >>> models.A.shape, bool(models.spectral_radius().max() < 1)
     ((2, 3, 3), True)
     """
@@ -90,11 +88,10 @@ def refine_population(
     data = TrainingData(population, keys, lifting, values, factor, marks)
     data.require_factors()
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
-    models, refinement = _refine(data.divided_by(ranges), options or RefineOptions())
-    return ranges.restore(models), replace(refinement, pooled=ranges.restore(refinement.pooled))
+    return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions()))
 
 
-def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices, Refinement]:
+def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     """Refine in channels divided by their ranges."""
     count, longest = options.segments, max(options.horizons)
     segments = read_segments(data.population, data.keys, longest, count, options.seed, data.lifting.history)
@@ -112,7 +109,7 @@ def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices
     models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
-    return models, Refinement(problem.matrices(common), strength)
+    return models
 
 
 def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:

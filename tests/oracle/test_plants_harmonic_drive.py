@@ -174,6 +174,5 @@ def test_at_rest_the_load_torque_is_gravity_and_the_current_holds_it(drives):
                 gravity, abs=2e-3
             )  # the twist turns the load by less than 5 mrad
             held = drives.raw.read(key)[:1000, 2].mean()
-            assert held == pytest.approx(
-                truth.load_torque(key)[0] + truth.parameters.take([row]).gearbox_current(start[3:4])[0], abs=2e-3
-            )
+            physics = Physics(truth.parameters.take([row]), np.ones(1), start[3:4])
+            assert held == pytest.approx(truth.load_torque(key)[0] + physics.disturbance(start[3:4])[0], abs=2e-3)

@@ -66,21 +66,21 @@ class Physics:
         self.q[:] = q0
         for _ in range(20):
             self.z[TWIST] = self.moment * np.sin(self.q - self.z[TWIST]) / p.stiffness
-        self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + p.gearbox_current(self.q)
+        self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + self.disturbance(q0)
 
     def advance(self) -> None:
         """Move on by one sampling period with the command in `z[COMMAND]` held."""
         q, z = self.q, self.z
         for _ in range(SUBSTEPS):
             middle = q + z[W] * (0.5 * SUBSTEP_S)
-            z[FM] = self._disturbance(middle) * -self.p.torque_constant - self.p.dry_friction(z[W])
+            z[FM] = self.disturbance(middle) * -self.p.torque_constant - self.p.dry_friction(z[W])
             z[FL] = np.sin(middle - z[TWIST]) * -self.moment
             moved = np.einsum("ijn,jn->in", self.M, z)
             z[:4] = moved[:4]
             q += moved[4]
 
-    def _disturbance(self, q: Array) -> Array:
-        """(34): i_d is the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
+    def disturbance(self, q: Array) -> Array:
+        """Return i_d of (34), a fraction of full scale: Im sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
         angle = q * GEAR_RATIO
         e = np.cos(angle) + 1j * np.sin(angle)
         total = self.ripple[-1] * e

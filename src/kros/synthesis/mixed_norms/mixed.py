@@ -98,7 +98,7 @@ def mixed(
 
 
 def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:
-    """Return the H2 optimum where it meets the constraint, else the best controller of inequalities and improvement."""
+    """Return the H2 optimum where it meets the constraint, else the best controller of the inequalities."""
     end = time.perf_counter() + time_limit_s
     require_plant(plant, "Mixed synthesis")
     if plant.dt == 0 or not plant.sizes[0]:
@@ -116,8 +116,10 @@ def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limi
     bare = replace(plant, D22=np.zeros_like(plant.D22))
     cross = h2_norm(plant.channel(plant.rows(2), plant.columns(1)).close(free.controller)) / gamma or 1.0
     plants = [scaled(bare, scaling * cross) for scaling in _SCALINGS]
-    result = min(_candidates(plants, gamma, max_states, end), key=_cost)
-    lower, gap, notes = enclosed(_cost(result), free.lower_bound)
+    candidates = _candidates(plants, gamma, max_states, end)
+    norms = [candidate.h2_norm or 0.0 for candidate in candidates]
+    result = candidates[int(np.argmin(norms))]
+    lower, gap, notes = enclosed(min(norms), free.lower_bound)
     controller = absorb_feedthrough(result.controller, plant.D22)
     return replace(result, controller=controller, lower_bound=lower, gap_percent=gap, notes=(*result.notes, *notes))
 
@@ -127,10 +129,6 @@ def _least(plant: GeneralizedPlant) -> float:
     if h2_violations(plant, proper=False):
         return frequency_bound(scale(plant))
     return hinf(plant).lower_bound or 0.0
-
-
-def _cost(candidate: Synthesis) -> float:
-    return np.inf if candidate.h2_norm is None else candidate.h2_norm
 
 
 def _candidates(plants: list[GeneralizedPlant], gamma: float, max_states: int, end: float) -> list[Synthesis]:

@@ -37,7 +37,7 @@ from .equations import absorb_feedthrough, solve_riccati
 Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
-_DOUBT = _EPS**0.5  # relative: conditions that hold or fail by less than this decide nothing
+_DOUBT = float(np.sqrt(_EPS))  # relative: conditions that hold or fail by less than this decide nothing
 _SINGULAR = 1e-2 / _EPS  # condition of a matrix that rounding makes singular
 
 

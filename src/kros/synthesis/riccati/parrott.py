@@ -20,27 +20,29 @@ from ..generalized_plant import GeneralizedPlant
 Array = npt.NDArray[Any]
 
 _EPS = float(np.finfo(float).eps)
-_RANK = _EPS**0.5  # relative: signals that are smaller prove nothing
+_RANK = float(np.sqrt(_EPS))  # relative: signals that are smaller prove nothing
 
 
 def frequency_bound(p: GeneralizedPlant, rounds: int = 5) -> float:
     """Return the largest bound of the frequencies around all poles, refined around the largest some rounds."""
     sides = (p.A, p.B1, p.C1, p.D11, p.C2, p.D21), (p.A.T, p.C1.T, p.B1.T, p.D11.T, p.B2.T, p.D12.T)
     best = 0.0
-    for A, B, C, D, C_y, D_y in sides:
+    for side in sides:
+        A, _, _, D, _, D_y = side
         free = null_space(D_y)
         best = max(best, float(np.linalg.norm(D @ free, 2)) if D.size and free.size else 0.0)
         points = _grid(A, p.dt) if len(A) and D.size else np.zeros(0)
         for _ in range(rounds if points.size else 0):
-            bounds = _bounds(A, B, C, D, C_y, D_y, points, p.dt)
+            bounds = _bounds(side, points, p.dt)
             k = int(np.argmax(bounds))
             best = max(best, float(bounds[k]))
             points = np.linspace(points[max(k - 1, 0)], points[min(k + 1, len(points) - 1)], 9)
     return best
 
 
-def _bounds(A: Array, B: Array, C: Array, D: Array, C_y: Array, D_y: Array, rad: Array, dt: float) -> Array:
+def _bounds(side: tuple[Array, ...], rad: Array, dt: float) -> Array:
     """Return the bounds at frequencies, rad/s, in discrete time rad per sample."""
+    A, B, C, D, C_y, D_y = side
     n, m, q = len(A), B.shape[1], len(C_y)
     # z - 1 keeps the digits at low frequency, where z and A are both close to one.
     point, shifted = (np.expm1(1j * rad), A - np.eye(n)) if dt > 0 else (1j * rad, A)

@@ -25,7 +25,6 @@ FORMS = {
     "inverse_input_multiplicative",
     "inverse_output_multiplicative",
 }
-KINDS = ("koopman", "linear", "koopman_edmd", "linear_edmd")
 CHANNELS = {"position", "velocity", "current"}
 
 

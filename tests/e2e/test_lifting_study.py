@@ -116,7 +116,6 @@ def test_models_with_delays_and_input_functions_are_refined(study, kros, tmp_pat
     models, linear = (ModelSet.load(tmp_path / "run" / "models" / name) for name in ("koopman", "linear"))
     assert (models.lifting.history, models.inputs) == (2, ("u", "w", "v*u"))
     assert (models.A.shape, models.B.shape, linear.B.shape) == ((3, 4, 4), (3, 4, 3), (3, 2, 2))
-    assert (tmp_path / "run" / "refinement" / "koopman" / "refinement.json").is_file()
     truth = np.array([[[0.9, 0.1, 0, 0], [0, 0.8, 1 + 0.1 * unit, 1 + 0.1 * unit]] for unit in (1, 2, 3)])
     found = np.concatenate([models.A[:, :2, :2], models.B[:, :2, :2]], axis=2)
     np.testing.assert_allclose(found, truth, atol=0.03)  # the prior draws units together whose gains differ by a tenth

@@ -45,7 +45,6 @@ def models(n_units: int = 3) -> ModelSet:
         A=A,
         B=np.array([[0.0], [1.0], [0.3]]) + 0.01 * rng.normal(size=(n_units, 3, 1)),
         parameters={"phase": np.zeros(n_units)},
-        residual_covariance=np.broadcast_to(np.eye(3), A.shape),
         output_scale=np.array([1.0, 2.0, 1.0]),
         input_scale=np.array([3.0]),
     )

@@ -35,7 +35,7 @@ estimator or residual_h2.
     kros.observer.tune_observer kros.observer.in_sizes
 Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.
     kros.observer.EstimateKind
-Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.
+Refined models of resampled episodes are no longer part of kros; use bootstrap_edmd, or the noise_share of a run.
     kros.identify.bootstrap_refined
 Disturbed measurements of every observer, unit and condition are no longer part of a study; use evaluate.robustness =
 true.
@@ -66,9 +66,9 @@ Worst-case H-infinity observers and gains are no longer part of kros; use worst_
 member too.
     kros.synthesis.worst_case_hinf kros.synthesis.robust_gain kros.synthesis.RobustGain
     synthesis.methods=worst_case_hinf
-Controllers are no longer polished by descent; use reduce_controller, which truncates in balanced coordinates and
-certifies the result.
-    kros.synthesis.polish synthesis.max_states synthesis.tune
+Controllers are no longer polished or reduced in order; use balred of python-control, and close the plant's loop with
+the result for its norms.
+    kros.synthesis.polish kros.synthesis.reduce_controller synthesis.max_states synthesis.tune
 Placed poles are no longer part of kros; use kalman.
     kros.synthesis.luenberger
 Random members of the uncertain set are no longer drawn in a study; the certificate bounds all of them, and the report
@@ -90,8 +90,8 @@ Parts of the phase calibration are no longer public; kros.identify calibrates, a
     kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase
 Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.
     kros.identify.lifted_factor kros.identify.reduce_episode
-Refined models have no class apart from others; refine_population returns their matrices and a Refinement.
-    kros.identify.refine.RefinedModels
+Refined models have no class apart from others; refine_population returns their matrices.
+    kros.identify.refine.RefinedModels kros.identify.refine.Refinement
 Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).
     kros.lifting.concatenate
 TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).

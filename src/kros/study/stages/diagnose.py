@@ -1,6 +1,6 @@
 """What the report says about the uncertainty beside its weights; later stages use nothing of it.
 
-models of resampled episodes    --> which share of the residuals finite recordings make    uncertainty/<model>/noise
+EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
 residuals of all units          --> beside the weights                                     uncertainty/<model>/units
 the most conspicuous unit       --> against the cover of all the others                    outliers/<models>/others
 """
@@ -54,7 +54,10 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
     tasks: list[Task] = [
-        (folder / kind / "noise", noise) for kind, one in sets.items() for noise in _noise(context, kind, one)
+        (folder / kind / "noise", noise)
+        for kind, one in sets.items()
+        if kind in models.edmd_kinds
+        for noise in _noise(context, kind, one)
     ]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]

@@ -38,7 +38,6 @@ Ratio = Callable[[Array, Array], tuple[Array, Array]]
 _CORRELATED = 1e-10  # regularises the coordinates, in which everything holds whatever they are
 _ROUNDING = 1e-7  # of responses, relative
 _RESOLVENT = 1e-14  # of resolvents, relative, for every state: what counts near a pole
-_ROUNDS = 60
 
 
 class Enclosure:
@@ -101,14 +100,14 @@ def _even_coordinates(system: StateSpace) -> Array:
     return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0) + _CORRELATED))
 
 
-def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000) -> Array:
+def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000, rounds: int = 60) -> Array:
     """Return what a ratio of responses nowhere falls below, for every channel."""
     theta, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     proven, seen = ratio(theta, half)
     least = seen.min(axis=0)
     done = np.full_like(least, np.inf)
     tried = len(theta)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         least = np.minimum(least, seen.min(axis=0, initial=np.inf))
         loose = (proven < (1 - rtol) * least).any(axis=1)
         done = np.minimum(done, proven[~loose].min(axis=0, initial=np.inf))

@@ -28,7 +28,6 @@ from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
 from ..observer.screen import Screen
 from ..observer.units import factors, in_sizes
-from ..uncertainty.band_energies import BandEnergies
 from .monitor import settling
 from .task import Design, DesignTask
 from .validation import TrainingSet, ValidationSet, hidden_mean
@@ -93,11 +92,10 @@ def _certified_models(
     errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
     hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
     lost = loss_error_percent(observers, data, settings)
-    known: dict[bytes, BandEnergies] = {}
     certified = []
     for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
         observer = observers[k]
-        bound = signal_bound(certificate, observer, batch, arrived[k], known)
+        bound = signal_bound(certificate, observer, batch, arrived[k])
         bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
         certificate = certificate.in_sizes(observer, {})
         facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))

@@ -44,6 +44,7 @@ class CertificateSettings:
     losses: int = 12  # patterns of lost measurements that are simulated; in the first one they stop
     box: float = 1.5  # operating box in ranges, where slopes of a lifting have no global bounds
     room: float = 1.0  # by which estimates may leave what they and the recordings were in training, in ranges
+    largest: float = 2.0  # most that an estimate may be where measurements are lost, of the largest value in training
 
 
 DEFAULT = CertificateSettings()
@@ -198,7 +199,7 @@ def guards_of(
     """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
     n, q = observers[0].lifting.n_states, list(observers[0].measured)
     low, high = np.full((len(observers), n), np.inf), np.full((len(observers), n), -np.inf)
-    largest = [np.zeros(o.controller.n_states) for o in observers]
+    size, largest = np.zeros(n), [np.zeros(o.controller.n_states) for o in observers]
     for part in data:
         batch, y, recorded = part.batch, part.measurements(q), part.batch.states.shape[-1]
         for first in (0, len(y) // 2):
@@ -207,24 +208,27 @@ def guards_of(
             states, least, most = batch.states[first:], np.full(n, np.inf), np.full(n, -np.inf)
             least[:recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
             most[:recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+            size = np.maximum(size, np.maximum(np.abs(least), np.abs(most)))
             low = np.minimum(low, np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least))
             high = np.maximum(high, np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most))
             for i, o in enumerate(observers):
                 nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
                 corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
                 largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
-    return [_guard(o, a, b, c, settings.room) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
+    most = settings.largest * size
+    room, tiny = settings.room * np.maximum(high - low, np.finfo(float).tiny), np.finfo(float).tiny
+    low, high = np.maximum(low - room, np.minimum(low, -most)), np.minimum(high + room, np.maximum(high, most))
+    corrections = [(1 + 2 * settings.room) * np.maximum(c, tiny) for c in largest]
+    return [_guard(*one) for one in zip(observers, low, high, corrections, strict=True)]
 
 
-def _guard(observer: Observer, low: Array, high: Array, correction: Array, room: float) -> Guard | None:
+def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Guard | None:
     """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
     if not all(np.isfinite(side).all() for side in (low, high, correction)):
         return None
-    wider = room * np.maximum(high - low, np.finfo(float).tiny)
-    low, high, at = low - wider, high + wider, list(observer.measured)
-    screen = Screen.of(observer).measured
+    at, screen = list(observer.measured), Screen.of(observer).measured
     low[at], high[at] = np.minimum(low[at], screen.least), np.maximum(high[at], screen.most)
-    return Guard(low, high, (1 + 2 * room) * np.maximum(correction, np.finfo(float).tiny), settling(observer))
+    return Guard(low, high, correction, settling(observer))
 
 
 def in_recorded_units(design: Design) -> Design:

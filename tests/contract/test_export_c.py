@@ -54,24 +54,6 @@ def test_the_selftest_leaves_out_bits_at_a_threshold(factor, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("precision", ["double", "float"])
-def test_a_machine_that_is_told_its_condition(precision, tmp_path):
-    observer, (y, u) = MACHINES["monitor"](), samples(800, faults=False)
-    folder = export_c(observer, tmp_path / "c", "drive", precision)
-    compiled = CompiledObserver.build(folder, flags=(*STRICT, "-Wno-unused-function"))
-    outside = []
-    for condition in (None, *observer.monitor.bounds):
-        wanted, found = in_python(observer, y, u, condition=condition)[1], compiled.run(y, u, condition=condition)[1]
-        np.testing.assert_array_equal(found, wanted)
-        outside.append(int(np.count_nonzero(wanted & 8)))
-    assert outside[1] < outside[0] < outside[2]
-    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
-        compiled.run(y, u, condition="loaded")
-    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
-        in_python(observer, y, u, condition="loaded")
-
-
-@needs_compiler
 @pytest.mark.parametrize("kind", ["lifted", "limits", "through the input", "filter bank"])
 def test_a_parameter_that_follows_the_machine(kind, tmp_path):
     observer, (y, u) = MACHINES[kind](), samples(800)

@@ -215,19 +215,20 @@ def guards_of(
                 nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
                 corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
                 largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
-    most = settings.largest * size
-    room, tiny = settings.room * np.maximum(high - low, np.finfo(float).tiny), np.finfo(float).tiny
+    room, most = settings.room * np.maximum(high - low, np.finfo(float).tiny), settings.largest * size
     low, high = np.maximum(low - room, np.minimum(low, -most)), np.minimum(high + room, np.maximum(high, most))
-    corrections = [(1 + 2 * settings.room) * np.maximum(c, tiny) for c in largest]
-    return [_guard(*one) for one in zip(observers, low, high, corrections, strict=True)]
+    return [_guard(o, a, b, c, settings) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
 
 
-def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Guard | None:
+def _guard(
+    observer: Observer, low: Array, high: Array, correction: Array, settings: CertificateSettings
+) -> Guard | None:
     """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
     if not all(np.isfinite(side).all() for side in (low, high, correction)):
         return None
     at, screen = list(observer.measured), Screen.of(observer).measured
     low[at], high[at] = np.minimum(low[at], screen.least), np.maximum(high[at], screen.most)
+    correction = (1 + 2 * settings.room) * np.maximum(correction, np.finfo(float).tiny)
     return Guard(low, high, correction, settling(observer))
 
 

@@ -76,14 +76,14 @@ def fit_monitor(
     }
     weights = weighted(steady(largest, settings))
     peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
-    bound, bounds = _bounds(peaks, units, settings)
+    bound = bound_of_peaks([max((p for (u, _), p in peaks.items() if u == unit), key=max) for unit in units], settings)
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
     step = np.sqrt(np.nanmean([e.step_square() for e in every], axis=0))
     hours = sum(e.moving(settings.moving * step) for e in every) * observer.sample_period_s / 3600
     loud = [p for group, of in squares.items() if max(peaks[group]) > bound for p in of()]
     alarms = sum(_alarms(_decibels(p, weights) > bound) for p in loud)
-    return replace(free, limits=limits, weights=weights, bounds=bounds, hours=hours, alarms=alarms)
+    return replace(free, limits=limits, weights=weights, hours=hours, alarms=alarms)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,17 +138,6 @@ def _mean_squares(monitor: Monitor, episodes: Sequence[Judged]) -> list[Array]:
 
 def _alarms(above: npt.NDArray[np.bool_]) -> int:
     return int(np.count_nonzero(above[1:] & ~above[:-1]))
-
-
-def _bounds(
-    peaks: Mapping[Group, list[float]], units: Sequence[str], settings: MonitorSettings
-) -> tuple[float, dict[str, float]]:
-    """Return the bound of levels over all conditions, dB, and what is added to it in every condition."""
-    conditions = list(dict.fromkeys(condition for _, condition in peaks))
-    loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
-    bound = bound_of_peaks(loudest, settings)
-    of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions if len(conditions) > 1}
-    return bound, {c: bound_of_peaks(p, settings) - bound for c, p in of.items() if len(p) >= LEAST_SCORES}
 
 
 def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings = DEFAULT) -> float:

@@ -97,7 +97,8 @@ class _File(_Part):
     about: dict[str, Any] = Field(default_factory=dict)
 
 
-_Whole = create_model("_Whole", __base__=_File, **{key: (_part(kind) | None, None) for key, kind in _PARTS.items()})
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:

@@ -18,14 +18,14 @@ its start: while they go by, all that the monitor remembers is held.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, DataError
+from ..core.errors import DataError
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -55,9 +55,6 @@ class Monitor:
         Whole numbers, how often a band counts.
     false_alarm_rate : float
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
-    bounds : mapping of str to float
-        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it
-        may be told in which it is.
     units : int
         Machines that the bound was found on.
     hours : float
@@ -89,7 +86,6 @@ class Monitor:
     limits: Array
     weights: Array
     false_alarm_rate: float
-    bounds: Mapping[str, float] = field(default_factory=dict)
     units: int = 0
     hours: float = 0.0
     alarms: int = 0
@@ -129,8 +125,6 @@ class Monitor:
                 f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found "
                 f"{self.weights}."
             )
-        if not np.isfinite(list(self.bounds.values())).all():
-            raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
 
     def times(self, y: Array) -> Self:
         """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
@@ -191,11 +185,9 @@ class Monitor:
         rest, _ = lfilter([self.forget], [1, -keep], squares[falling:], axis=0, zi=last)
         return np.concatenate([begun, rest])
 
-    def level(self, mean_squares: Array, condition: str | None = None) -> Array:
-        """Return the level over the bound in dB, (...), of mean squares (..., q, bands), in a condition or any."""
-        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(
-            condition
-        )
+    def level(self, mean_squares: Array) -> Array:
+        """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
+        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT)
 
     def band_levels(self, mean_squares: Array) -> Array:
         """Return the level of every band over its limit in dB, shape (..., q, bands)."""
@@ -205,24 +197,6 @@ class Monitor:
         """Return the centre frequencies of the bands, shape (bands,)."""
         _, a1, a2 = self.filters.T
         return np.asarray(np.arccos(-a1 / (1 + a2)) / (2 * np.pi * sample_period_s))
-
-    def bound(self, condition: str | None) -> float:
-        """Return the bound of a condition, dB over that of all; None is any.
-
-        Raises
-        ------
-        ConfigError
-        """
-        if condition is not None and condition not in self.bounds:
-            raise ConfigError(
-                f"Monitor of an observer: the condition {condition!r} is unknown; known are "
-                f"{', '.join(self.bounds) or 'none'}."
-            )
-        return 0.0 if condition is None else float(self.bounds[condition])
-
-    def product(self, condition: str | None) -> float:
-        """Return the product that a machine in a condition may have."""
-        return float(10 ** (self.bound(condition) * WEIGHT / 10))
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -261,18 +235,7 @@ class Watch:
         self._limits = (1 / monitor.limits).tolist()
         self._weights: list[list[int]] = monitor.weights.astype(int).tolist()
         self._monitor = monitor
-        self.condition = None
         self.reset()
-
-    @property
-    def condition(self) -> str | None:
-        """Condition that the machine is in; None where that is not known."""
-        return self._condition
-
-    @condition.setter
-    def condition(self, name: str | None) -> None:
-        """Change the bound from the next sample that is judged on."""
-        self._condition, self._bound = name, self._monitor.product(name)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -314,11 +277,9 @@ class Watch:
                     product *= share
         gain /= 1.0 + gain
         self._gain = gain if gain > self._forget else self._forget
-        self.outside = product > self._bound
+        self.outside = product > 1.0
 
     @property
     def level_db(self) -> float:
         """Level of the innovation over its bound, dB; far below zero before anything was judged."""
-        return float(
-            self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition)
-        )
+        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory])))

@@ -307,8 +307,6 @@ class Source:
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),
             "settle": own.settle,
-            "conditions": [plain(c) for c in own.bounds],
-            "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
             "rates": {
                 "percent": f"{100 * own.false_alarm_rate:g}",

@@ -142,7 +142,6 @@ def _golden(observer: Observer, source: Source, track: str | None, tolerance: fl
 
 def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
     deployed = json_bytes(with_checksum(observer_content(observer)))
-    conditions = [] if observer.monitor is None else list(observer.monitor.bounds)
     return {
         "name": context["name"],
         "precision": context["real"],
@@ -154,7 +153,6 @@ def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "state_bytes": context["state_bytes"],
         "numerical_error": context["accuracy"],
-        **({"conditions": conditions} if conditions else {}),
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
@@ -176,6 +174,6 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     reals += of("n") + of("order") + 2 if of("tracked") else 0
     reals += 2 * of("recorded") + of("q") * (bank["filters"] + 1) if bank else 0
     reals += of("q") * monitor["bands"] * 3 + 1 if monitor else 0
-    words = of("m") + bool(of("delay")) + bool(monitor) + 2 + bool(monitor and monitor["conditions"])
+    words = of("m") + bool(of("delay")) + bool(monitor) + 2
     align = 8 if doubles or real == 8 else 4
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align

@@ -144,7 +144,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
                 values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
                 judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
-        level = highest_level(monitor, judged, condition)
+        level = highest_level(monitor, judged)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
         row: dict[str, Any] = {"unit": unit, "condition": condition, "outlier": outlier, "level_db": level}
         row |= dict.fromkeys(("score", "threshold", "detectable"))
@@ -155,9 +155,9 @@ def monitored(recordings: FieldRecordings) -> Rows:
     return rows
 
 
-def highest_level(monitor: Monitor | None, innovations: Judged, condition: str) -> float | None:
-    """Return the highest level over the bound of a condition, dB; None where nothing is judged."""
+def highest_level(monitor: Monitor | None, innovations: Judged) -> float | None:
+    """Return the highest level over the bound, dB; None where nothing is judged."""
     if monitor is None or not any(judged.any() for _, judged in innovations):
         return None
     squares = np.concatenate(monitor.in_turn(innovations))
-    return float(monitor.level(squares, condition if condition in monitor.bounds else None).max())
+    return float(monitor.level(squares).max())

@@ -4,11 +4,12 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from batches import run_with_status
 
 from kros.core import StateSpace
 from kros.export import CompiledObserver, export_c
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
+from kros.observer import FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers
 from kros.observer.simulate import Course
 from kros.synthesis import Injection
 

@@ -27,7 +27,7 @@ from .running import Estimate, RunningObserver
 from .runtime import Guard, Runtime, Seen
 from .screen import SampleStatus, sample_status
 from .sensor import Sensor
-from .simulate import run_observer, run_observers, run_with_status
+from .simulate import run_observer, run_observers
 from .tracking import Tracked, track_parameter
 
 __all__ = [
@@ -54,7 +54,6 @@ __all__ = [
     "relift_certificate",
     "run_observer",
     "run_observers",
-    "run_with_status",
     "sample_status",
     "signal_bound",
     "track_parameter",

@@ -111,12 +111,6 @@ class Runtime:
         low = self.lower is not None and bool(np.any(x <= self.lower))
         return low or (self.upper is not None and bool(np.any(x >= self.upper)))
 
-    def clips_alike(self, other: Runtime) -> bool:
-        """Whether two observers have the same delay, and their estimates the same limits."""
-        ours, theirs = self.limits(), other.limits()
-        same = ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
-        return same and self.delay == other.delay
-
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         low, high = (side if side is None else side[: x.shape[-1]] for side in (self.lower, self.upper))

@@ -22,7 +22,7 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
@@ -169,11 +169,6 @@ class Screen:
 
     measured: Bounds
     inputs: Bounds
-
-    def same_as(self, other: Screen) -> bool:
-        """Whether two screens judge alike."""
-        pairs = ((self.measured, other.measured), (self.inputs, other.inputs))
-        return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for a, b in pairs for f in fields(Bounds))
 
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:

@@ -226,8 +226,8 @@ def _guard(
     """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
     if not all(np.isfinite(side).all() for side in (low, high, correction)):
         return None
-    at, screen = list(observer.measured), Screen.of(observer).measured
-    low[at], high[at] = np.minimum(low[at], screen.least), np.maximum(high[at], screen.most)
+    at, q, screen = list(observer.measured), len(observer.measured), Screen.of(observer)
+    low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
     correction = (1 + 2 * settings.room) * np.maximum(correction, np.finfo(float).tiny)
     return Guard(low, high, correction, settling(observer))
 

@@ -15,7 +15,7 @@ from ...motor_drive import AngleLoad
 from ...observer import Observer
 from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
 from ...observer.runtime import bounds
-from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
+from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
@@ -160,8 +160,8 @@ class Source:
             "clips_estimate": run.lower is not None or run.upper is not None,
             **{k: wide.numbers(np.full(o.lifting.n_states, end) if v is None else v) for k, (v, end) in ends.items()},
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
-            "y_bounds": self.bounds(screen.measured),
-            "u_bounds": self.bounds(screen.inputs),
+            "y_bounds": self.bounds(screen)[: len(o.measured)],
+            "u_bounds": self.bounds(screen)[len(o.measured) :],
             "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
 
@@ -353,7 +353,7 @@ class Source:
         """Return literals in double precision."""
         return [Precision().literal(float(v)) for v in values]
 
-    def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
+    def bounds(self, bounds: Screen) -> list[dict[str, str]]:
         """Return the bounds of every channel in double precision, and those of good samples in single."""
         most, single = float(np.finfo(float).max), float(np.finfo(np.float32).max)
         rows = []

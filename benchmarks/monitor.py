@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.stats import beta
+from scipy.stats import beta, chi2
 
 import kros
 from kros.data import EpisodeBatch, Unit
@@ -28,7 +28,6 @@ from kros.design.monitor import MonitorSettings, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
-from kros.observer.monitor import poisson_interval
 from kros.observer.simulate import run_innovations
 from kros.plants.harmonic_drive.parameters import DriveParameters, draw_parameters
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
@@ -98,7 +97,7 @@ def levels(observer: Observer, recorded: TrainingSet) -> list[tuple[str, str, np
         y = batch.measurements(observer.measured)
         nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), monitor.settle)
         step = np.abs(np.diff(y, axis=0, prepend=y[:1]))[..., 0]
-        motion = np.cumsum(step > MonitorSettings().moving * np.sqrt(np.mean(step**2)), axis=0) * dt
+        motion = np.cumsum(step > 0.1 * np.sqrt(np.mean(step**2)), axis=0) * dt
         for i, key in enumerate(batch.keys):
             level = monitor.level(monitor.mean_squares(nu[:, i : i + 1], judged[:, i : i + 1])[:, 0])
             rows.append((key.unit, key.condition, level, motion[:, i]))
@@ -125,7 +124,8 @@ class Count:
     def __str__(self) -> str:
         n, k = self.units, self.alarmed
         low, high = (beta.ppf(0.025, k, n - k + 1) if k else 0.0), (beta.ppf(0.975, k + 1, n - k) if k < n else 1.0)
-        per_hour = [x / self.hours for x in (self.alarms, *poisson_interval(self.alarms))]
+        interval = [chi2.ppf(p, 2 * n) / 2 for p, n in ((0.025, self.alarms), (0.975, self.alarms + 1))]  # Garwood
+        per_hour = [x / self.hours for x in (self.alarms, *np.nan_to_num(interval))]
         share = f"{k} of {n} units, {100 * k / n:.2f} % (95 %: {100 * low:.2f} to {100 * high:.2f})"
         return f"{share}; {self.alarms} in {self.hours:.2f} h of motion, {per_hour[0]:.2f} an hour (95 %: {per_hour[1]:.2f} to {per_hour[2]:.2f})"
 

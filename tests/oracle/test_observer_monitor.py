@@ -12,7 +12,7 @@ from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor, mo
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Monitor, Observer, SampleStatus
-from kros.observer.monitor import RECOVERY, Watch, octaves, poisson_interval
+from kros.observer.monitor import RECOVERY, Watch, octaves
 from kros.observer.simulate import run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
@@ -123,11 +123,6 @@ def test_what_cannot_be_a_monitor_is_refused():
         replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), np.full((2, 3), [4, 4, 0]), 0.1))
 
 
-def test_poisson_interval_is_that_of_the_tables():
-    np.testing.assert_allclose(poisson_interval(0), (0, 3.689), atol=1e-3)
-    np.testing.assert_allclose(poisson_interval(3), (0.619, 8.767), atol=1e-3)
-
-
 def test_the_bound_is_that_of_one_more_unit():
     """Peaks sample by sample, episodes one after the other, the bound by hand; a unit that shakes is outside."""
     simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=3.0, conditions=("noload",), seed=3).simulate()
@@ -167,8 +162,7 @@ def test_the_bound_is_that_of_one_more_unit():
     over = prediction_bound(highest, 0.05) - highest.mean()
     assert abs(highest.mean() + np.sqrt(over**2 + wider)) < 1e-5  # levels are over the bound already
     facts = monitor_facts(monitor)
-    assert (facts["units"], facts["alarms"]) == (6, 0)
-    assert 0.75 * 54 < 3600 * facts["hours"] < 54
+    assert facts["units"] == 6
     loudest = records[max(found, key=found.get)]
     y, u = loudest[:, :1], loudest[:, 3:]
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide

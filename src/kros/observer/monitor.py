@@ -57,10 +57,6 @@ class Monitor:
         Probability that one more good machine exceeds the bound while it is moved as much as those in training.
     units : int
         Machines that the bound was found on.
-    hours : float
-        Motion of these machines that was judged.
-    alarms : int
-        How often the bound was exceeded in it.
     first : float
         Share that the first sample replaces, later ones less; `forget` from the beginning where it is not larger.
 
@@ -87,8 +83,6 @@ class Monitor:
     weights: Array
     false_alarm_rate: float
     units: int = 0
-    hours: float = 0.0
-    alarms: int = 0
     first: float = 0.0
 
     def __post_init__(self) -> None:
@@ -204,14 +198,6 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
     alpha = np.sin(w) / (2 * quality)
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
-
-
-def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact (Garwood) interval of the mean of a Poisson count."""
-    from scipy.special import gammaincinv  # halves of quantiles of chi-squared: its own module takes a second to load
-
-    tail = (1 - level) / 2
-    return (float(gammaincinv(count, tail)) if count else 0.0), float(gammaincinv(count + 1, 1 - tail))
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:

@@ -13,7 +13,7 @@ from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
+from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
@@ -308,13 +308,8 @@ class Source:
             "one": self.precision.literal(1.0),
             "settle": own.settle,
             "recovery": RECOVERY,
-            "rates": {
-                "percent": f"{100 * own.false_alarm_rate:g}",
-                "units": own.units,
-                "alarms": own.alarms,
-                "hours": f"{own.hours:.3g}",
-                "interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None,
-            },
+            "percent": f"{100 * own.false_alarm_rate:g}",
+            "units": own.units,
         }
 
     def guard(self) -> dict[str, Any]:

@@ -7,14 +7,17 @@ residual, so every choice of rows comes from two residuals,
 
     omega_i = x_i(k + 1) - [A_i | B_i] [theta(x); u]          with [A_i | B_i] as identified, or by least squares.
 
-A model with rows of both kinds is no member of any uncertain set, and need not be stable by itself: the correction
-makes the observer stable.
+Choices are ordered by the error that the Kalman predictor for their measured spectra promises; nothing has to be
+simulated for that. A model with rows of both kinds is no member of any uncertain set, and need not be stable by itself:
+the correction makes the observer stable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,10 +26,24 @@ from ...core.errors import DataError
 from ...core.linalg import least_squares
 from ...data import EpisodeBatch
 from ...lifting import Lifting
-from .one_step import one_step_residual
+from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
+from .one_step import mean_error_dynamics, mean_slopes, one_step_residual, residual_spectra
 
 Array = npt.NDArray[np.float64]
+_MOST_HIDDEN = 3  # beyond it, all hidden states or none are refitted
 _THIN = 3
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualModel:
+    """A model for a residual-shaped observer, with what its synthesis needs."""
+
+    refitted: tuple[int, ...]
+    A: Array  # (n_lifted, n_lifted)
+    B: Array  # (n_lifted, m)
+    dynamics: Array  # (n, n)
+    spectra: npt.NDArray[Any]  # (unit, f, n, n)
+    promised: Array  # (n,)
 
 
 def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
@@ -61,15 +78,47 @@ class Refitted:
 def refitted_models(
     lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch
 ) -> tuple[list[Refitted], Array]:
-    """Return the model as identified, and with its measured rows or all of them fitted to single steps; residuals of both."""
+    """Return the model as identified and with choices of rows fitted to single steps."""
     n = lifting.n_states
+    hidden = [i for i in range(n) if i not in measured] or list(range(n))
     fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
     both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
     residual = np.concatenate([one_step_residual(lifting, *model, x, u, values) for model in both], axis=-1)
     models = []
-    for rows in dict.fromkeys(((), tuple(sorted(measured)), tuple(range(n)))):
+    for rows in _choices(tuple(measured), hidden):
         own = [M.copy() for M in both[0]]
         for matrix, other in zip(own, both[1], strict=True):
             matrix[list(rows)] = other[list(rows)]
         models.append(Refitted(rows, own[0], own[1], tuple(i + n * (i in rows) for i in range(n))))
     return models, residual
+
+
+def residual_models(
+    lifting: Lifting,
+    A: Array,
+    B: Array,
+    measured: Sequence[int],
+    batch: EpisodeBatch,
+    noise: Array,
+    scale: Array,
+) -> list[ResidualModel]:
+    """Return models with rows of both kinds, the one that promises the smallest hidden errors first."""
+    n = lifting.n_states
+    hidden = [i for i in range(n) if i not in measured] or list(range(n))
+    refitted, residual = refitted_models(lifting, A, B, measured, batch)
+    spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, batch.units)
+    models, slopes = [], mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
+    for model in refitted:
+        dynamics = mean_error_dynamics(model.A, slopes)
+        chosen = spectra[..., model.columns, :][..., model.columns]
+        promised = promised_errors(
+            ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
+        )
+        models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))
+    return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
+
+
+def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int, ...]]:
+    others = [i for i in hidden if i not in measured]
+    sizes = range(len(others) + 1) if len(others) <= _MOST_HIDDEN else (0, len(others))
+    return [(), *(tuple(sorted(measured + some)) for size in sizes for some in combinations(others, size))]

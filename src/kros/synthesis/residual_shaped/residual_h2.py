@@ -156,6 +156,16 @@ def residual_h2(
     )
 
 
+def promised_errors(problem: ResidualProblem) -> Array:
+    """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
+    shaped = problem.scaled(BASES[1])
+    try:
+        K = shaped.correction(shaped.filter())
+    except SynthesisError:
+        return np.full(len(shaped.A), np.inf)
+    return np.asarray(np.sqrt(shaped.unit_errors(K).mean(axis=0)))
+
+
 @dataclass(frozen=True, eq=False)
 class _Scaled:
     """The problem in scaled coordinates."""

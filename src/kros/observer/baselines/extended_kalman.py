@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ...loops import Library, formulas, library, tape_of
 from ..screen import require_samples
 
 Array = npt.NDArray[np.float64]
@@ -105,8 +104,6 @@ class ExtendedKalman:
             name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))
             for name, v in {**self.parameters, **(parameters or {})}.items()
         }
-        if (loops := library()) is not None:
-            return self._compiled(loops, y, u, values)
         x = np.zeros((k, batch, n))
         x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
         P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
@@ -119,14 +116,18 @@ class ExtendedKalman:
                 earlier = lifting.window.hold(x, held) if earlier is None else earlier
                 window = np.concatenate([x, earlier], axis=-1)
                 F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
-                x = (
-                    lifting.lift(window, values) @ self.A[:n].T
-                    + lifting.lift_inputs(held, window, values) @ self.B[:n].T
-                )
+                x = self._ahead(window, held, values)
                 P = F @ P @ np.swapaxes(F, -1, -2) + Q
                 P = (P + P.swapaxes(-1, -2)) / 2
                 earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _ahead(self, window: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+        """Return the next states by the model."""
+        n, lifting = self.lifting.n_states, self.lifting
+        return np.asarray(
+            lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
+        )
 
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
@@ -135,50 +136,21 @@ class ExtendedKalman:
         L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _compiled(self, loops: Library, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
-        lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape
-        Q, tape = self.Q.reshape(-1, n, n), tape_of(lifting, m, tuple(range(n)), of_inputs=False)
-        states = np.empty((n_samples, len(Q), n, batch))
-        job = {
-            "filters": len(Q),
-            "samples": n_samples,
-            "batch": batch,
-            "q": len(self.measured),
-            "slopes": len(tape.slopes),
-        }
-        job |= {
-            "A": self.A[:n],
-            "B": self.B[:n],
-            "Q": Q,
-            "R": self.R,
-            "P": self.P0,
-            "y": y,
-            "u": u,
-            "measured": self.measured,
-        }
-        job |= {"slope": tape.slopes, "states": states}
-        loops.call("kros_kalman", formulas(lifting, tape, values, m, batch), ("kalman_job", job))
-        return states.transpose(1, 0, 3, 2)
-
     def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
-        d, lifting, n = min(self.delay, len(y) - 1), self.lifting, self.lifting.n_states
-        if lifting.history:
+        d, values = min(self.delay, len(y) - 1), {**self.parameters, **(parameters or {})}
+        if self.lifting.history:
             raise DimensionError(
                 f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
-                f"{lifting.functions}."
+                f"{self.lifting.functions}."
             )
-        before = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
-        values = {**self.parameters, **(parameters or {})}
-        found = np.empty((len(before), len(y), *before.shape[2:]))
+        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
+        late = np.empty((len(x), len(y), *x.shape[2:]))
         for step in range(d):
-            found[:, step] = before[:, 0]  # nothing arrived but where to start
-            inputs = np.broadcast_to(u[step : len(u) - d + step], (*before.shape[:-1], u.shape[-1]))
-            before = (
-                lifting.lift(before, values) @ self.A[:n].T + lifting.lift_inputs(inputs, before, values) @ self.B[:n].T
-            )
-        found[:, d:] = before
-        return found
+            late[:, step] = x[:, 0]  # nothing arrived but where to start
+            x = self._ahead(x, np.broadcast_to(u[step : len(u) - d + step], (*x.shape[:-1], u.shape[-1])), values)
+        late[:, d:] = x
+        return late
 
 
 def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:

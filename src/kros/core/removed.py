@@ -130,6 +130,8 @@ with LoadSettings.
     kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load
 The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.
     kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
+The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
+    kros.export.HeldOut
 The status bits of a batch have no run of their own; use sample_status, or step a running observer and read its status.
     kros.observer.run_with_status
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.

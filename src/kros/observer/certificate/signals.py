@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ from .error import ErrorSystem, ReliftScales, error_system
 from .proof import proven_gain
 
 Array = npt.NDArray[np.float64]
-_OTHERS = 1e-3  # weight of other states' errors, with which the Riccati equation is better conditioned; sound for any
+_OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
 _ROUNDING = 1e-6
 
 
@@ -196,9 +197,10 @@ def mismatch_gains(system: ErrorSystem, acted: Array, n: int) -> Array:
         return np.zeros(n)
     rest, top, gains = system.mismatch(), float(acted.max()), np.full(n, np.inf)
     rest = replace(rest, B=rest.B * (acted / top), D=rest.D * (acted / top))  # else gains underflow where little moves
-    for j in range(n):
-        weight = np.where(np.arange(len(rest.C)) == j, 1.0, _OTHERS)[:, None]
-        gains[j] = proven_gain(replace(rest, C=weight * rest.C)) * top
+    for j, others in product(range(n), _OTHERS):
+        if np.isinf(gains[j]):
+            weight = np.where(np.arange(len(rest.C)) == j, 1.0, others)[:, None]
+            gains[j] = proven_gain(replace(rest, C=weight * rest.C)) * top
     return gains
 
 

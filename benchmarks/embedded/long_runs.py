@@ -26,7 +26,9 @@ from kros.evaluate.sensor import as_arriving
 from kros.export import CompiledObserver, export_c
 from kros.export.c99.numbers import Source
 from kros.identify import IdentifiedModels
-from kros.observer import Observer, run_observer, sample_status, track_parameter
+from kros.observer import Observer, run_observer, sample_status
+from kros.observer.simulate import Course
+from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
 from kros.study.engine.run_folder import open_finished
 from kros.study.stages.read import open_source
@@ -116,10 +118,8 @@ def faulty(data: HeldOut, seed: int, share: float = 2e-3) -> tuple[np.ndarray, n
 
 def in_python(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str | None) -> np.ndarray:
     """Return estimates of the recorded states."""
-    found = (
-        run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
-    )
-    return found[..., : len(observer.recorded)]
+    loop = None if track is None else PhaseLockedLoop(observer, track, y.shape[1])
+    return Course(observer, y.shape[1], own, loop).take(y, u).estimates[..., : len(observer.recorded)]
 
 
 def in_c(

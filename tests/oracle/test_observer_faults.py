@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from batches import track_parameter
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -12,8 +13,6 @@ from kros.data.population import EpisodeKey
 from kros.design.baselines import Baseline
 from kros.lifting import Lifting
 from kros.observer import (
-    ExtendedKalman,
-    FilteredDifference,
     Observer,
     Runtime,
     SampleStatus,
@@ -22,9 +21,9 @@ from kros.observer import (
     run_observer,
     run_observers,
     sample_status,
-    track_parameter,
 )
-from kros.observer.baselines.extended_kalman import start_covariance
+from kros.observer.baselines.difference import FilteredDifference
+from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system
 from kros.synthesis import Injection
 
@@ -151,7 +150,7 @@ def test_the_phase_locked_loop_forgets_too():
     y, u = together()
     found = track_parameter(observer("lifted"), y, u, {"phase": 0.1}, settle_s=0.3)
     require_forgotten(found.estimates)
-    assert np.all(np.abs(found.values[:, 1:] - found.values[:, :1])[LAST + 2000 :] < 0.01)
+    assert np.all(np.abs(found.followed[:, 1:] - found.followed[:, :1])[LAST + 2000 :] < 0.01)
 
 
 @pytest.mark.parametrize("fault", FAULTS)

@@ -5,6 +5,7 @@ import numpy as np
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
 from kros.observer.simulate import Course
+from kros.observer.tracking import PhaseLockedLoop
 
 
 def batch_of(states, inputs, dt, parameters=None, lengths=None, units=None):
@@ -22,3 +23,9 @@ def run_with_status(observer, y, u, parameters=None):
     """Estimates of a batch with the status bits of every sample."""
     run = Course(observer, y.shape[1], parameters).take(y, u)
     return run.estimates, run.status
+
+
+def track_parameter(observer, y, u, parameters=None, name="phase", settle_s=None):
+    """A batch whose parameter follows the machines: estimates, status and what is `followed`."""
+    loop = PhaseLockedLoop(observer, name, y.shape[1], settle_s)
+    return Course(observer, y.shape[1], parameters, loop).take(y, u)

@@ -132,6 +132,10 @@ The torque constant has no functions apart; use TorqueScale.calibrated, whose re
     kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
 The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
     kros.export.HeldOut
+Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
+    kros.observer.track_parameter kros.observer.Tracked
+Baselines are no longer public classes; name them in observer.baselines of a study, ekf and filtered_difference.
+    kros.observer.ExtendedKalman kros.observer.FilteredDifference
 The status bits of a batch have no run of their own; use sample_status, or step a running observer and read its status.
     kros.observer.run_with_status
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.

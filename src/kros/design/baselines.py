@@ -16,9 +16,9 @@ from ..data.population import EpisodeKey
 from ..evaluate import error_percent
 from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
-from ..observer import ExtendedKalman, FilteredDifference, Seen
-from ..observer.baselines.difference import cutoffs_hz, followed
-from ..observer.baselines.extended_kalman import start_covariance
+from ..observer import Seen
+from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
+from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual

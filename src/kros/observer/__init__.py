@@ -12,8 +12,6 @@ Examples
 """
 
 from ..core.removed import refusing
-from .baselines.difference import FilteredDifference
-from .baselines.extended_kalman import ExtendedKalman
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
 from .certificate.signals import SignalBound, signal_bound
@@ -28,14 +26,11 @@ from .runtime import Guard, Runtime, Seen
 from .screen import SampleStatus, sample_status
 from .sensor import Sensor
 from .simulate import run_observer, run_observers
-from .tracking import Tracked, track_parameter
 
 __all__ = [
     "Estimate",
     "EstimatorSettings",
-    "ExtendedKalman",
     "FilterBank",
-    "FilteredDifference",
     "Guard",
     "Monitor",
     "Observer",
@@ -49,14 +44,12 @@ __all__ = [
     "Seen",
     "Sensor",
     "SignalBound",
-    "Tracked",
     "identify_estimator",
     "relift_certificate",
     "run_observer",
     "run_observers",
     "sample_status",
     "signal_bound",
-    "track_parameter",
 ]
 
 __getattr__ = refusing(__name__)

@@ -71,8 +71,8 @@ class Monitor:
     >>> from kros.observer import Monitor
     >>> filters = np.array([[0.1, -1.6, 0.8]])  # one band
     >>> monitor = Monitor(filters, 0.01, 100, np.ones(1), np.ones((1, 1)), np.array([[16]]), false_alarm_rate=0.01)
-    >>> monitor.settle, monitor.centres_hz(0.001).shape
-    (100, (1,))
+    >>> monitor.settle
+    100
     """
 
     filters: Array
@@ -186,11 +186,6 @@ class Monitor:
     def band_levels(self, mean_squares: Array) -> Array:
         """Return the level of every band over its limit in dB, shape (..., q, bands)."""
         return np.asarray(10 * np.log10(np.maximum(mean_squares / self.limits, QUIET)))
-
-    def centres_hz(self, sample_period_s: float) -> Array:
-        """Return the centre frequencies of the bands, shape (bands,)."""
-        _, a1, a2 = self.filters.T
-        return np.asarray(np.arccos(-a1 / (1 + a2)) / (2 * np.pi * sample_period_s))
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:

@@ -19,34 +19,13 @@ _EXPLAINED = 0.5  # share of a variance
 
 @dataclass(frozen=True)
 class FilteredDifference:
-    """Rates of measured states by filtered differences; all other states are not estimated.
-
-    Parameters
-    ----------
-    n_states : int
-    pairs : tuple of (int, int)
-        Position among the measurements, and the state that is its rate.
-    cutoff_hz : float
-        Of the low-pass, below half the sampling frequency.
-    sample_period_s : float
-    scales : tuple of float
-        Of every pair: the state over the rate, which their units of measure decide; one by default.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import FilteredDifference
-    >>> position = 2.0 * 0.001 * np.arange(500).reshape(500, 1, 1)  # 2 rad/s
-    >>> difference = FilteredDifference(2, pairs=((0, 1),), cutoff_hz=50.0, sample_period_s=0.001)
-    >>> difference.run(position, np.zeros((500, 1, 1)))[-1, 0].round(6).tolist()  # the position itself is not estimated
-    [nan, 2.0]
-    """
+    """Rates of measured states by filtered differences; all other states are not estimated."""
 
     n_states: int
-    pairs: tuple[tuple[int, int], ...]
-    cutoff_hz: float
+    pairs: tuple[tuple[int, int], ...]  # position among the measurements, and the state that is its rate
+    cutoff_hz: float  # of the low-pass, below half the sampling frequency
     sample_period_s: float
-    scales: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
     def __post_init__(self) -> None:
         if not 0 < self.cutoff_hz < 0.5 / self.sample_period_s:
@@ -80,14 +59,7 @@ class FilteredDifference:
         return np.asarray(lfilter(*butter(2, self.cutoff_hz, fs=1 / self.sample_period_s), signals))
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
-        """Return the same with the scales that fit recordings best, so that units of measure do not matter.
-
-        Parameters
-        ----------
-        batch : EpisodeBatch
-        measured : sequence of int
-            Indices of the measured states.
-        """
+        """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
         states, y = batch.states, batch.measurements(measured, arrived=False)
         inside = (np.arange(len(y))[:, None] < batch.lengths).astype(float)
         found = replace(self, scales=()).run(y, y[..., :0])

@@ -31,50 +31,18 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ExtendedKalman:
-    """Extended Kalman filter.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-        With input functions, m counts them.
-    measured : tuple of int
-    inputs : tuple of str
-    Q : ndarray, shape (n, n)
-        Process noise of the original states; or (k, n, n) for k filters at once, see `run_all`.
-    R : ndarray, shape (q, q)
-        Measurement noise.
-    P0 : ndarray, shape (n, n)
-        Covariance of the first estimate, in which measured states have the measurement's noise.
-    parameters : mapping of str to float
-        Default values of the lifting's parameters, the nominal unit's.
-    delay : int
-        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the
-        model.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import ExtendedKalman
-    >>> A, B = np.array([[1.0, 0.01], [0.0, 0.9]]), np.array([[0.0], [0.1]])
-    >>> Q, R, P0 = np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0])
-    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), Q, R, P0)
-    >>> kalman.run(np.zeros((100, 1, 1)), np.zeros((100, 1, 1))).shape
-    (100, 1, 2)
-    """
+    """Extended Kalman filter; measured states start with the measurement's noise."""
 
     lifting: Lifting
-    A: Array
-    B: Array
+    A: Array  # (n_lifted, n_lifted)
+    B: Array  # (n_lifted, m), with input functions
     measured: tuple[int, ...]
     inputs: tuple[str, ...]
-    Q: Array
-    R: Array
-    P0: Array
+    Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
+    R: Array  # (q, q), measurement noise
+    P0: Array  # (n, n), of the first estimate
     parameters: Mapping[str, float] = field(default_factory=dict)
-    delay: int = 0
+    delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
     def __post_init__(self) -> None:
         n, q = self.lifting.n_states, len(self.measured)

@@ -10,7 +10,8 @@ from batches import batch_of
 
 from kros.core.lti import gain
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer, signal_bound
+from kros.observer import Observer, Runtime, Seen, relift_certificate, run_observer
+from kros.observer.certificate.signals import signal_bound
 from kros.synthesis import Injection
 
 DT, N = 0.01, 600

@@ -125,10 +125,9 @@ metrics.json.
 Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
 for any pattern of losses, and the report's figure of lost measurements.
     kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
-Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known load,
-with LoadSettings.
+Calibrations of a load are no longer objects apart; a study with recordings of the condition load makes them.
     kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load
-The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.
+The torque constant has no functions apart; a study with recordings of the condition load finds it.
     kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
 The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
     kros.export.HeldOut
@@ -136,6 +135,11 @@ Runs of a batch that follow a parameter are no longer public; use track of a run
     kros.observer.track_parameter kros.observer.Tracked
 Baselines are no longer public classes; name them in observer.baselines of a study, ekf and filtered_difference.
     kros.observer.ExtendedKalman kros.observer.FilteredDifference
+Bounds for recorded signals are no longer a public function; kros.synthesize computes them, facts hold set_bound_percent.
+    kros.observer.signal_bound kros.observer.SignalBound
+How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
+    kros.motor_drive.LoadSettings kros.motor_drive.TorqueScale kros.motor_drive.known_load
+    kros.motor_drive.load_observer
 The status bits of a batch have no run of their own; use sample_status, or step a running observer and read its status.
     kros.observer.run_with_status
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.

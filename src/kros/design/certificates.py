@@ -17,12 +17,11 @@ from ..observer import (
     ReliftCertificate,
     ReliftScales,
     ReliftStatus,
-    SignalBound,
     relift_certificate,
     run_observer,
     run_observers,
-    signal_bound,
 )
+from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual

@@ -14,7 +14,6 @@ Examples
 from ..core.removed import refusing
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
-from .certificate.signals import SignalBound, signal_bound
 from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
@@ -43,13 +42,11 @@ __all__ = [
     "SampleStatus",
     "Seen",
     "Sensor",
-    "SignalBound",
     "identify_estimator",
     "relift_certificate",
     "run_observer",
     "run_observers",
     "sample_status",
-    "signal_bound",
 ]
 
 __getattr__ = refusing(__name__)

@@ -38,44 +38,15 @@ _ROUNDING = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class SignalBound:
-    """Bounds on the errors of one observer at run time.
+    """Bounds on the errors of one observer at run time, in the states' own units of measure."""
 
-    Parameters
-    ----------
-    states : tuple of str
-        Of the recordings.
-    units : tuple of str
-    bounds : ndarray, shape (units, n)
-        On the RMS error of every state, for what the recordings of one unit hold; infinite where there is none.
-    errors : ndarray, shape (units, n)
-        RMS errors as they were.
-    sizes : ndarray, shape (n,)
-        Ranges of the states; all of the above are in the states' own units of measure.
-    reason : str
-        Why there is no bound; empty where there is one.
-    outside : tuple of str
-        Units of which the observer refuses samples as implausible. Their rows are infinite.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.observer import relift_certificate, signal_bound
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> uncertain = kros.quantify(kros.identify(motors, refine=False), n_freqs=50, max_order=1)
-    >>> observer = kros.synthesize(uncertain, "kalman_tuned", methods=()).observer
-    >>> bound = signal_bound(relift_certificate(observer), observer, EpisodeBatch.read(motors, motors.keys()))
-    >>> bound.states, bound.bounds.shape, bool((bound.errors <= bound.bounds).all())
-    (('position', 'velocity', 'current'), (2, 3), True)
-    """
-
-    states: tuple[str, ...]
+    states: tuple[str, ...]  # of the recordings
     units: tuple[str, ...]
-    bounds: Array
-    errors: Array
-    sizes: Array
-    reason: str = ""
-    outside: tuple[str, ...] = ()
+    bounds: Array  # (units, n), on RMS errors for what the recordings of a unit hold; infinite where there is none
+    errors: Array  # (units, n), RMS errors as they were
+    sizes: Array  # (n,), ranges of the states
+    reason: str = ""  # why there is no bound
+    outside: tuple[str, ...] = ()  # units of which the observer refuses samples as implausible; their rows are infinite
 
     @property
     def cover(self) -> Array:
@@ -120,41 +91,7 @@ class SignalBound:
 def signal_bound(
     certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None
 ) -> SignalBound:
-    """Bound the errors of an observer for signals like those of recorded episodes.
-
-    Parameters
-    ----------
-    certificate : ReliftCertificate
-        Of this observer: its box, parameters and sizes are taken.
-    observer : ObserverData
-    batch : EpisodeBatch
-        Training episodes; noise is what its sensor shows beside the recording, and no sample of it is lost.
-    estimates : ndarray, shape (n_samples, batch, n), optional
-        Of `run_observer` for these measurements; it is run where they are missing.
-
-    Returns
-    -------
-    SignalBound
-        Also where there is none: `reason` says why.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import kros
-    >>> from kros.core import gain
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, relift_certificate, signal_bound
-    >>> from kros.synthesis import Injection
-    >>> x = np.random.default_rng(0).normal(size=(2, 200, 2)).cumsum(axis=1)
-    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
-    >>> population = kros.from_arrays({"a": [x[0]], "b": [x[1]]}, **names, sample_period_s=0.01)
-    >>> batch = kros.data.EpisodeBatch.read(population, population.keys())
-    >>> model = np.array([[0.9]]), np.ones((1, 1)), (0,), ("u",)
-    >>> observer = Observer("x", Lifting(("x",)), *model, gain([[0.5]], 0.01), Injection.STATE, 0.01)
-    >>> bound = signal_bound(relift_certificate(observer), observer, batch)
-    >>> bool((bound.errors <= bound.bounds).all())
-    True
-    """
+    """Bound errors for signals like those of training episodes, which noise of the sensor is added to and none is lost."""
     seen, n = course(observer, batch, estimates), len(observer.recorded)
     units, sizes = tuple(dict.fromkeys(batch.units)), certificate.scales.error[:n].copy()
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)

@@ -25,11 +25,11 @@ from kros.observer import (
     Observer,
     Runtime,
     run_observer,
-    run_observers,
 )
 from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.baselines.learned import Moments
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT = 0.001

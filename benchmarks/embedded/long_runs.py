@@ -26,7 +26,8 @@ from kros.evaluate.sensor import as_arriving
 from kros.export import CompiledObserver, export_c
 from kros.export.c99.numbers import Source
 from kros.identify import IdentifiedModels
-from kros.observer import Observer, run_observer, sample_status
+from kros.observer import Observer, run_observer
+from kros.observer.screen import screened
 from kros.observer.simulate import Course
 from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
@@ -153,7 +154,7 @@ def against_python(observer: Observer, track: str | None, data: HeldOut, given: 
     met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None or observer.runtime.correction is not None else 0)
     while steps < given.steps:
         y, u = (data.y, data.u) if not steps else faulty(data, seed)
-        wanted, bits = in_python(observer, y, u, own, track), sample_status(observer, y, u)
+        wanted, bits = in_python(observer, y, u, own, track), screened(observer, y, u).status
         for precision in apart:
             found, status = in_c(observer, y, u, own, track, precision)
             far = float(np.max(rms(found - wanted) / np.std(wanted, axis=(0, 1))))

@@ -19,12 +19,12 @@ from kros.observer import (
     Seen,
     relift_certificate,
     run_observer,
-    run_observers,
-    sample_status,
 )
 from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system
+from kros.observer.screen import screened
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200
@@ -166,7 +166,7 @@ def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
         np.testing.assert_allclose(
             both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12
         )  # the other machine of the batch does not notice
-        own = sample_status(o, bad_y, bad_u)[:, 0]
+        own = screened(o, bad_y, bad_u).status[:, 0]
         assert all(SampleStatus(int(b)) in s for b, s in zip(own, status, strict=True))
 
 
@@ -203,18 +203,18 @@ def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
     o = observer()
     y, u = recordings(50)
     y[20], u[30, 0, 1] = 2.99, -1.49
-    assert not sample_status(o, y, u).any()
+    assert not screened(o, y, u).status.any()
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(replace(o, seen=None), y, u))
     y[20] = 3.01
     missing = y.copy()
     missing[20] = np.nan
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, missing, u))
-    assert np.flatnonzero(sample_status(o, y, u)).tolist() == [20]
-    assert not sample_status(replace(o, seen=None), 1e6 * y, u).any()
+    assert np.flatnonzero(screened(o, y, u).status).tolist() == [20]
+    assert not screened(replace(o, seen=None), 1e6 * y, u).status.any()
     zero = replace(
         o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0]))
     )  # nothing is known of an input that never was anything but zero
-    assert not sample_status(zero, np.clip(y, -1, 1), u).any()
+    assert not screened(zero, np.clip(y, -1, 1), u).status.any()
 
 
 def test_a_declared_limit_takes_the_place_of_the_range():
@@ -222,7 +222,7 @@ def test_a_declared_limit_takes_the_place_of_the_range():
     y, u = recordings(50)
     y[10:12] = 2.5
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, np.clip(y, -3, 2), u))
-    assert np.flatnonzero(sample_status(o, y, u) == SampleStatus.LIMIT).tolist() == [10, 11]
+    assert np.flatnonzero(screened(o, y, u).status == SampleStatus.LIMIT).tolist() == [10, 11]
     y[10:12] = 4.6  # beyond 1.5 times the declared range
     gone = y.copy()
     gone[10:12] = np.nan

@@ -11,8 +11,8 @@ from kros.core.lti import gain
 from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, SampleStatus
-from kros.observer.monitor import RECOVERY, Watch, octaves
+from kros.observer import Observer, SampleStatus
+from kros.observer.monitor import RECOVERY, Monitor, Watch, octaves
 from kros.observer.simulate import run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation

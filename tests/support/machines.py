@@ -6,8 +6,8 @@ import numpy as np
 
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Monitor, Observer, Runtime, Seen
-from kros.observer.monitor import octaves
+from kros.observer import FilterBank, Observer, Runtime, Seen
+from kros.observer.monitor import Monitor, octaves
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3

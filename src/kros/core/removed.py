@@ -140,8 +140,10 @@ Bounds for recorded signals are no longer a public function; kros.synthesize com
 How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
     kros.motor_drive.LoadSettings kros.motor_drive.TorqueScale kros.motor_drive.known_load
     kros.motor_drive.load_observer
-The status bits of a batch have no run of their own; use sample_status, or step a running observer and read its status.
-    kros.observer.run_with_status
+Status bits of a batch, monitors, guards and observers side by side are internal; step a running observer, read its
+status, and let kros.synthesize make the others.
+    kros.observer.run_with_status kros.observer.sample_status kros.observer.Monitor kros.observer.Guard
+    kros.observer.run_observers
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
     kros.synthesis.UnitCheck kros.synthesis.check_units
 """

@@ -12,20 +12,20 @@ import numpy.typing as npt
 
 from ..loops.filtering import recursion
 from ..observer import (
-    Guard,
     Observer,
     ReliftCertificate,
     ReliftScales,
     ReliftStatus,
     relift_certificate,
     run_observer,
-    run_observers,
 )
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
+from ..observer.runtime import Guard
 from ..observer.screen import Screen
+from ..observer.simulate import run_observers
 from ..observer.units import factors, in_sizes
 from .monitor import settling
 from .task import Design, DesignTask

@@ -17,8 +17,9 @@ from ..evaluate import error_rms
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen, run_observer, run_observers
+from ..observer import Observer, Seen, run_observer
 from ..observer.sensor import Sensors, in_units
+from ..observer.simulate import run_observers
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")

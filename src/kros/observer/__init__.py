@@ -18,20 +18,17 @@ from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
 from .filter_bank import FilterBank
-from .monitor import Monitor
 from .observer import Observer
 from .running import Estimate, RunningObserver
-from .runtime import Guard, Runtime, Seen
-from .screen import SampleStatus, sample_status
+from .runtime import Runtime, Seen
+from .screen import SampleStatus
 from .sensor import Sensor
-from .simulate import run_observer, run_observers
+from .simulate import run_observer
 
 __all__ = [
     "Estimate",
     "EstimatorSettings",
     "FilterBank",
-    "Guard",
-    "Monitor",
     "Observer",
     "Recordings",
     "ReliftCertificate",
@@ -45,8 +42,6 @@ __all__ = [
     "identify_estimator",
     "relift_certificate",
     "run_observer",
-    "run_observers",
-    "sample_status",
 ]
 
 __getattr__ = refusing(__name__)

@@ -37,53 +37,17 @@ QUIET = 0.01  # of its limit: a band that is more quiet says no more
 
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """What a monitor computes with, and how often it is wrong about good machines.
+    """What a monitor computes with, and how often it is wrong about good machines."""
 
-    Parameters
-    ----------
-    filters : ndarray, shape (bands, 3)
-        ``b, a1, a2`` of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``.
-    forget : float
-        Share of a mean square that a sample replaces in the long run.
-    settle : int
-        Samples after a start that are not judged.
-    size : ndarray, shape (q,)
-        What innovations are divided by: their RMS in training.
-    limits : ndarray, shape (q, bands)
-        Mean squares at the bound.
-    weights : ndarray, shape (q, bands)
-        Whole numbers, how often a band counts.
-    false_alarm_rate : float
-        Probability that one more good machine exceeds the bound while it is moved as much as those in training.
-    units : int
-        Machines that the bound was found on.
-    first : float
-        Share that the first sample replaces, later ones less; `forget` from the beginning where it is not larger.
-
-    Raises
-    ------
-    DataError
-        When a number is out of its range, or sizes do not fit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import Monitor
-    >>> filters = np.array([[0.1, -1.6, 0.8]])  # one band
-    >>> monitor = Monitor(filters, 0.01, 100, np.ones(1), np.ones((1, 1)), np.array([[16]]), false_alarm_rate=0.01)
-    >>> monitor.settle
-    100
-    """
-
-    filters: Array
-    forget: float
-    settle: int
-    size: Array
-    limits: Array
-    weights: Array
-    false_alarm_rate: float
-    units: int = 0
-    first: float = 0.0
+    filters: Array  # (bands, 3): b, a1, a2 of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``
+    forget: float  # share of a mean square that a sample replaces in the long run
+    settle: int  # samples after a start that are not judged
+    size: Array  # (q,), what innovations are divided by: their RMS in training
+    limits: Array  # (q, bands), mean squares at the bound
+    weights: Array  # (q, bands), whole numbers, how often a band counts
+    false_alarm_rate: float  # probability that one more good machine exceeds the bound, moved as those in training
+    units: int = 0  # machines that the bound was found on
+    first: float = 0.0  # share that the first sample replaces, later ones less, down to `forget`
 
     def __post_init__(self) -> None:
         for name in ("filters", "size", "limits", "weights"):
@@ -125,18 +89,7 @@ class Monitor:
         return replace(self, size=self.size * y)
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
-        """Return the mean squares of all bands after every sample, for many machines that start together.
-
-        Parameters
-        ----------
-        innovation : ndarray, shape (n_samples, batch, q)
-        judged : ndarray of bool, shape (n_samples, batch)
-            The other samples hold what was.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, batch, q, bands)
-        """
+        """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""
         from scipy.signal import lfilter
 
         scaled = innovation / self.size
@@ -152,17 +105,7 @@ class Monitor:
         return squares
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
-        """Return the mean squares of every episode, of a machine that has them one after the other.
-
-        Parameters
-        ----------
-        episodes : sequence of (ndarray, shape (n_samples, q); ndarray of bool, shape (n_samples,))
-            Innovations, and which samples are judged.
-
-        Returns
-        -------
-        list of ndarray, shape (n_samples, q, bands)
-        """
+        """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
         innovation, judged = (np.concatenate(parts)[:, None] for parts in zip(*episodes, strict=True))
         return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
 

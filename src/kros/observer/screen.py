@@ -185,22 +185,6 @@ class Screen:
         return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
 
 
-def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, SampleStatus, sample_status
-    >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
-    >>> y = np.array([1.0, np.nan, 0.5]).reshape(3, 1, 1)
-    >>> [SampleStatus(int(bits)).name for bits in sample_status(observer, y, np.zeros((3, 1, 1))).ravel()]
-    ['GOOD', 'MISSING', 'GOOD']
-    """
-    return screened(observer, y, u).status
-
-
 def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
     """Return a batch of samples as an observer takes them; `held` is known before the first."""
     y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)

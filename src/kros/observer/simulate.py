@@ -71,33 +71,7 @@ def run_observer(
 def run_observers(
     observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
 ) -> Array:
-    """Run observers of one and the same model, which differ in their corrections, side by side.
-
-    Parameters
-    ----------
-    observers : sequence of ObserverData
-        Of the same lifting, measured states and inputs; corrections may have different orders.
-    y, u, parameters
-        As in `run_observer`.
-
-    Returns
-    -------
-    ndarray, shape (observer, n_samples, batch, n)
-        A view with the samples outermost in memory.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import gain
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, run_observers
-    >>> from kros.synthesis import Injection
-    >>> plant = Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",)
-    >>> observers = [Observer(f"gain {L}", *plant, gain([[L]], 0.01), Injection.STATE, 0.01) for L in (0.0, 0.5)]
-    >>> y = np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1)
-    >>> run_observers(observers, y, np.zeros((3, 1, 1))).reshape(2, 3).tolist()
-    [[4.0, 2.0, 1.0], [4.0, 2.0, 4.0]]
-    """
+    """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     first = observers[0]
     if any(_kind(o) != _kind(first) for o in observers[1:]):
         raise DimensionError(

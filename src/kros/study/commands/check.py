@@ -18,8 +18,9 @@ from ...data.checks import check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer, sample_status
+from ...observer import Observer
 from ...observer.monitor import Monitor
+from ...observer.screen import screened
 from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import score_row
@@ -138,7 +139,7 @@ def monitored(recordings: FieldRecordings) -> Rows:
         counts, judged, samples = dict[str, int](), Judged(), 0
         for arrived in recordings.batches(keys):
             samples += int(arrived.batch.lengths.sum())
-            status = sample_status(observer, arrived.y, arrived.u)
+            status = screened(observer, arrived.y, arrived.u).status
             count_status(counts, np.where(np.arange(len(status))[:, None] < arrived.batch.lengths, status, 0))
             if monitor is not None:
                 values = arrived.parameters(observer)

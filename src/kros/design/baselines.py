@@ -106,8 +106,8 @@ def make_extended(
     training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
 ) -> Baseline:
     """Tune the extended Kalman filter of a nominal model: process noise of two shapes, all run side by side."""
-    data, lifting, n = training.read(), models.lifting, models.lifting.n_states
-    row, C, R, batch = models.index(unit), list(models.measured), np.diag(noise**2), data.batch
+    batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
+    row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
     shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2)}
     shapes[RESIDUAL] = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
@@ -125,10 +125,10 @@ def make_extended(
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
-    short = data.first(settings.extended_samples)
+    short = batch.head(settings.extended_samples)
     percents = [
-        error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
-        for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)
+        error_percent(estimate, short.states, short.lengths).mean(axis=0)
+        for estimate in filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     ]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
     ranks = [rank(p, np.full(n, 100.0), models.measured) for p in bounded]
@@ -143,8 +143,8 @@ def make_extended(
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale."""
-    population, data = training.population, training.read()
-    batch, y, period = data.batch, data.measurements(measured), training.population.sample_period_s
+    population, batch = training.population, training.read()
+    y, period = batch.measurements(measured), population.sample_period_s
     pairs = followed(batch, measured)
     if not pairs:
         states = ", ".join(population.states)
@@ -166,7 +166,7 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     samples = len(training.population.read(training.keys[0])) * len(training.keys)
     step = max(1, samples // Ridge().rows)
-    moments = Moments.of((part.batch for part in training.one_by_one()), measured, step)
+    moments = Moments.of(training.one_by_one(), measured, step)
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)

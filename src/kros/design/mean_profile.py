@@ -109,7 +109,7 @@ def unit_means(
     profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
     n_samples, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
     for part in training.one_by_one():
-        (unit,), states, u = part.batch.units, part.batch.states[:, 0, list(estimated)], part.batch.inputs[:, 0]
+        (unit,), states, u = part.units, part.states[:, 0, list(estimated)], part.inputs[:, 0]
         apart = np.array([difference(motion, u, sizes) for motion in motions])
         closest = np.minimum(closest, apart)
         if apart.min() <= settings.same_motion:

@@ -217,7 +217,8 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
     """Return the standard deviation of every measurement's noise."""
     names, steps = [models.lifting.states[i] for i in models.measured], np.zeros(len(models.measured))
     if any(one.jitter_samples for one in sensor.values()):
-        steps = TrainingSet.of(identified, models).read().steps(models.measured)
+        states = TrainingSet.of(identified, models).read().states[..., list(models.measured)]
+        steps = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=(0, 1)))
     variances = []
     for name, step in zip(names, steps, strict=True):
         one = sensor.get(name, Sensor())

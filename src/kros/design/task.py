@@ -19,7 +19,7 @@ from ..lifting import Lifting
 from ..observer import Observer, ReliftCertificate, Runtime
 from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
-from .validation import TrainingSet, rank
+from .validation import TrainingSet, percent_of, rank
 
 Array = npt.NDArray[np.float64]
 FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
@@ -182,7 +182,7 @@ class DesignTask:
 
     def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
         """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
-        limit, *errors = self.training.read().percent_of_all([self.observer(self.open_loop()), *observers])
+        limit, *errors = percent_of([self.observer(self.open_loop()), *observers], self.training.read())
         ranks = [rank(error, limit, self.models.measured) for error in errors]
         first = min(range(len(ranks)), key=lambda i: ranks[i])
         return first, ranks[first][1]

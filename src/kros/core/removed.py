@@ -135,7 +135,8 @@ Runs of a batch that follow a parameter are no longer public; use track of a run
     kros.observer.track_parameter kros.observer.Tracked
 Baselines are no longer public classes; name them in observer.baselines of a study, ekf and filtered_difference.
     kros.observer.ExtendedKalman kros.observer.FilteredDifference
-Bounds for recorded signals are no longer a public function; kros.synthesize computes them, facts hold set_bound_percent.
+Bounds for recorded signals are no longer a public function; kros.synthesize computes them, its facts hold
+set_bound_percent.
     kros.observer.signal_bound kros.observer.SignalBound
 How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
     kros.motor_drive.LoadSettings kros.motor_drive.TorqueScale kros.motor_drive.known_load

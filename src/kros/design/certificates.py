@@ -11,6 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..data import EpisodeBatch
+from ..evaluate import error_rms
 from ..loops.filtering import recursion
 from ..observer import (
     Observer,
@@ -30,7 +31,7 @@ from ..observer.simulate import run_observers
 from ..observer.units import factors, in_sizes
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import TrainingSet, compare, hidden_mean, percent_of
+from .validation import TrainingSet, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -81,23 +82,14 @@ def _certified_models(
 ) -> list[Design]:
     """Certify corrected models, which run side by side."""
     observers = [design.observer for design in designs]
-    first = observers[0]
     guards = guards_of(observers, [batch, *others], settings)
     scales = scales_of(observers, batch, task)
     certificates = [certify_model(o, s, task, settings.box) for o, s in zip(observers, scales, strict=True)]
-    estimates = run_observers(observers, batch.measurements(first.measured), batch.inputs, first.own(batch.parameters))
-    arrived = estimates
-    if batch.lost is not None:  # bounds are for measurements that arrive
-        y = batch.measurements(first.measured, arrived=False)
-        arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
-    errors = [compare(estimates, batch), *(percent_of(observers, other) for other in others)]
-    hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
-    lost = loss_error_percent(observers, batch, settings)
-    certified = []
+    hidden = hidden_error_percent(observers, [batch, *others])
+    lost, certified = loss_error_percent(observers, batch, settings), []
     for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
         observer = observers[k]
-        bound = signal_bound(certificate, observer, batch, arrived[k])
-        bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
+        bound = signal_bound(certificate, observer, batch).in_sizes(factors(observer, {})[0][: len(observer.recorded)])
         certificate = certificate.in_sizes(observer, {})
         facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
         observer = replace(observer, guard=guards[k])
@@ -116,17 +108,14 @@ def _certified_filters(
     observer = design.observer
     n, measured = len(observer.recorded), observer.measured
     estimates = run_observer(observer, batch.measurements(measured), batch.inputs, observer.own(batch.parameters))
-    error = estimates[..., :n] - batch.states
-    inside = (np.arange(len(error))[:, None] < batch.lengths)[..., None]
-    square = np.sum(np.where(inside, error, 0.0) ** 2, axis=0) / batch.lengths[:, None]
+    square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
     units = list(dict.fromkeys(batch.units))
     errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
     sizes, by = task.models.output_scale[:n], factors(observer, {})[0]
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
     growth = design.facts["left_out_to_training"]
     left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
-    percents = [compare([estimates], batch)[0], *(percent_of([observer], other)[0] for other in others)]
-    hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * left_out, measured)) for percent in percents])))
+    hidden = float(hidden_error_percent([observer], [batch, *others], left_out)[0])
     lost = float(loss_error_percent([observer], batch, settings)[0])
     certificate = filter_certificate(observer, scales)
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
@@ -147,6 +136,15 @@ def _facts(
         s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
     }
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
+
+
+def hidden_error_percent(
+    observers: Sequence[Observer], batches: Sequence[EpisodeBatch], by: float | Array = 1.0
+) -> Array:
+    """Return the mean error of hidden states over conditions, (observer,); errors are multiplied by factors, (n,)."""
+    percents = [percent_of(observers, batch) * by for batch in batches]
+    logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
+    return np.asarray(np.exp(np.mean(logs, axis=0)))
 
 
 def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:

@@ -35,7 +35,8 @@ class ReliftStatus(str, Enum):
         The gain is proven.
     UNSTABLE
         Slopes that stay at a corner of the box, or in its middle, make the error grow without bound in the model: there
-        is no certificate for this observer over this box. Take a smaller box, weaken the correction, or use another model.
+        is no certificate for this observer over this box. Take a smaller box, weaken the correction, or use another
+        model.
     UNBOUNDED
         A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
     NOT_FOUND

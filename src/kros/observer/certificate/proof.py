@@ -1,4 +1,4 @@
-r"""Proof of a gain: multipliers by cutting planes, a Lyapunov matrix by a Riccati equation, a decision without rounding.
+r"""Proof of a gain: multipliers by cutting planes, a Lyapunov matrix by a Riccati equation, an exact decision.
 
 For slopes that move anywhere in their box the gain gamma is proven where ``T = diag(t) > 0`` and ``P = R' R > 0`` have
 

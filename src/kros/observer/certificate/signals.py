@@ -88,11 +88,9 @@ class SignalBound:
         return replace(self, **{name: getattr(self, name) * by for name in ("bounds", "errors", "sizes")})
 
 
-def signal_bound(
-    certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None
-) -> SignalBound:
-    """Bound errors for signals like those of training episodes, which noise of the sensor is added to and none is lost."""
-    seen, n = course(observer, batch, estimates), len(observer.recorded)
+def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: EpisodeBatch) -> SignalBound:
+    """Bound errors for signals like those of training episodes as their sensor shows them, of which none is lost."""
+    seen, n = course(observer, batch), len(observer.recorded)
     units, sizes = tuple(dict.fromkeys(batch.units)), certificate.scales.error[:n].copy()
     member = np.array([[unit == name for unit in batch.units] for name in units], dtype=float)
     member /= member.sum(axis=1, keepdims=True)

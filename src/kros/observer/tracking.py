@@ -33,14 +33,13 @@ from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
 MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
-SETTLE_SAMPLES = 2_000
 
 
 class PhaseLockedLoop:
     """The loop beside an observer's `Steps`, for a batch of machines."""
 
     def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float | None = None) -> None:
-        settle_s = SETTLE_SAMPLES * observer.sample_period_s if settle_s is None else settle_s
+        settle_s = 2_000 * observer.sample_period_s if settle_s is None else settle_s
         lifting = observer.lifting
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:

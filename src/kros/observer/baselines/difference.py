@@ -12,9 +12,6 @@ from ...core.errors import ConfigError, DimensionError
 from ...data import EpisodeBatch
 
 Array = npt.NDArray[np.float64]
-_LOWEST, _HIGHEST = 1e-3, 0.45  # of the sampling frequency
-_CANDIDATES = 24
-_EXPLAINED = 0.5  # share of a variance
 
 
 @dataclass(frozen=True)
@@ -72,8 +69,8 @@ class FilteredDifference:
         return replace(self, scales=tuple(slopes))
 
 
-def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return which states recordings show to be rates of measured ones, whatever the units of measure."""
+def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
+    """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
     states, y, sample_period_s = batch.states, batch.measurements(measured, arrived=False), batch.sample_period_s
     hidden = [j for j in range(states.shape[-1]) if j not in measured]
     inside = np.arange(len(y))[:, None] < batch.lengths
@@ -93,11 +90,11 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
     pairs = []
     for i in range(len(share)):
         j = int(share[i].argmax()) if hidden else 0
-        if hidden and share[i, j] > _EXPLAINED and share[:, j].argmax() == i:
+        if hidden and share[i, j] > explained and share[:, j].argmax() == i:
             pairs.append((i, hidden[j]))
     return tuple(pairs)
 
 
 def cutoffs_hz(sample_period_s: float) -> Array:
     """Return the cut-offs that are tried, log-spaced from a thousandth to nearly half of the sampling frequency."""
-    return np.geomspace(_LOWEST, _HIGHEST, _CANDIDATES) / sample_period_s
+    return np.geomspace(1e-3, 0.45, 24) / sample_period_s

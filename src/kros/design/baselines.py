@@ -76,8 +76,12 @@ class Baseline:
         samples, estimate = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), np.empty(0)
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
-            run, some = partial(self._piece, self.by_unit[unit]), samples.of(rows)
-            part = restarted(run, some, values) if self.restarts else run(some.y, some.u, values)
+            estimator, some = self.by_unit[unit], samples.of(rows)
+            run = partial(self._piece, estimator)
+            if isinstance(estimator, ExtendedKalman):
+                part = estimator.run(some.y, some.u, values, some.starts)
+            else:
+                part = restarted(run, some, values) if self.restarts else run(some.y, some.u, values)
             estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
             estimate[:, rows] = part
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
@@ -138,7 +142,7 @@ def make_extended(
     shape, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape}
     tuned = {"": replace(filters, Q=Q)}
-    return Baseline(tuned, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen)
+    return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:

@@ -65,7 +65,7 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return advance([Course(observer, np.shape(y)[1], parameters)], screened(observer, y, u))[0].estimates
+    return _run([observer], screened(observer, y, u), parameters)[0].estimates
 
 
 def run_observers(
@@ -82,7 +82,7 @@ def run_observers(
         return np.stack([run_observer(o, y, u, parameters) for o in observers])
     (n_samples, batch), n = np.shape(y)[:2], first.lifting.n_states
     states = np.empty((n_samples, len(observers), n, batch))
-    runs = advance([Course(o, batch, parameters) for o in observers], screened(first, y, u), states=states)
+    runs = _run(observers, screened(first, y, u), parameters, states=states)
     for i, run in enumerate(runs):
         if not np.may_share_memory(run.estimates, states):
             states[:, i] = run.estimates.swapaxes(1, 2)
@@ -102,23 +102,34 @@ def run_innovations(
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
-    run = advance([Course(observer, np.shape(y)[1], parameters)], samples, innovations=True)[0]
+    run = _run([observer], samples, parameters, innovations=True)[0]
     starts = run.starts.copy()
     starts[0] = True
     return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
 
 
-def advance(
-    courses: Sequence[Course], samples: Screened, innovations: bool = False, states: Array | None = None
+def _run(
+    observers: Sequence[ObserverData],
+    samples: Screened,
+    parameters: Parameters | None,
+    innovations: bool = False,
+    states: Array | None = None,
 ) -> list[Stepped]:
-    """Move observers of one model on over screened samples, compiled where that is possible, then into `states`."""
-    loops, runs = library(), list[Stepped | None]([None] * len(courses))
-    if loops is not None and all(course.even(samples) for course in courses):
-        runs = _compiled(loops, courses, samples, innovations, states)
-    every = [run or stepped(course, samples) for run, course in zip(runs, courses, strict=True)]
-    for run, course in zip(every, courses, strict=True):
-        _limit(course.observer, run.estimates)
-    return every
+    """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
+    loops, batch = library(), samples.starts.shape[1]
+    courses = [Course(o, batch, parameters) for o in observers]
+    if loops is None:
+        runs = [stepped(course, samples) for course in courses]
+    else:
+        runs, again = _compiled(loops, courses, samples, innovations, states)
+        if observers[0].bank is not None:
+            again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
+        for run, course, some in zip(runs, courses, again, strict=True):
+            if some.any():
+                run.replace(np.flatnonzero(some), course, samples)
+    for run, observer in zip(runs, observers, strict=True):
+        _limit(observer, run.estimates)
+    return runs
 
 
 def _limit(observer: ObserverData, estimates: Array) -> None:
@@ -138,6 +149,14 @@ class Stepped:
     starts: Flags  # (n_samples, batch)
     moving: Flags  # (n_samples, batch)
     followed: Array  # (n_samples, batch): the parameter that a loop follows
+
+    def replace(self, machines: Whole, course: Course, samples: Screened) -> None:
+        """Put what some machines do in NumPy in the place of what they did, from the first sample of all."""
+        values, batch = course.values, samples.starts.shape[1]
+        own = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[machines] for name, v in values.items()}
+        part = stepped(Course(course.observer, len(machines), own), samples.of(machines))
+        for name in ("estimates", "status", "starts", "moving", *(("innovation",) if len(self.innovation) else ())):
+            getattr(self, name)[:, machines] = getattr(part, name)
 
 
 class Loop(Protocol):
@@ -182,7 +201,12 @@ class Course:
     def take(self, y: Array, u: Array) -> Stepped:
         """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
         samples = screened(self.observer, y, u, None if self._before is None else self._before.held)
-        run = advance([self], samples)[0]
+        loops, run = library(), None
+        if loops is not None and self.even(samples):
+            runs, restarted = _compiled(loops, [self], samples)
+            run = None if restarted.any() else runs[0]
+        run = stepped(self, samples) if run is None else run
+        _limit(self.observer, run.estimates)
         return replace(run, status=run.status | samples.status)
 
     def even(self, samples: Screened) -> bool:
@@ -267,41 +291,43 @@ def _predict(
 
 
 def _compiled(
-    loops: Library, courses: Sequence[Course], samples: Screened, innovations: bool, states: Array | None
-) -> list[Stepped | None]:
-    """Run observers of one model on in the compiled loop; none for those that leave their bounds."""
+    loops: Library,
+    courses: Sequence[Course],
+    samples: Screened,
+    innovations: bool = False,
+    states: Array | None = None,
+) -> tuple[list[Stepped], Flags]:
+    """Run observers of one model on in the compiled loop; return which machines left their bounds, (observer, batch)."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
     late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
-    pending, states = (
-        np.concatenate(late),
-        np.empty((n_samples, len(observers), n, batch)) if states is None else states,
-    )
+    pending, states = np.concatenate(late), _empty(n_samples, len(observers), n, batch) if states is None else states
     job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
-    innovation = np.empty(samples.y.shape) if innovations else np.zeros((0, *samples.y.shape[1:]))
-    before = np.empty((n_samples, batch, job["past"].shape[-1]))
+    innovation = _empty(*samples.y.shape) if innovations else _empty(0, *samples.y.shape[1:])
+    before = _empty(n_samples, batch, job["past"].shape[-1])
     moving = (pending == delay) & (~samples.starts | (delay == 0))
     job |= {"innovation": innovation} if innovations else {}
     if delay:
         job |= {"moving": moving, "before": before, "pending": pending}
     tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
     loops.call("kros_relift", tape, ("relift_job", job))
-    runs: list[Stepped | None] = []
+    runs, restarted = [], job["restart"].view(bool)
     for i, course in enumerate(courses):
         x = states[:, i].swapaxes(1, 2)
-        if job["restart"][i].any():
-            runs.append(None)
-            continue
-        course.since = np.where(samples.starts[-1], 0, pending[-1])
-        _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], x[-1], samples)
+        if not restarted[i].any():
+            course.since = np.where(samples.starts[-1], 0, pending[-1])
+            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], x[-1], samples)
         if delay:
             with np.errstate(over="ignore", invalid="ignore"):
                 _predict(course.observer, x, before, pending, samples, values)
-        status = np.zeros((n_samples - lead, batch), np.uint8)
-        rest = status, samples.starts[lead:], moving[lead:], np.empty(0)
-        runs.append(Stepped(x[lead:], innovation[lead:], *rest))
-    return runs
+        status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
+        runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
+    return runs, restarted
+
+
+def _empty(*shape: int) -> Array:
+    return np.empty(shape)
 
 
 def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:

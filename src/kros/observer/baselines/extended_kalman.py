@@ -52,19 +52,32 @@ class ExtendedKalman:
                 f"found {self.Q.shape}, {self.P0.shape} and {self.R.shape}."
             )
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m).
+    def run(
+        self,
+        y: Array,
+        u: Array,
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        starts: npt.NDArray[np.bool_] | None = None,
+    ) -> Array:
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m); shape (n_samples, batch, n).
 
         Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
-        corrected at that sample, and the covariance grows.
+        corrected at that sample, and the covariance grows. Machines start again at samples `starts`, (n_samples, batch).
         """
-        return self.run_all(y, u, parameters)[0]
+        return self.run_all(y, u, parameters, starts)[0]
 
-    def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run_all(
+        self,
+        y: Array,
+        u: Array,
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        starts: npt.NDArray[np.bool_] | None = None,
+    ) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
+        starts = np.zeros(y.shape[:2], dtype=bool) if starts is None else starts
         if self.delay:
-            return self._late(y, u, parameters)
+            return self._late(y, u, parameters, starts)
         lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
         Q = self.Q.reshape(-1, 1, n, n)
         k, (n_samples, batch) = len(Q), y.shape[:2]
@@ -72,16 +85,20 @@ class ExtendedKalman:
             name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))
             for name, v in {**self.parameters, **(parameters or {})}.items()
         }
-        x = np.zeros((k, batch, n))
-        x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
-        P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
-        estimates, earlier = np.empty((n_samples, k, batch, n)), None
+        x, P = np.zeros((k, batch, n)), np.zeros((k, batch, n, n))
+        earlier = np.zeros((k, batch, len(lifting.window.earlier)))
+        estimates = np.empty((n_samples, k, batch, n))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for sample in range(n_samples):
+                begins, held = starts[sample] | (sample == 0), np.broadcast_to(u[sample], (k, *u[sample].shape))
                 estimates[sample] = x
+                if begins.any():
+                    x[:, begins], P[:, begins] = 0.0, self.P0
+                    x[..., C] = np.where(begins[:, None], np.where(np.isfinite(y[sample]), y[sample], 0.0), x[..., C])
+                if sample == 0:
+                    estimates[0] = x
                 x, P = self._corrected(x, P, y[sample])
-                held = np.broadcast_to(u[sample], (k, *u[sample].shape))
-                earlier = lifting.window.hold(x, held) if earlier is None else earlier
+                earlier = np.where(begins[:, None], lifting.window.hold(x, held), earlier) if begins.any() else earlier
                 window = np.concatenate([x, earlier], axis=-1)
                 F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
                 x = self._ahead(window, held, values)
@@ -104,7 +121,9 @@ class ExtendedKalman:
         L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+    def _late(
+        self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None, starts: npt.NDArray[np.bool_]
+    ) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
         d, values = min(self.delay, len(y) - 1), {**self.parameters, **(parameters or {})}
         if self.lifting.history:
@@ -112,7 +131,7 @@ class ExtendedKalman:
                 f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
                 f"{self.lifting.functions}."
             )
-        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
+        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters, starts[d:])
         late = np.empty((len(x), len(y), *x.shape[2:]))
         for step in range(d):
             late[:, step] = x[:, 0]  # nothing arrived but where to start

@@ -297,7 +297,7 @@ def _compiled(
     innovations: bool = False,
     states: Array | None = None,
 ) -> tuple[list[Stepped], Flags]:
-    """Run observers of one model on in the compiled loop; return which machines left their bounds, (observer, batch)."""
+    """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]

@@ -62,7 +62,7 @@ class ExtendedKalman:
         """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m); shape (n_samples, batch, n).
 
         Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
-        corrected at that sample, and the covariance grows. Machines start again at samples `starts`, (n_samples, batch).
+        corrected at that sample, and the covariance grows. At `starts`, (n_samples, batch), machines start again.
         """
         return self.run_all(y, u, parameters, starts)[0]
 

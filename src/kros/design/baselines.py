@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -59,7 +58,6 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    takes_missing: bool = False
     restarts: bool = True
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
@@ -77,32 +75,29 @@ class Baseline:
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
             estimator, some = self.by_unit[unit], samples.of(rows)
-            run = partial(self._piece, estimator)
             if isinstance(estimator, ExtendedKalman):
                 part = estimator.run(some.y, some.u, values, some.starts)
+            elif self.restarts:
+                part = restarted(estimator, some, values)
             else:
-                part = restarted(run, some, values) if self.restarts else run(some.y, some.u, values)
+                part = estimator.run(some.y, some.u, values)
             estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
             estimate[:, rows] = part
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
-    def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
-        return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
 
-
-def restarted(
-    run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]
-) -> Array:
-    """Run a batch, every member again from each sample at which it starts again to the next; (n_samples, batch, n)."""
+def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    """Run a batch, missing measurements held, every member again from each sample at which it starts again to the next; (n_samples, batch, n)."""
     n_samples, batch = samples.starts.shape
-    estimate = run(samples.y, samples.u, parameters)
+    estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
         members = np.flatnonzero(samples.starts[begin])
         again = samples.starts[begin + 1 :, members]
         lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
         rows = slice(begin, int(np.max(lasts)) + 1)
         part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
-        estimate[begin + 1 : rows.stop, members] = run(samples.y[rows, members], samples.u[rows, members], part)[1:]
+        y, u = hold_missing(samples.y[rows, members]), samples.u[rows, members]
+        estimate[begin + 1 : rows.stop, members] = estimator.run(y, u, part)[1:]
     return estimate
 
 

@@ -87,7 +87,7 @@ def make_mean_profile(
     units = dict.fromkeys(unit for of_units in means for unit in of_units)
     facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
     by_unit = {unit: without(unit) for unit in (*units, "")}
-    return Baseline(by_unit, measured, estimated, facts, takes_missing=True, restarts=False, seen=training.seen)
+    return Baseline(by_unit, measured, estimated, facts, restarts=False, seen=training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:

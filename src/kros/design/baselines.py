@@ -87,7 +87,7 @@ class Baseline:
 
 
 def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, missing measurements held, every member again from each sample at which it starts again to the next; (n_samples, batch, n)."""
+    """Run a batch, missing measurements held, every member again from each sample at which it starts again."""
     n_samples, batch = samples.starts.shape
     estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:

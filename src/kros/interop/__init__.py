@@ -17,7 +17,6 @@ from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
     from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
-    from .models import quantify_models
     from .sklearn_estimator import KoopmanRegressor
 
 _HOME = {
@@ -25,7 +24,6 @@ _HOME = {
         ("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"),
         "control",
     ),
-    "quantify_models": "models",
     "KoopmanRegressor": "sklearn_estimator",
 }
 
@@ -34,7 +32,6 @@ __all__ = [
     "UncertaintyForControl",
     "from_control",
     "models_to_control",
-    "quantify_models",
     "to_control",
     "uncertainty_to_control",
 ]

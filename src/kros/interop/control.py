@@ -46,9 +46,10 @@ class UncertaintyForControl:
     Examples
     --------
     >>> import control
-    >>> from kros.interop import quantify_models
-    >>> lags = [control.tf([1 - pole], [1, -pole], 0.01) for pole in (0.88, 0.9, 0.91)]
-    >>> found = quantify_models(lags, "additive")
+    >>> import kros
+    >>> from kros.interop import uncertainty_to_control
+    >>> lags = [control.ss([[pole]], [[1 - pole]], [[1]], [[0]], 0.01) for pole in (0.88, 0.9, 0.91)]
+    >>> found = uncertainty_to_control(kros.quantify(lags, "additive"))
     >>> found.model.nominal_id, found.nominal.ninputs, found.left.dt
     ('1', 1, 0.01)
     """

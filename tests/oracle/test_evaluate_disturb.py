@@ -11,7 +11,9 @@ from kros.data.population import EpisodeKey
 from kros.evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
 from kros.evaluate.disturb import Measured, hold_missing
 from kros.lifting import Lifting
-from kros.observer import ExtendedKalman, Observer, run_observers
+from kros.observer import Observer
+from kros.observer.baselines.extended_kalman import ExtendedKalman
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 LINEAR = Lifting(("x", "v"))

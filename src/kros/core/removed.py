@@ -136,11 +136,26 @@ metrics.json.
 Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
 for any pattern of losses, and the report's figure of lost measurements.
     kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
-Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known load,
-with LoadSettings.
+Calibrations of a load are no longer objects apart; a study with recordings of the condition load makes them.
     kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load
-The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.
+The torque constant has no functions apart; a study with recordings of the condition load finds it.
     kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
+The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
+    kros.export.HeldOut
+Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
+    kros.observer.track_parameter kros.observer.Tracked
+Baselines are no longer public classes; name them in observer.baselines of a study, ekf and filtered_difference.
+    kros.observer.ExtendedKalman kros.observer.FilteredDifference
+Bounds for recorded signals are no longer a public function; kros.synthesize computes them, its facts hold
+set_bound_percent.
+    kros.observer.signal_bound kros.observer.SignalBound
+How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
+    kros.motor_drive.LoadSettings kros.motor_drive.TorqueScale kros.motor_drive.known_load
+    kros.motor_drive.load_observer
+Status bits of a batch, monitors, guards and observers side by side are internal; step a running observer, read its
+status, and let kros.synthesize make the others.
+    kros.observer.run_with_status kros.observer.sample_status kros.observer.Monitor kros.observer.Guard
+    kros.observer.run_observers
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
     kros.synthesis.UnitCheck kros.synthesis.check_units
 """

@@ -102,8 +102,4 @@ def _monitor(entry: Mapping[str, Any] | None) -> list[str]:
         return []
     text = f"Status bit 8: the innovation is outside the envelope of {entry['units']} units. A good unit leaves it "
     text += f"with a probability of {100 * entry['false_alarm_rate']:g} %"
-    low, high = entry["alarms_per_hour"]
-    if low is not None:
-        text += f", {number(entry['alarms'] / entry['hours'], 2)} times an hour in the recordings (95 % interval "
-        text += f"{number(low, 2)} to {number(high, 2)})"
     return [f"{text}."]

@@ -18,8 +18,9 @@ from ...design.task import split_name
 from ...evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
 from ...evaluate.disturb import Measured
 from ...evaluate.sensor import as_shown
-from ...observer import Observer, run_observers
+from ...observer import Observer
 from ...observer.sensor import Sensors
+from ...observer.simulate import run_observers
 from ..engine.context import Context
 
 Array = npt.NDArray[np.float64]

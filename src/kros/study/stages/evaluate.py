@@ -18,7 +18,7 @@ from ...design.synthesize import measurement_noise
 from ...design.validation import TrainingSet
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
-from ...observer.sensor import limits_of, sides
+from ...observer.sensor import sides
 from ..engine.context import Context
 from .disturbed import Trial, alike, make_trial, run_disturbed
 from .held_out import HeldOut, Outcome
@@ -69,7 +69,7 @@ def run(context: Context) -> None:
 def estimation(context: Context, episodes: HeldOut, trial: Trial | None = None) -> Pieces:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
     states = context.population.states
-    limits = sides(limits_of({}, context.facts.limits, states), states)
+    limits = sides(context.facts.limits, states)
     makers = baseline_makers(context, episodes)
     work: Pieces = {(name,): partial(episodes.baseline, make, limits, trial) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):

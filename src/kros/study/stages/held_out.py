@@ -17,8 +17,9 @@ from ...evaluate import TrueErrors, true_errors
 from ...evaluate.errors import ErrorSummary, summarise_all
 from ...evaluate.sensor import as_shown
 from ...identify import ModelSet, free_run
-from ...observer import Observer, run_observers
+from ...observer import Observer
 from ...observer.sensor import Sensors
+from ...observer.simulate import run_observers
 from .disturbed import Trial
 
 Array = npt.NDArray[np.float64]

@@ -5,7 +5,6 @@ E_k = W_L Delta_k W_R,   ||Delta_k|| <= 1      w2 ──> W_L ──>   and   �
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -35,10 +34,6 @@ class Weight:
         """Return the magnitudes of the diagonals at some frequencies."""
         left, right = (dense_response(side, freqs_hz) for side in (self.left, self.right))
         return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
-
-    def mapped(self, change: Callable[[StateSpace], StateSpace]) -> Weight:
-        """Return the weight with its systems changed, for example to another time."""
-        return replace(self, left=change(self.left), right=change(self.right))
 
     def scaled(self, factor: float) -> Weight:
         """Return the weight with its left part multiplied."""

@@ -158,6 +158,8 @@ status, and let kros.synthesize make the others.
     kros.observer.run_observers
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
     kros.synthesis.UnitCheck kros.synthesis.check_units
+The mean of episodes with the same inputs is no longer part of kros; use learned, and compare repeated motions with numpy.
+    observer.baselines=mean_profile
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

@@ -41,7 +41,6 @@ class FitRule:
     """Fit of diagonal weights and their covers; none of it bears on soundness, which the proof at the end decides."""
 
     points: int = 160  # frequencies of the joint fit: what is missed between them joins it
-    covered: int = 300  # frequencies at which optimal covers are computed, between which they are interpolated
     units: int = 4  # largest residuals of a frequency in cover and fit; the check has all
     temperatures: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003)  # nepers, of smoothed maxima; the last is 0.03 dB
     steps: int = 12  # at most, at each temperature, and of the search of a cover at each of its orders
@@ -99,7 +98,6 @@ class OutlierRule:
     largest_db: float = 26.0  # beyond the largest of the others, twenty times as far away, at which a unit has to show
     largest_percent: float = 900.0  # change of gain, ten times as large, at which a unit has to show
     percent: float = 1.0  # change of an entry from which the smallest change that shows is extrapolated
-    changed: int = 12  # units at most, whose entries are changed
     recorded: float = 0.5  # of the middle unit's samples: the variance of an estimate is at most twice the usual one
 
 
@@ -113,7 +111,6 @@ class SetRule:
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
-    nominals: int = 64  # at most, of the mean over pairs of units
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 

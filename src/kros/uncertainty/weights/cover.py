@@ -70,21 +70,19 @@ def optimal_cover(E: Array) -> Cover:
 def _descend(first: Array, p: int) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     size = sigma_max_first(first).max(axis=0)
-    alive = np.flatnonzero(size > 0)
-    n = first.shape[0] + first.shape[1]
+    alive, n = np.flatnonzero(size > 0), first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, FIT.covered).round().astype(int))]
-    E = first[..., chosen] / size[chosen]
+    E = first[..., alive] / size[alive]
     leading = np.argsort(-sigma_max_first(E), axis=0)[: FIT.units]  # all others are covered by the scale
     E = E[:, :, np.unique(leading)]
-    x = np.zeros((n, len(chosen)))
+    x = np.zeros((n, len(alive)))
     for squarings in FIT.squarings:
         for _ in range(FIT.steps):
             before, x = x, _newton(_Smooth(E, p, squarings), x)
             if np.abs(x - before).max() < PROOF.rounding:
                 break
-    return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
+    return np.array([np.interp(np.arange(len(size)), alive, row) for row in x])
 
 
 @dataclass(frozen=True, eq=False)

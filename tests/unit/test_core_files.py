@@ -113,7 +113,7 @@ def test_archives_that_would_unpack_to_anything(tmp_path: Path) -> None:
     )
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", header + bytes(8))
-    with pytest.raises(DataError, match="holds 8 bytes"):
+    with pytest.raises(DataError, match="not a valid archive"):
         read_arrays(path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", b"not an array")

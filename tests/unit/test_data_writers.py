@@ -13,8 +13,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kros.core.errors import ConfigError, DataError
-from kros.core.locks import locked
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
 from kros.data.readers.parquet import group_file, read_parquet, write_group, write_index
 
@@ -176,17 +175,6 @@ def test_damaged_folders(tmp_path: Path) -> None:
     (out / "b@warm.parquet").unlink()
     with pytest.raises(DataError, match=r"1 files are missing, the first b@warm\.parquet"):
         read_parquet(out)
-
-
-def test_what_a_killed_writer_left_goes_and_two_at_once_are_refused(tmp_path: Path) -> None:
-    out, left = tmp_path / "population", tmp_path / ".kros.population"
-    (left / "draft").mkdir(parents=True)
-    (left / "draft" / "half").write_text("done")
-    with locked(left), pytest.raises(ConfigError, match="is at work in it"):
-        write_parquet(population(), out)
-    write_parquet(population(), out)
-    assert [p.name for p in tmp_path.iterdir()] == ["population"]
-    assert not (out / "half").exists()
 
 
 def test_an_episode_is_read_once_and_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:

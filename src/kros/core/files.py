@@ -16,7 +16,6 @@ from typing import Any
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
-from .locks import locked
 
 _KINDS = {
     stat.S_IFDIR: "a folder",
@@ -98,23 +97,12 @@ def whole_folder(out: Path) -> Iterator[Path]:
     out = out.absolute()
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
-    work = out.with_name(f"{TEMPORARY}{out.name}")
-    draft = work / "draft"
-    work.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(work):
-            shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed
-            try:
-                draft.mkdir()
-                yield draft
-                with suppress(FileNotFoundError):
-                    out.rmdir()
-                draft.replace(out)
-            finally:
-                shutil.rmtree(draft, ignore_errors=True)
-    finally:
-        with suppress(OSError):  # another process has begun
-            work.rmdir()
+    with draft_beside(out.parent) as draft:
+        draft.mkdir()
+        yield draft
+        with suppress(FileNotFoundError):
+            out.rmdir()
+        draft.replace(out)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

@@ -9,129 +9,53 @@ from typing import Any
 # A sentence, then indented the public names ``kros.package.name``, the keys of a study ``section.key``, and their
 # values ``section.key=value`` that it is for.
 _TABLE = """\
-Subspace-identified predictors are no longer part of kros; use the method estimator, whose settings are in [estimator].
+Subspace-identified predictors and steps of the estimator's design are no longer part of kros; use the method estimator.
     memory predictor synthesis.methods=memory kros.observer.identify_predictor kros.observer.PastMoments
+    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal kros.observer.residual_models
+    kros.observer.tune_observer kros.observer.in_sizes kros.observer.EstimateKind kros.observer.Dropped
+    kros.observer.DropoutBound kros.observer.dropout_bound
 Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.
     synthesis.noise
-Structures of weights to choose from are no longer part of kros; remove the key structure, weights are diagonal.
-    uncertainty.structure
-Systems and responses are no longer quantified by functions of their own; use quantify, which takes systems, responses
-(form before freqs_hz) and models of kros.identify.
-    kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses
-Order against tightness of weights is no longer part of kros; use fit_magnitude, whose result has overbound_db.
-    kros.uncertainty.magnitude_tightness
-Where a form is exact is no longer a function of its own; use misfit, which is zero there.
-    kros.uncertainty.completion kros.uncertainty.existence
-The nominals of all forms are no longer one function; use choose_nominal for each form.
-    kros.uncertainty.choose_nominals
-Parameters of a lifting are not named; a formula that reads phase has one for every unit, remove the key parameters.
-    lifting.parameters
-What is left out at the start of a segment of constant speed is no longer a setting; remove the key settle_s, it is a
-two-hundredth of an episode.
-    calibrate.settle_s
-Steps of the design of predictors and residual-shaped observers are no longer public; use synthesize with method
-estimator or residual_h2.
-    kros.observer.conditioned kros.observer.driven_coordinates kros.observer.with_internal kros.observer.residual_models
-    kros.observer.tune_observer kros.observer.in_sizes
-Filtered estimates are those of a running observer, whose gain follows from the correction; use running.filter.
-    kros.observer.EstimateKind
-Refined models of resampled episodes are made where a study quantifies; use bootstrap_edmd, or the noise_share of a run.
-    kros.identify.bootstrap_refined
-Disturbed measurements of every observer, unit and condition are no longer part of a study; use evaluate.robustness =
-true.
-    evaluate.robustness=all
-The observers kalman_white and luenberger are no longer part of kros; use kalman_tuned.
-    observer.baselines=kalman_white observer.baselines=luenberger
-The set of worst-case synthesis, of signals or of the form, is chosen on held-out episodes; remove the key set.
-    synthesis.set
-Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify, recordings go both ways
-with kros.data.
-    kros.interop.AdoptedModel kros.interop.from_pykoop kros.interop.models_from_pykoop
-Pairs of rows are no longer part of kros; use y of KoopmanRegressor.fit, or GroupKFold.
-    kros.interop.one_step_pairs
-Preparation steps that follow events are no longer part of kros; use offset and trim, or a class of your own that
-derives from Step.
-    kros.data.steps.ByDirection kros.data.steps.Cut kros.data.steps.Tare
-Centres other than those of k-means are no longer part of kros; use kmeans_centres, or a list of points.
-    kros.lifting.grid_centres kros.lifting.latin_hypercube_centres kros.lifting.random_centres
-Families that only join texts are no longer part of kros; write the formulas under functions or input_functions.
-    kros.lifting.formulas kros.lifting.products
-Kernels of random Fourier features are no longer a choice; fourier_features approximates the Gaussian kernel.
-    kros.lifting.Kernel
-Bounds of the structured singular value and D-K iteration are no longer part of kros; hand the uncertain model to dkpy,
-as examples/output_feedback does.
-    kros.synthesis.Block kros.synthesis.MuBounds kros.synthesis.dk_iteration kros.synthesis.mu_bounds
-    kros.synthesis.mu_lower kros.synthesis.mu_upper
-Worst-case H-infinity observers and gains are no longer part of kros; use worst_case_h2, which bounds the error of every
-member too.
-    kros.synthesis.worst_case_hinf kros.synthesis.robust_gain kros.synthesis.RobustGain
-    synthesis.methods=worst_case_hinf
-Controllers are no longer polished by descent; use reduce_controller, which truncates in balanced coordinates and
-certifies the result.
-    kros.synthesis.polish synthesis.max_states synthesis.tune
-Placed poles are no longer part of kros; use kalman.
-    kros.synthesis.luenberger
-Random members of the uncertain set are no longer drawn in a study; the certificate bounds all of them, and the report
-shows disturbed measurements.
-    kros.evaluate.MonteCarlo kros.evaluate.sample_errors evaluate.monte_carlo
-Readers of one format are no longer public; use kros.read, which finds the format or is told it.
-    kros.data.read_csv_folder kros.data.read_motor_drive_raw
-The check of a population and the class of a split are no longer public; kros.identify checks, split_episodes splits.
-    kros.data.Split kros.data.check_population
-The function run_study is no longer part of kros; use kros.run, which takes a study too.
-    kros.study.run_study
-The load's angle and the size of its observer are no longer settings; remove the keys, and let the step offset make the
-angle zero where the moment is.
-    load.angle_rad load.memories
-The place of corrections is no longer chosen in a study: worst_case_h2 corrects the state, mixed the input; remove the
-key injection.
-    synthesis.injection
-Parts of the phase calibration are no longer public; kros.identify calibrates, and its result has the calibration.
-    kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase
-Factors of single episodes before their parameters are known are no longer public; use kros.identify.episode_factors.
-    kros.identify.lifted_factor kros.identify.reduce_episode
-Refined models have no class apart from others; refine_population returns their matrices and a Refinement.
-    kros.identify.refine.RefinedModels
-Families are joined as tuples, and a lifting refuses functions that repeat; write harmonics(...) + polynomials(...).
-    kros.lifting.concatenate
-TrueChannel is no longer part of kros; use Channel with the role truth, Channel(name, Role.TRUTH, unit, of=state).
-    kros.data.TrueChannel
-How weights and outlier scores are computed is no longer set in a study; use kros.quantify, which takes nominal,
-max_order, tolerance_db and false_alarm_rate.
-    uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate
-Flagged units are no longer dropped by a study itself; name them under data.exclude.
-    uncertainty.drop_outliers
-What the fit of a weight is made of is no longer public; use quantify.
-    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
-    kros.uncertainty.FitSettings
-Margins of stability, the largest residual of identification and the factor of alpha are no longer settings; remove the
-keys, or set identify.alpha to a number.
-    identify.margin identify.largest_residual identify.alpha_factor
-The spectrum of the inputs, the penalty on corrections and the time limit are no longer settings of a study; remove the
-keys, and use kros.design.methods for a method with other options.
-    synthesis.input_weight synthesis.penalty synthesis.time_limit_s
-Limits of states are no longer declared; remove the table limits, kros detects limits that recordings reach.
-    limits
+Keys for details of a method are no longer part of a study; remove the key, or call the function of the stage in Python.
+    uncertainty.structure uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db lifting.parameters
+    uncertainty.false_alarm_rate calibrate.settle_s identify.margin identify.largest_residual identify.alpha_factor
+    synthesis.set synthesis.injection synthesis.max_states synthesis.tune synthesis.input_weight synthesis.penalty
+    synthesis.time_limit_s evaluate.monte_carlo evaluate.robustness=all observer.false_alarm_rate load.angle_rad
+    load.memories load.condition load.angle load.current load.limit load.level_s
+Limits, requirements and dropped units are no longer part of a study; remove the key, see metrics.json and data.exclude.
+    limits require require.robust require.no_outliers uncertainty.drop_outliers
 The deployed observer is no longer named in a study; remove the key deployed, and use kros export c --observer.
     observer.deployed
-The rate of false alarms of the monitor is no longer a setting of a study; remove the key, it is 0.02.
-    observer.false_alarm_rate
-Names of condition, angle and current, limit and time constant of a load are no longer settings; remove the keys, name
-the condition load and the states position and current.
-    load.condition load.angle load.current load.limit load.level_s
-Requirements are no longer part of a study; remove the table require, and read certificates and outliers in
-metrics.json.
-    require require.robust require.no_outliers
-Certificates for lost measurements are no longer part of kros; use the method estimator, whose estimates stay bounded
-for any pattern of losses, and the report's figure of lost measurements.
-    kros.observer.Dropped kros.observer.DropoutBound kros.observer.dropout_bound
-Calibrations of a load are no longer objects apart; use load_observer, which takes the recordings and the known load,
-with LoadSettings.
-    kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load
-The torque constant has no functions apart; use TorqueScale.calibrated, whose result has load.
-    kros.motor_drive.calibrate_torque kros.motor_drive.load_from_current
-Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
-    kros.synthesis.UnitCheck kros.synthesis.check_units
+Robust controllers beyond H2 are no longer part of kros; use worst_case_h2, or hand the uncertain model to dkpy.
+    kros.synthesis.Block kros.synthesis.MuBounds kros.synthesis.dk_iteration kros.synthesis.mu_bounds
+    kros.synthesis.mu_lower kros.synthesis.mu_upper kros.synthesis.worst_case_hinf kros.synthesis.robust_gain
+    kros.synthesis.RobustGain kros.synthesis.polish kros.synthesis.UnitCheck kros.synthesis.check_units
+    synthesis.methods=worst_case_hinf
+White-noise Kalman observers and placed poles are no longer part of kros; use kalman_tuned.
+    observer.baselines=kalman_white observer.baselines=luenberger kros.synthesis.luenberger
+Parts of the uncertainty are no longer public; use quantify, which takes models, systems and responses.
+    kros.uncertainty.quantify_systems kros.uncertainty.quantify_responses kros.uncertainty.magnitude_tightness
+    kros.uncertainty.completion kros.uncertainty.existence kros.uncertainty.choose_nominals
+    kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
+    kros.uncertainty.FitSettings
+Parts of the identification are no longer public; use kros.identify, whose result has models and calibration.
+    kros.identify.bootstrap_refined kros.identify.find_segments kros.identify.resolve_branches kros.identify.unit_phase
+    kros.identify.lifted_factor kros.identify.reduce_episode kros.identify.refine.RefinedModels
+Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
+    kros.interop.AdoptedModel kros.interop.from_pykoop kros.interop.models_from_pykoop kros.interop.one_step_pairs
+Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
+    kros.data.read_csv_folder kros.data.read_motor_drive_raw kros.data.Split kros.data.check_population
+    kros.data.TrueChannel kros.data.steps.ByDirection kros.data.steps.Cut kros.data.steps.Tare
+Families that join texts, and centres and kernels to choose from, are no longer part of kros; write the formulas.
+    kros.lifting.grid_centres kros.lifting.latin_hypercube_centres kros.lifting.random_centres kros.lifting.formulas
+    kros.lifting.products kros.lifting.Kernel kros.lifting.concatenate
+Random members of the uncertain set are no longer drawn; use the certificate, which bounds all of them.
+    kros.evaluate.MonteCarlo kros.evaluate.sample_errors
+The function run_study is no longer part of kros; use kros.run, which takes a study too.
+    kros.study.run_study
+Calibrations of a load are no longer objects apart; use load_observer, or TorqueScale.calibrated, whose result has load.
+    kros.motor_drive.LoadCalibration kros.motor_drive.calibrate_load kros.motor_drive.calibrate_torque
+    kros.motor_drive.load_from_current
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

@@ -31,7 +31,6 @@ import numpy.typing as npt
 from ..core.errors import DimensionError
 from ..core.settings import member
 from ..core.small_matrices import (
-    condition_number,
     entries_first,
     entries_last,
     multiply,
@@ -207,7 +206,7 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     size = sigma_max(responses)
     ratio = np.divide(error, size, out=np.zeros_like(error), where=size > 0)
     if form.inverse:
-        ratio[~(condition_number(inverted_matrix(form, nominal, E)) <= SET.condition)] = np.nan
+        ratio[~(np.linalg.cond(inverted_matrix(form, nominal, E)) <= SET.condition)] = np.nan
     return ratio
 
 
@@ -218,7 +217,7 @@ def completion(
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
     E = residual(form, G, Gp) if E is None else E
     if form.inverse:
-        regular = condition_number(inverted_matrix(form, G, E)) <= SET.condition
+        regular = np.linalg.cond(inverted_matrix(form, G, E)) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)
     return E, Gp - rebuild(form, G, E)
 

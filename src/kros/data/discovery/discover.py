@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,6 @@ from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
-Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
 
 
 @dataclass(frozen=True)
@@ -55,7 +54,7 @@ class Discovery:
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
+def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
     """Describe a folder of text tables or of Parquet files of any layout."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
@@ -63,7 +62,7 @@ def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None,
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, why = _columns(source, head, list(alike.values()), wanted.period_s)
     mapping, notes = mapping | keys, notes | why
-    columns = _decided(columns, wanted, ask)
+    columns = _decided(columns, wanted)
     recorded = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
     mapping["channel"] = [_channel(c) for c in columns if c.part in recorded]
     draft = Discovery(mapping, (), tuple(columns), read_csv_folder(source, mapping | _exclusion(strange)), notes)
@@ -227,11 +226,9 @@ def _channel(column: TableColumn) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
-def _decided(columns: Sequence[TableColumn], wanted: Wanted, ask: Ask | None) -> list[TableColumn]:
+def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
     """Return the columns with the parts that were named or asked for, else proposed."""
     decided = assign(columns, wanted.measured, wanted.inputs)
-    if ask is not None and not (wanted.measured and wanted.inputs):
-        decided = list(ask(decided))
     needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
     for part, (what, option) in needed.items():
         if not any(c.part is part for c in decided):

@@ -55,7 +55,7 @@ def list_run(run: Path) -> list[str]:
         records = {stage.value: store.record(stage) for stage in Stage}
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
-        if store.is_kept("metrics.json"):
+        if store.path("metrics.json").exists():
             result = RunResult(store.folder, read_json(store.path("metrics.json")))
             return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:

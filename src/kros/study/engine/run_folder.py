@@ -7,14 +7,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import read_json
+from ...core.artifacts import read_json, write_json
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import TEMPORARY
 from ...core.locks import locked
 from ..config import Stage, StudyConfig, stored_config
-from .store import Store
-
-STUDY = "study.json"
+from .store import STUDY, Store
 
 
 def require_own(out: Path, config: StudyConfig) -> bool:
@@ -61,7 +59,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
             store.tidy()
             try:
                 if fresh:
-                    store.keep(STUDY, config.dump())
+                    write_json(store.path(STUDY), config.dump())
                 yield store
             except (ConfigError, DataError, DimensionError):
                 if fresh and store.record(Stage.READ) is None:

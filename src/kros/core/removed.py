@@ -51,6 +51,9 @@ Families that join texts, and centres and kernels to choose from, are no longer 
     kros.lifting.products kros.lifting.Kernel kros.lifting.concatenate
 Random members of the uncertain set are no longer drawn; use the certificate, which bounds all of them.
     kros.evaluate.MonteCarlo kros.evaluate.sample_errors
+Disturbed episodes and errors against truth are no longer public objects; use kros.run, whose metrics have them.
+    kros.evaluate.Disturbance kros.evaluate.DisturbedEpisodes kros.evaluate.TrueErrors kros.evaluate.robustness_rows
+    kros.evaluate.standard_disturbances
 The function run_study is no longer part of kros; use kros.run, which takes a study too.
     kros.study.run_study
 Calibrations of a load are no longer objects apart; use load_observer, or TorqueScale.calibrated, whose result has load.

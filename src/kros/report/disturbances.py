@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..evaluate import Kind
-from ..evaluate.robustness import severity_of_growth
+from ..evaluate.disturb import severity_of_growth
 from .facts import Facts
 
 Array = npt.NDArray[np.float64]

@@ -19,7 +19,7 @@ from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
 from ...data.survey import RecordingFacts
-from ...evaluate.arriving import Arriving, arriving
+from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import segments_of
 from ...observer import Observer

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...core.artifacts import load_artifact, read_json
+from ...core.artifacts import load_artifact
 from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.verdict import judge
 from ..config import Stage
 from ..engine.run_folder import open_finished
+from ..engine.store import METRICS
 from ..pipeline import RunResult
 
 
@@ -55,8 +56,8 @@ def list_run(run: Path) -> list[str]:
         records = {stage.value: store.record(stage) for stage in Stage}
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
-        if store.path("metrics.json").exists():
-            result = RunResult(store.folder, read_json(store.path("metrics.json")))
+        if store.path(METRICS).exists():
+            result = RunResult(store.folder, store.metrics())
             return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]

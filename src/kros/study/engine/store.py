@@ -19,8 +19,9 @@ from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
-from ...core.artifacts import with_checksum, write_json
+from ...core.artifacts import read_json, with_checksum, write_json
 from ...core.errors import ConfigError, DataError
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...core.locks import NAME as LOCK
@@ -99,6 +100,13 @@ class Store:
         """Tell whether a file, or any file in a folder, belongs to the run."""
         name = "/".join(parts)
         return any(f == name or f.startswith(f"{name}/") for f in self.files())
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the metrics of the run."""
+        content = read_json(self.path(METRICS))
+        if not isinstance(content, dict):
+            raise DataError(f"Run: {self.path(METRICS)} holds no metrics; run the study again.")
+        return content
 
     def verify(self, *stages: str) -> None:
         """Make sure that what some finished stages, or all, wrote is as they left it."""

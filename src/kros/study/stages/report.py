@@ -6,7 +6,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-from ...core.artifacts import read_json
 from ...core.store import digest_of
 from ...core.work import Progress
 from ..config import Stage
@@ -37,7 +36,7 @@ def render_run(folder: Path, workers: int = 1) -> Path:
         store.drafting() as draft,
         open_executor(workers) as executor,
     ):
-        render(store.folder, read_json(store.path("metrics.json")), executor.map, draft.draft(REPORT))
+        render(store.folder, store.metrics(), executor.map, draft.draft(REPORT))
         record = store.record(Stage.REPORT)
         digest = digest_of(REPORT, [artefact.digest for artefact in store.manifest.values()])
         digest, seconds = (record.digest, record.seconds) if record else (digest, time.perf_counter() - began)

@@ -104,7 +104,7 @@ def init(
     from .study.commands.init import init_study
 
     wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
-    _say(init_study(folder, out, wanted, _progress()).lines)
+    _say(init_study(folder, out, wanted, _progress()))
 
 
 @app.command()

@@ -120,6 +120,9 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     for file in (tmp_path / "logged").iterdir():
         np.savetxt(file, _cut(file), delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
     result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv")
+    assert result.exit_code == 1
+    assert "--track phase" in result.stderr
+    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv", "--track", "phase")
     assert result.exit_code == 0, result.output
     assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
     names, values = table(tmp_path / "x.csv")
@@ -129,12 +132,9 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     for unit, own in facts["parameters"].items():
         apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
-    assert (
-        kros(
-            "estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2"
-        ).output.count("given")
-        == 1
-    )
+    options = ("--track", "phase", "--parameter", "m001001.phase=1.2")
+    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", *options)
+    assert result.output.count("that is given") == 1
     assert np.isfinite(values).all()
 
 

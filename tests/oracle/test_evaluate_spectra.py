@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from kros.evaluate.errors import error_spectrum, summarise
+from kros.evaluate.held_out import alike
 from kros.lifting import Lifting
 from kros.observer import Observer
-from kros.study.stages.held_out import alike
 
 DT = 1e-3
 

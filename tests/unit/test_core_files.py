@@ -145,7 +145,7 @@ def special(kind: str, path: Path) -> Path:
 def test_only_regular_files_are_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     monkeypatch.chdir(tmp_path)  # names of sockets are short
     path = special(kind, Path("x.toml"))
-    with pytest.raises(ConfigError, match=f"a regular file is needed, found .*{kind}"):
+    with pytest.raises(ConfigError, match=f"a regular file is needed, found a .*{kind}"):
         read_toml(path, "Study")
     with pytest.raises(DataError, match="a regular file is needed"):
         read_json(path)

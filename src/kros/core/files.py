@@ -17,13 +17,6 @@ from typing import Any
 from . import limits
 from .errors import ConfigError, DataError, KrosError
 
-_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 TEMPORARY = ".kros."  # how names begin of what is beside its place until it is whole
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 
@@ -51,8 +44,8 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
     except (OSError, ValueError) as failure:
         raise error(f"Reading {path}: {failure}; check the path and the permissions.") from failure
     if not stat.S_ISREG(status.st_mode):
-        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "not a regular file")
-        raise error(f"Reading {path}: a regular file is needed, found {kind}; copy its content to a file first.")
+        found = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
+        raise error(f"Reading {path}: a regular file is needed, found {found}; copy its content to a file first.")
     if status.st_size > limit:
         advice = "split it, or raise the limit in kros.core.limits"
         raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; {advice}.")
@@ -116,9 +109,10 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Read a TOML file."""
-    content = read_bytes(path, limits.MAX_TOML_BYTES, ConfigError)
     try:
-        return parse_toml(content.decode("utf-8-sig"))
+        return parse_toml(read_bytes(path, limits.MAX_TOML_BYTES, ConfigError).decode("utf-8-sig"))
+    except KrosError:
+        raise
     except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
         reason = "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
         raise ConfigError(f"{what} {path}: not a TOML file that can be used ({reason}); correct it.") from error

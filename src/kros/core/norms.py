@@ -30,7 +30,7 @@ Array = npt.NDArray[Any]
 
 _MAX_ITERATIONS = 60
 _EPSILON = float(np.finfo(float).eps)
-_AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
+_AGREE = 1e-4  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
 def as_state_space(system: Any) -> StateSpace:
@@ -92,12 +92,13 @@ def h2_norm(system: Any) -> float:
     Returns
     -------
     float
-        Infinity for an unstable system, and for a continuous one whose `D` is not zero.
+        The larger of the values by both Gramians, which rounding makes differ; infinity for an unstable system, and for
+        a continuous one whose `D` is not zero.
 
     Raises
     ------
     KrosError
-        When the two Gramians give different norms, so that rounding decides.
+        When the two differ so much that rounding decides.
 
     Examples
     --------
@@ -115,7 +116,7 @@ def h2_norm(system: Any) -> float:
     if not abs(squared - dual) <= _AGREE * max(squared, dual):
         problem = f"its square by both Gramians is {squared} and {dual}, so double precision does not determine it"
         raise KrosError(f"H2 norm: {problem}; scale states and time, or leave out modes that are much faster.")
-    return float(np.sqrt(max(squared, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
+    return float(np.sqrt(max(squared, dual, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
 
 
 def balanced(system: StateSpace) -> StateSpace:

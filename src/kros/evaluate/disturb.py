@@ -74,9 +74,7 @@ class Disturbance:
         object.__setattr__(self, "kind", member(Kind, self.kind, "Disturbance: the kind"))
         most = 1.0 if self.kind is Kind.DROPPED else np.inf
         if not 0 <= self.severity <= most or self.severity == np.inf:
-            raise ConfigError(
-                f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}."
-            )
+            raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be between 0 and {most:g}.")
         if self.kind in {Kind.GAP, Kind.DELAY} and self.severity != int(self.severity):
             raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be a whole number of samples.")
 
@@ -211,9 +209,7 @@ def severity_of_growth(severities: npt.ArrayLike, errors: npt.ArrayLike, factor:
     """Return the severity at which an error reaches a multiple of that without disturbance."""
     s, e = np.asarray(severities, dtype=float), np.asarray(errors, dtype=float)
     if s.shape != e.shape or s.ndim != 1 or not len(s) or s[0] != 0:
-        raise DimensionError(
-            f"Severity of growth: severities {s} should begin at zero, with as many errors, found {e.shape}."
-        )
+        raise DimensionError(f"Severity of growth: {s} should begin at zero, with as many errors, found {e.shape}.")
     limit = factor * e[0]
     beyond = np.flatnonzero(~(e < limit))
     if not len(beyond) or beyond[0] == 0:

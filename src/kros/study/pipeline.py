@@ -126,18 +126,14 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
     base, tables = Path(), dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
-            raise ConfigError(
-                "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
-            )
+            raise ConfigError("Run: data.source and data.reader are those of the population given; leave them out.")
         raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
         base = out
     elif isinstance(source, StudyConfig):
         raw = source.dump()
     elif not isinstance(source, str | Path):
-        raise ConfigError(
-            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with "
-            "kros.from_arrays."
-        )
+        needed = f"needs a Population, a folder or a study, found {type(source).__name__}"
+        raise ConfigError(f"Run: {needed}; make one with kros.from_arrays.")
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
         raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}

@@ -43,16 +43,15 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
     from ...plants import PLANTS
 
     plant, raw = simulation.plant, simulation.format == "raw"
-    for name, allowed in (("plant", tuple(PLANTS)), ("format", ("parquet", "raw")), ("loop", ("stiff", "soft"))):
+    for name, allowed in (("plant", tuple(PLANTS)), ("format", ("parquet", "raw"))):
         if (value := getattr(simulation, name)) not in allowed:
             raise ConfigError(f"--{name} {value!r}: choose one of {', '.join(allowed)}.")
     if raw and plant != HARMONIC_DRIVE:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    names = ("n_units", "n_episodes", "seconds", "seed", "spread", "outlier")
-    settings = {name: getattr(simulation, name) for name in (*names, *(("loop",) if plant == HARMONIC_DRIVE else ()))}
-    simulated = PLANTS[plant](**settings).simulate()
+    names = ("n_units", "n_episodes", "seconds", "seed", "spread", "outlier", *(["loop"] * (plant == HARMONIC_DRIVE)))
+    simulated = PLANTS[plant](**{name: getattr(simulation, name) for name in names}).simulate()
     if out.exists():
         out.rmdir()
     if raw:

@@ -48,10 +48,8 @@ def export_run(
         }
         known = (*names, *loads)
         if observer not in known:
-            raise ConfigError(
-                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, known) or ';'} "
-                f"known are {', '.join(known)}."
-            )
+            hint = f"{did_you_mean(observer, known) or ';'} known are {', '.join(known)}"
+            raise ConfigError(f"Run {run}: has no observer {observer!r}{hint}.")
         path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
         chosen, name = Observer.load(path), name or identifier(config.name)
         if not chosen.about:  # that of a load: its channels are those of the observer that is deployed

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,22 +27,10 @@ from ..stages.read import FEWEST, open_source
 from .study_text import LiftingProposal, study_text
 
 log = logging.getLogger(__name__)
-MOST_FINDINGS = 12
-_UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
-NO_LOAD = _UNLOADED_WORDS.split()
 
 
-@dataclass(frozen=True)
-class Initialised:
-    """What `kros init` wrote, and what it says."""
-
-    study: Path
-    lines: tuple[str, ...]
-    findings: tuple[str, ...]
-
-
-def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> Initialised:
-    """Write a study for a folder of recordings."""
+def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> list[str]:
+    """Write a study for a folder of recordings; return what people read at the terminal."""
     if out.exists():
         raise ConfigError(f"Output {out}: exists; name another file, --out FILE, or remove it.")
     if not source.is_dir():
@@ -62,8 +48,8 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> I
         data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
     folder = out.parent.absolute()
-    unloaded = _unloaded(open_source(validate_config({"data": dict(data)}, folder, str(out))))
-    data |= {} if unloaded is None else {"identify_on": unloaded}
+    condition = _commonest(open_source(validate_config({"data": dict(data)}, folder, str(out))))
+    data |= {} if condition is None else {"identify_on": condition}
     config = validate_config({"data": dict(data)}, folder, str(out))
     population, facts, refused = _surveyed(config, work)
     proposal = LiftingProposal(why="not looked for") if facts is None else propose_lifting(population, facts)
@@ -73,7 +59,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> I
     validate_config(parse_toml(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    return Initialised(out, tuple(_lines(population, discovery, proposal, findings, out)), tuple(findings))
+    return _lines(population, discovery, proposal, findings, out)
 
 
 def _source(source: Path, out: Path) -> str:
@@ -83,13 +69,12 @@ def _source(source: Path, out: Path) -> str:
         return str(source.absolute())
 
 
-def _unloaded(population: Population) -> str | None:
-    """Return the condition without load where its name is not the default, else the one that most units have."""
+def _commonest(population: Population) -> str | None:
+    """Return the condition that most units have, where none has the name of the one without load."""
     conditions = population.conditions
     if len(conditions) < 2 or UNLOADED in conditions:
         return None
-    named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD]
-    return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
+    return max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
 
 
 def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFacts | None, str]:
@@ -156,14 +141,10 @@ def _lines(
     episodes = f"{len(population.episodes)} episodes ({each} for each unit and condition)"
     period = f"every {population.sample_period_s:g} s"
     lines = [f"{number}, conditions {', '.join(population.conditions)}, {episodes}, {period}"]
-    if discovery is not None:
-        lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
+    lines += [] if discovery is None else [f"  {discovery.reading}", *column_lines(discovery.columns)]
     functions = "; ".join(proposal.lifting.get("functions", ()))
     lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
-    lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
-    if len(findings) > MOST_FINDINGS:
-        more = f"{len(findings) - MOST_FINDINGS} further points, which are written at the start of the study"
-        lines.append(f"looks wrong: {more}")
+    lines += [f"looks wrong: {text}" for text in findings]
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

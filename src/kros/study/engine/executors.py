@@ -38,10 +38,8 @@ def _results(results: Iterator[T]) -> Iterator[T]:
     try:
         yield from results
     except BrokenProcessPool as error:
-        raise KrosError(
-            "A worker process ended: memory ran out, or a script that asks for workers has no "
-            '`if __name__ == "__main__":` around what it does. Run again with fewer workers, or add that line.'
-        ) from error
+        reason = 'memory ran out, or a script that asks for workers has no `if __name__ == "__main__":` in it'
+        raise KrosError(f"A worker process ended: {reason}. Run again with fewer workers, or add that.") from error
 
 
 @contextmanager

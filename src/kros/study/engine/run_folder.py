@@ -25,10 +25,8 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     there, this = _identity(_read_study(out)), _identity(config.dump())
     if there != this:
-        raise ConfigError(
-            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; "
-            "name another folder, or remove this one if it is not needed any more."
-        )
+        both = f"holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}"
+        raise ConfigError(f"Output {out}: {both}; name another folder, or remove this one if it is not needed.")
     return False
 
 

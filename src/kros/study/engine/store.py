@@ -174,10 +174,8 @@ class Store:
             link_or_copy(source, beside)
             beside.replace(target)
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            obstacle = error.filename2 or error.filename
-            raise ConfigError(
-                f"Run folder {self.folder}: {obstacle} is in the place of a result; move it away."
-            ) from error
+            obstacle = f"{error.filename2 or error.filename} is in the place of a result"
+            raise ConfigError(f"Run folder {self.folder}: {obstacle}; move it away.") from error
 
     def drop(self, *stages: str) -> None:
         """Forget stages and their files in the run folder that are as written; artefacts and runs inside stay."""

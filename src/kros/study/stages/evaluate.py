@@ -12,17 +12,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import save_artifact
+from ...core.errors import KrosError
+from ...data.population import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned
 from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.task import split_name
 from ...design.validation import TrainingSet
 from ...evaluate.disturb import Kind, disturbed_rows, standard_disturbances
+from ...evaluate.held_out import HeldOut, Outcome, Trial, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.sensor import limits_of, sides
 from ..engine.context import Context
-from .held_out import HeldOut, Outcome, Trial, alike
 from .load import run_load
 
 log = logging.getLogger(__name__)
@@ -106,10 +108,27 @@ def estimation(context: Context, episodes: HeldOut, trial: Trial | None = None) 
     states = context.population.states
     limits = sides(limits_of({}, context.facts.limits, states), states)
     makers = baseline_makers(context, episodes)
-    work: Pieces = {(name,): partial(episodes.baseline, make, limits, trial) for name, make in makers.items()}
+    work: Pieces = {(name,): partial(of_baseline, episodes, make, limits, trial) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):
         work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
     return work
+
+
+def of_baseline(
+    episodes: HeldOut, make: Callable[[], Baseline], limits: tuple[Array, Array], trial: Trial | None
+) -> Outcome | str:
+    """Make a baseline and run it, on disturbed episodes too; return the reason where it cannot be made."""
+    try:
+        baseline = replace(make(), limits=limits)
+    except KrosError as error:
+        return str(error)
+
+    def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> list[Array]:
+        return [baseline.estimate(keys, y, u, values)[None]]
+
+    (outcome,) = episodes.estimates(run, baseline.measured)
+    disturbed = None if trial is None else trial.errors(run)[0]
+    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
 
 
 def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.lti import StateSpace, dense_response, gain
+from ...core.lti import StateSpace, gain
 from .certificate import Method
 from .cover import Cover
 
@@ -64,7 +64,7 @@ class Weight:
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
-        left, right = (dense_response(side, freqs_hz) for side in (self.left, self.right))
+        left, right = (side.frequency_response(freqs_hz) for side in (self.left, self.right))
         return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
 
     def matrix(self) -> StateSpace:

@@ -1,4 +1,4 @@
-"""What observers, baselines and models do on held-out episodes: errors, disturbed or not, and trajectories for figures."""
+"""Errors of observers, baselines and models on held-out episodes, disturbed or not, and trajectories for figures."""
 
 from __future__ import annotations
 
@@ -9,17 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import KrosError
-from ...data import EpisodeBatch
-from ...data.population import EpisodeKey, Population
-from ...design.baselines import Baseline
-from ...evaluate.disturb import Disturbance, Run, disturbed_errors
-from ...evaluate.errors import ErrorSummary, summarise
-from ...evaluate.sensor import as_shown
-from ...evaluate.truth import TrueErrors, true_errors
-from ...identify import ModelSet, free_run
-from ...observer import Observer, run_observers
-from ...observer.sensor import Sensors
+from ..data import EpisodeBatch
+from ..data.population import EpisodeKey, Population
+from ..identify import ModelSet, free_run
+from ..observer import Observer, run_observers
+from ..observer.sensor import Sensors
+from .disturb import Disturbance, Run, disturbed_errors
+from .errors import ErrorSummary, summarise
+from .sensor import as_shown
+from .truth import TrueErrors, true_errors
 
 Array = npt.NDArray[np.float64]
 SIDE_BY_SIDE = 32  # episodes
@@ -81,26 +79,13 @@ class HeldOut:
 
     def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
         """Run observers that `alike` puts together."""
-        return self.outcomes(lambda batch: self._estimates(observers_run(observers), batch, observers[0].measured))
+        return self.estimates(observers_run(observers), observers[0].measured)
 
-    def _estimates(self, run: Run, batch: EpisodeBatch, measured: Sequence[int]) -> Iterable[Array]:
-        return run(batch.keys, batch.measurements(measured), batch.inputs, batch.parameters)
-
-    def baseline(
-        self, make: Callable[[], Baseline], limits: tuple[Array, Array], trial: Trial | None = None
-    ) -> Outcome | str:
-        """Make a baseline and run it, on disturbed episodes too; return the reason where it cannot be made."""
-        try:
-            baseline = replace(make(), limits=limits)
-        except KrosError as error:
-            return str(error)
-
-        def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> list[Array]:
-            return [baseline.estimate(keys, y, u, values)[None]]
-
-        (outcome,) = self.outcomes(lambda batch: self._estimates(run, batch, baseline.measured))
-        disturbed = None if trial is None else trial.errors(run)[0]
-        return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
+    def estimates(self, run: Run, measured: Sequence[int]) -> list[Outcome]:
+        """Run estimators on what the sensor shows of the measured states."""
+        return self.outcomes(
+            lambda batch: run(batch.keys, batch.measurements(measured), batch.inputs, batch.parameters)
+        )
 
     def models(self, models: ModelSet) -> Outcome:
         """Run every unit's model freely from the true first state, with delays from the first recorded ones."""

@@ -5,8 +5,8 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays
-from kros.study.stages import held_out
-from kros.study.stages.held_out import HeldOut
+from kros.evaluate import held_out
+from kros.evaluate.held_out import HeldOut
 
 STATES = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE)
 CHANNELS = (*STATES, Channel("u", Role.INPUT), Channel("v_true", Role.TRUTH, of="v"))

@@ -132,8 +132,7 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
     elif isinstance(source, StudyConfig):
         raw = source.dump()
     elif not isinstance(source, str | Path):
-        needed = f"needs a Population, a folder or a study, found {type(source).__name__}"
-        raise ConfigError(f"Run: {needed}; make one with kros.from_arrays.")
+        raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}.")
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
         raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}

@@ -26,7 +26,7 @@ from .field import load_calibration
 
 log = logging.getLogger(__name__)
 
-DEPLOYED, LOAD = "deployed", "load"
+DEPLOYED, LOAD, KINDS = "deployed", "load", ("koopman", "linear")
 _EPISODES, _SAMPLES = 8, 20_000  # that the numerical error is measured on
 
 
@@ -43,17 +43,14 @@ def export_run(
     """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
-        loads = {
-            f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")
-        }
-        known = (*names, *loads)
-        if observer not in known:
+        places = {name: store.path("observers", f"{name}.json") for name in names}
+        loads = {f"{k}/{LOAD}": store.path(LOAD, f"{k}.json") for k in KINDS if store.holds(LOAD, f"{k}.json")}
+        if observer not in (known := places | loads):
             hint = f"{did_you_mean(observer, known) or ';'} known are {', '.join(known)}"
             raise ConfigError(f"Run {run}: has no observer {observer!r}{hint}.")
-        path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
-        chosen, name = Observer.load(path), name or identifier(config.name)
+        chosen, name = Observer.load(known[observer]), name or identifier(config.name)
         if not chosen.about:  # that of a load: its channels are those of the observer that is deployed
-            about = Observer.load(store.path("observers", f"{DEPLOYED}.json")).about
+            about = Observer.load(places[DEPLOYED]).about
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)
@@ -70,13 +67,12 @@ def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut |
     facts, calibration = RecordingFacts.load(store.path("population")), load_calibration(store)
     try:
         population = open_source(config)
-        units = {
-            u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad}
-            for u in population.unit_ids
+        phases = {} if calibration is None else calibration.units
+        known = {
+            u: {} if calibration is None else {calibration.spec.parameter: phases[u].phase_rad} for u in facts.groups
         }
-        batch = EpisodeBatch.read(
-            population, spread([k for k in facts.test if k.unit in units], _EPISODES), parameters=units
-        )
+        keys = spread([k for k in facts.test if k.unit in population.unit_ids], _EPISODES)
+        batch = EpisodeBatch.read(population, keys, parameters=known)
     except (KrosError, KeyError) as error:
         log.warning("Numerical error: not measured, since the run's recordings cannot be read: %s", error)
         return None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 from ...core.artifacts import write_json
@@ -73,7 +72,6 @@ def run_demo(
         if (artefact := store.stored(digest)) is not None:
             store.add(_STAGE, artefact)
         else:
-            executor.map(_load, range(workers))  # worker processes begin with it meanwhile
             progress.start(_STAGE, None)
             began = time.perf_counter()
             with store.drafting() as draft:
@@ -81,9 +79,3 @@ def run_demo(
                 draft.commit(_STAGE, digest, time.perf_counter() - began)
         require_usable(config, Stage.REPORT)
         return run_in(store, config, Stage.REPORT, executor, progress)
-
-
-def _load(_: int) -> None:
-    """In a worker: load what takes long to load and every study needs."""
-    for name in ("kros.study.pipeline", "pyarrow.parquet", "scipy.optimize", "sympy"):
-        import_module(name)

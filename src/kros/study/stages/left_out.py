@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -86,7 +86,11 @@ def results(context: Context) -> dict[str, Any]:
 
 def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> dict[str, Any]:
     """Make the study once for every fold; return the errors on the units that took no part in it."""
-    results = [run_fold(context, number, units, len(folds)) for number, units in enumerate(folds)]
+    results = []
+    context.work.progress.start("left out", len(folds))
+    for number, units in enumerate(folds):
+        results.append(run_fold(context, number, units))
+        context.work.progress.advance()
     return {
         "folds": folds,
         "errors": "empirical",  # of these units: folds share what they learn from, so nothing follows for the next one
@@ -96,16 +100,15 @@ def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> dict[str, Any]
     }
 
 
-def run_fold(whole: Context, number: int, units: Sequence[str], folds: int) -> dict[str, Any]:
+def run_fold(whole: Context, number: int, units: Sequence[str]) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; return the reason where it fails."""
-    progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
     store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
-    context = Context(without(whole, units), store, replace(whole.work, progress=progress))
+    context = Context(without(whole, units), store, replace(whole.work, progress=Progress()))
     steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, units), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
     except KrosError as error:
-        log.warning("fold %d of %d: %s", number + 1, folds, error)
+        log.warning("fold %d: %s", number + 1, error)
         return {"failed": str(error)}
     return load_artifact(context.store.path("evaluation"), KIND)[0]
 
@@ -221,23 +224,3 @@ def facts_of_folds(folds: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts
-
-
-@dataclass(frozen=True)
-class Fold(Progress):
-    """Tells a progress listener about the stages of a fold."""
-
-    listener: Progress
-    title: str
-
-    def start(self, stage: str, total: int | None) -> None:
-        """A stage of the fold begins."""
-        self.listener.start(self.title + stage, total)
-
-    def advance(self) -> None:
-        """One of its steps is done."""
-        self.listener.advance()
-
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """A stage of the fold is done, or was found done."""
-        self.listener.finish(self.title + stage, seconds, skipped)

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 import typer
 
-from .core.work import Progress, keep_freed_memory
+from .core.work import Progress
 from .edge import NOT_MET, UNDECIDED, EdgeGroup, log_to_stderr
 
 app = typer.Typer(
@@ -85,9 +85,8 @@ def main(
         bool, _option("Say the version and nothing else.", "--version", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Set up logging and memory."""
+    """Set up logging."""
     log_to_stderr(verbose)
-    keep_freed_memory()
 
 
 @app.command()

@@ -32,7 +32,6 @@ class Artefact(Settings):
     digest: str = Field(pattern="^[0-9a-f]{64}$")
     seconds: NonNegativeFloat = 0.0  # that it took
     files: dict[str, Described] = Field(default_factory=dict)  # by name
-    runs: dict[str, str] = Field(default_factory=dict)  # digests of runs that were made with it, by folder
     results: tuple[str, ...] = ()  # digests of the results that it was computed from
 
     @classmethod
@@ -100,7 +99,4 @@ def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
 
 def recorded_files(folder: Path) -> frozenset[str]:
     """Return the names of all files that belong to a run."""
-    artefacts = read_manifest(folder).values()
-    runs = [run for artefact in artefacts for run in artefact.runs]
-    inside = (f"{run}/{name}" for run in runs for name in recorded_files(place(folder, run)))
-    return frozenset(inside).union(*(artefact.files for artefact in artefacts))
+    return frozenset().union(*(artefact.files for artefact in read_manifest(folder).values()))

@@ -7,12 +7,10 @@ on how they were obtained; what cannot be read back whole is computed again.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import json
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,8 +25,6 @@ from .store import digest_of
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_TRIM, _MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of glibc
-_RETAINED, _OF_HEAP = 1 << 28, 1 << 25  # bytes; glibc takes no more than the second
 
 
 class Executor:
@@ -197,11 +193,3 @@ class Work:
 
 def _call(work: Callable[[], T]) -> T:
     return work()
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep what is freed for the next array, up to 256 MB; nothing changes elsewhere."""
-    with suppress(AttributeError, TypeError, OSError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_TRIM, _RETAINED)
-        mallopt(_MMAP, _OF_HEAP)

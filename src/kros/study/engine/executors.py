@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
-from ...core.work import Executor, keep_freed_memory
+from ...core.work import Executor
 from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")
@@ -79,8 +79,6 @@ def _begin(pipe: Any) -> None:
     """In a worker: end when the other end of a pipe is closed; the parent handles interrupts from the keyboard."""
     import signal
     from threading import Thread
-
-    keep_freed_memory()
 
     def watch() -> None:
         with suppress(EOFError, OSError):

@@ -69,12 +69,9 @@ def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
     """Remove what does not follow from the study any more; the run folder is that of the study as it is now."""
     store, manifest = context.store, context.store.manifest
     outdated = [stage for stage in Stage if stage in manifest and manifest[stage].digest != digests.get(stage)]
-    unwanted = [run for stage in Stage if stage not in digests for run in store.runs(stage)]
-    if outdated or unwanted:
+    if outdated:
         store.path(METRICS).unlink(missing_ok=True)
         store.drop(*outdated)
-        for run in unwanted:
-            run.remove()
     write_json(store.path(STUDY), context.config.dump())
 
 

@@ -3,7 +3,7 @@
     <run>/manifest.json          which artefact every stage has, with digests of all files
     <run>/store/<digest>/        artefacts, and results of single units; see `core.store`
     <run>/models/ ...            the files of the artefacts, for people and for all that reads a run
-    <run>/<stage>/<name>/        a run that a stage made, with another manifest and the same store
+    <run>/<stage>/<name>/        a run that a stage made, among its files, with another manifest and the same store
 
 A stage writes a draft, which becomes an artefact, which the manifest names. So an interrupted stage leaves nothing that
 counts, and nothing is removed from the run folder that the manifest does not list with the content it has.
@@ -66,11 +66,6 @@ class Store:
             log.warning("%s", error)
             return {}
 
-    @property
-    def digest(self) -> str:
-        """A digest of all stages of this run."""
-        return digest_of(sorted((str(stage), artefact.digest) for stage, artefact in self.manifest.items()))
-
     def path(self, *parts: str) -> Path:
         """Return where something that earlier stages wrote is read from."""
         return self.folder.joinpath(*parts)
@@ -79,14 +74,9 @@ class Store:
         """Return where the running stage writes something; it will be found at `path` once the stage is done."""
         return (self.place or self.folder).joinpath(*parts)
 
-    def nested(self, stage: str, name: str) -> Store:
-        """Return the run folder of a study that a stage makes inside this one."""
-        return Store(self.path(stage, name), shared=self.artefacts)
-
-    def runs(self, stage: str = "*") -> list[Store]:
-        """Return the runs in the folder of a stage, or all."""
-        inside = sorted(path.parent for path in self.folder.glob(f"{stage}/*/{MANIFEST}"))
-        return [self.nested(*folder.parts[-2:]) for folder in inside if not folder.is_symlink()]
+    def nested(self, *parts: str) -> Store:
+        """Return the run folder of a study that the running stage makes in its draft."""
+        return Store(self.draft(*parts), shared=self.artefacts)
 
     def record(self, stage: str) -> Artefact | None:
         """Return the artefact of a finished stage, or None."""
@@ -116,21 +106,12 @@ class Store:
             for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
                 reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
                 raise DataError(f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again.")
-            self._verify_runs(artefact)
-
-    def _verify_runs(self, artefact: Artefact) -> None:
-        for name, digest in artefact.runs.items():
-            run = Store(place(self.folder, name))
-            run.verify()
-            if run.digest != digest:
-                raise DataError(f"Run {run.folder}: is missing or another one; run the study again.")
 
     def stored(self, digest: str) -> Artefact | None:
-        """Return an artefact that is in the store, whole, as are the runs that were made with it."""
+        """Return an artefact that is in the store, whole."""
         folder = self.artefacts / digest
         try:
             artefact = Artefact.read(folder / INDEX)
-            self._verify_runs(artefact)
             whole = artefact.digest == digest and all(artefact.matches(folder, name) for name in artefact.files)
         except (ConfigError, DataError, AttributeError, TypeError):
             return None
@@ -144,11 +125,11 @@ class Store:
 
     def commit(self, stage: str, digest: str, seconds: float, results: Collection[str] = ()) -> None:
         """Move the draft of the running stage into the store, in place of one that is not whole, and name it."""
-        draft, runs = self.draft(), {f"{stage}/{run.folder.name}": run.digest for run in self.runs(stage)}
+        draft = self.draft()
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
         files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
-        artefact = Artefact(digest=digest, seconds=seconds, files=files, runs=runs, results=tuple(sorted(results)))
+        artefact = Artefact(digest=digest, seconds=seconds, files=files, results=tuple(sorted(results)))
         write_json(draft / INDEX, with_checksum(artefact.model_dump()))
         target = self.artefacts / digest
         if target.exists():
@@ -178,7 +159,7 @@ class Store:
             raise ConfigError(f"Run folder {self.folder}: {obstacle}; move it away.") from error
 
     def drop(self, *stages: str) -> None:
-        """Forget stages and their files in the run folder that are as written; artefacts and runs inside stay."""
+        """Forget stages and their files in the run folder that are as written; artefacts stay."""
         manifest = self.manifest
         for artefact in [manifest.pop(stage) for stage in stages if stage in manifest]:
             for name in artefact.files:
@@ -191,15 +172,12 @@ class Store:
 
     def remove(self) -> None:
         """Remove a run as far as its manifest lists it, and its folder where nothing else is in it."""
-        for run in self.runs():
-            run.remove()
         self.drop(*self.manifest)
         for name in (MANIFEST, STUDY, METRICS):
             self.path(name).unlink(missing_ok=True)
-        if self.shared is None:
-            _sweep(self.artefacts, ())
-            _prune(self.artefacts, self.folder)
-        _prune(self.folder, self.folder.parent)
+        _sweep(self.artefacts, ())
+        for folder in (self.artefacts, self.folder):
+            _prune(folder, self.folder.parent)
 
     def tidy(self) -> None:
         """Remove what a killed process left half done."""
@@ -213,9 +191,10 @@ class Store:
 
     def _named(self) -> set[str]:
         """Digests of all artefacts of this run and of those inside, and of results that they were computed from."""
-        stored = [self.stored(artefact.digest) for artefact in self.manifest.values()]
-        named = {digest for artefact in stored if artefact for digest in (artefact.digest, *artefact.results)}
-        return named.union(*(run._named() for run in self.runs()))
+        inside = [replace(self, folder=path.parent) for path in self.folder.glob(f"*/*/{MANIFEST}")]
+        digests = {artefact.digest for run in (self, *inside) for artefact in run.manifest.values()}
+        stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
+        return {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
 
 
 def _sweep(folder: Path, named: Collection[str]) -> None:

@@ -69,9 +69,6 @@ def run(context: Context) -> None:
     """Make the study once for every fold, and run the deployed observer on the units in reserve."""
     models, wanted_folds = context.identified.models(), context.config.evaluate.folds
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], wanted_folds) if wanted_folds else []
-    for surplus in context.store.runs(FOLDER):
-        if surplus.folder.name not in map(str, range(len(folds))):
-            surplus.remove()
     if context.facts.reserve:
         save_artifact(context.store.draft(NEXT), NEXT, next_unit(context))
     if folds:

@@ -6,7 +6,7 @@ import platform
 import shutil
 from importlib import metadata
 
-_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "rich", "jinja2", "matplotlib")
+_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib")
 _OPTIONAL = {
     "distributed": "maps over units on a cluster (kros run --scheduler)",
     "pandas": "reading long data frames",

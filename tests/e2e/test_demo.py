@@ -6,14 +6,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.core.work import Work
 from kros.evaluate import Kind
 from kros.identify import ModelSet
 from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
-from kros.study.engine.context import Context
-from kros.study.engine.executors import open_executor
-from kros.study.pipeline import load_run
-from kros.study.stages.resampling import resampling
 from kros.uncertainty import UncertainModel, VariationAndNoise
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
@@ -197,21 +192,6 @@ def test_noise_is_kept_and_summarised(demo, metrics, name):
     share = metrics["uncertainty"][name]["noise_share"]
     assert all(0 <= share[key] <= 1 for key in ("median", "at_peak"))
     assert share["peak_hz"] == pytest.approx(noise.freqs_hz[noise.residual.max(axis=0).argmax()])
-
-
-@pytest.mark.parametrize("name", KINDS)
-def test_resampled_models_surround_the_stored_ones(demo, name):
-    config, store = load_run(demo)
-    models = ModelSet.load(demo / "models" / name)
-    units = list(reversed(models.unit_ids[1:]))
-    rows = [models.index(u) for u in units]
-    with open_executor(1, None) as executor:
-        samples = resampling(Context(config, store, Work(executor)), name, units)()
-    assert samples.unit_ids == tuple(units)
-    np.testing.assert_allclose(samples.estimate.A, models.A[rows], atol=1e-9)
-    np.testing.assert_allclose(samples.estimate.B, models.B[rows], atol=1e-9)
-    middle, spread = samples.samples.A.mean(axis=1), samples.samples.A.std(axis=1)
-    assert np.median(np.abs(middle - samples.estimate.A) / spread) < 0.5  # three episodes: single entries may be skewed
 
 
 def test_every_disturbance_is_told_for_the_observers_of_the_kind_that_is_handed_over(metrics):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import kros
-from kros.core.errors import ConfigError
+from kros.core.errors import ConfigError, DataError
 from kros.core.store import digest_of
 from kros.core.work import Results, Work, packed, unpacked
 from kros.study.engine.store import Store
@@ -74,6 +74,14 @@ def test_a_run_inside_is_among_the_files_of_its_stage_and_shares_the_store(tmp_p
     store.drop("left_out")
     assert store.files() == frozenset()
     assert not (tmp_path / "left_out").exists()
+
+
+def test_a_digest_cannot_reach_out_of_the_store(tmp_path):
+    store = written(tmp_path, "one")
+    path = tmp_path / "manifest.json"
+    path.write_text(path.read_text().replace(digest_of("a"), "../../victim").replace('"checksum"', '"other"'))
+    with pytest.raises(DataError, match="is damaged"):
+        store.verify()
 
 
 def test_files_of_others_stay(tmp_path):

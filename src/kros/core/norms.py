@@ -54,7 +54,7 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
     for _ in range(_MAX_ITERATIONS):
         step = power @ P @ power.T
         P = P + step
-        if np.abs(step).max(initial=0.0) <= _EPSILON * np.abs(P).max(initial=0.0):
+        if np.all(np.diag(step) <= _EPSILON * np.diag(P)):  # state by state, in whatever units of measure
             break
         power = power @ power
     return (P + P.T) / 2
@@ -73,7 +73,7 @@ def gramian_root(A: Array, B: Array, dt: float) -> Array:
     for _ in range(_MAX_ITERATIONS):
         step = power @ R
         R = qr_triangle(np.hstack([R, step]).T).T
-        if np.abs(step).max(initial=0.0) <= _EPSILON * np.abs(R).max(initial=0.0):
+        if np.all(np.abs(step).max(axis=1, initial=0.0) <= _EPSILON * np.abs(R).max(axis=1, initial=0.0)):
             break
         power = power @ power
     return R

@@ -80,15 +80,15 @@ class Disturbance:
 
 
 def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturbance]:
-    """Return the disturbances of a study: five severities of every kind, evenly spaced on a logarithmic axis."""
-    steps = np.arange(5)
+    """Return the disturbances of a study: six severities of every kind, evenly spaced on a logarithmic axis."""
+    steps = np.arange(6)
     severities = {
         Kind.DROPPED: 0.5 ** (steps[::-1] + 1.0),
-        Kind.GAP: np.round(10 ** (1 + steps / 2)),
+        Kind.GAP: np.round(10 ** (1 + 0.4 * steps)),
         Kind.PHASE: np.pi * 0.5 ** steps[::-1],
         Kind.DELAY: 2.0**steps,
     }
-    shares = 10.0 ** (steps - 6)  # of the largest value
+    shares = 10.0 ** (steps - 7)  # of the largest value
     return [Disturbance(kind, float(severity)) for kind in kinds for severity in severities.get(kind, shares)]
 
 

@@ -126,7 +126,7 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
     base, tables = Path(), dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
-            raise ConfigError("Run: data.source and data.reader are those of the population given; leave them out.")
+            raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
         raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
         base = out
     elif isinstance(source, StudyConfig):

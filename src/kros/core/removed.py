@@ -9,10 +9,8 @@ from typing import Any
 # A sentence, then indented what it is for: public names ``kros.package.name``, keys ``section.key`` of a study, values
 # ``section.key=value``; behind ``kros.package:`` or ``section:`` stand names of that package or section alone.
 _TABLE = """\
-Subspace-identified predictors and steps of the estimator's design are no longer part of kros; use the method estimator.
-    memory predictor synthesis: methods=memory kros.observer: identify_predictor PastMoments conditioned
-    driven_coordinates with_internal residual_models tune_observer in_sizes EstimateKind Dropped DropoutBound
-    dropout_bound
+Subspace-identified predictors are no longer part of kros; use the method estimator.
+    memory predictor synthesis: methods=memory kros.observer: identify_predictor PastMoments
 Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; move it there.
     synthesis: noise
 Keys for details of a method are no longer part of a study; remove the key, or call the function of the stage in Python.
@@ -30,16 +28,11 @@ Robust controllers beyond H2 are no longer part of kros; use worst_case_h2, or h
 White-noise Kalman observers and placed poles are no longer part of kros; use kalman_tuned.
     observer: baselines=kalman_white baselines=luenberger kros.synthesis: luenberger
 Parts of the uncertainty are no longer public; use quantify, which takes models, systems and responses.
-    kros.uncertainty: quantify_systems quantify_responses magnitude_tightness completion existence choose_nominals
-    ResidualSystems fit_weight optimal_cover FitSettings
-Parts of the identification are no longer public; use kros.identify, whose result has models and calibration.
-    kros.identify: bootstrap_refined find_segments resolve_branches unit_phase lifted_factor reduce_episode
-    kros.identify.refine: RefinedModels
+    kros.uncertainty: quantify_systems quantify_responses magnitude_tightness choose_nominals fit_weight optimal_cover
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
     kros.interop: AdoptedModel from_pykoop models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
-    kros.data: read_csv_folder read_motor_drive_raw Split check_population TrueChannel kros.data.steps: ByDirection Cut
-    Tare
+    kros.data: read_csv_folder read_motor_drive_raw check_population TrueChannel kros.data.steps: ByDirection Cut Tare
 Families that join texts, and centres and kernels to choose from, are no longer part of kros; write the formulas.
     kros.lifting: grid_centres latin_hypercube_centres random_centres formulas products Kernel concatenate
 Random members of the uncertain set are no longer drawn; use the certificate, which bounds all of them.
@@ -48,8 +41,6 @@ Disturbed episodes and errors against truth are no longer public objects; use kr
     kros.evaluate: Disturbance DisturbedEpisodes TrueErrors robustness_rows standard_disturbances
 The function run_study and ExportError are no longer part of kros; use kros.run, and KrosError.
     kros.study: run_study kros.core: ExportError
-Calibrations of a load are no longer objects apart; use load_observer, or TorqueScale.calibrated, whose result has load.
-    kros.motor_drive: LoadCalibration calibrate_load calibrate_torque load_from_current
 """
 
 

@@ -16,7 +16,7 @@ import tokenize
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import partial, wraps
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,18 +33,6 @@ CHECKSUM = "checksum"
 _AGAIN = "write it again with the step that made it"
 _DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
 _DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
-
-
-class LoadedContent(dict[Any, Any]):
-    """A JSON object or a set of arrays as read from a file; a key that is missing is an error that names the file."""
-
-    def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
-        super().__init__(content)
-        self.path = path
-
-    def __missing__(self, key: Any) -> Any:
-        problem = f"key {key!r} is missing, found {shortened(str(list(self)))}"
-        raise DataError(f"Reading {self.path}: {problem}; write it again with this version.")
 
 
 def plain(value: Any) -> Any:
@@ -71,11 +59,10 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, or say which file is missing or broken; its objects are `LoadedContent`."""
-    path = Path(path)
-    text, loaded = _read(path, limits.MAX_JSON_BYTES), partial(LoadedContent, path=path)
+    """Read a JSON file, or say which file is missing or broken."""
+    text = _read(Path(path), limits.MAX_JSON_BYTES)
     try:
-        return json.loads(text.decode(), object_hook=loaded, parse_constant=_finite, parse_float=_finite)
+        return json.loads(text.decode(), parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise DataError(f"Reading {path}: not valid JSON ({shortened(str(error))}); {_AGAIN}.") from error
 
@@ -133,7 +120,7 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an .npz; pickled objects and packed archives are refused."""
     path = Path(path)
-    return LoadedContent(unpack_arrays(_read(path, limits.MAX_ARRAYS_BYTES), path), path)
+    return unpack_arrays(_read(path, limits.MAX_ARRAYS_BYTES), path)
 
 
 def _read(path: Path, limit: int) -> bytes:
@@ -168,11 +155,11 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
     if digest is None and not archive.exists():
-        return content, LoadedContent({}, archive)
+        return content, {}
     packed = _read(archive, limits.MAX_ARRAYS_BYTES)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
         raise DataError(f"Reading {archive}: it is not the file that {path.name} was written with; {_AGAIN}.")
-    return content, LoadedContent(unpack_arrays(packed, archive), archive)
+    return content, unpack_arrays(packed, archive)
 
 
 @contextmanager

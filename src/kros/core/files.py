@@ -109,10 +109,9 @@ def link_or_copy(source: Path, target: Path) -> None:
 
 def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Read a TOML file."""
+    content = read_bytes(path, limits.MAX_TOML_BYTES, ConfigError)
     try:
-        return parse_toml(read_bytes(path, limits.MAX_TOML_BYTES, ConfigError).decode("utf-8-sig"))
-    except KrosError:
-        raise
+        return parse_toml(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
         reason = "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
         raise ConfigError(f"{what} {path}: not a TOML file that can be used ({reason}); correct it.") from error

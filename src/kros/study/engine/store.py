@@ -94,7 +94,7 @@ class Store:
     def metrics(self) -> dict[str, Any]:
         """Return the metrics of the run."""
         content = read_json(self.path(METRICS))
-        if not isinstance(content, dict):
+        if not isinstance(content, dict) or not {"study", "units"} <= set(content):
             raise DataError(f"Run: {self.path(METRICS)} holds no metrics; run the study again.")
         return content
 

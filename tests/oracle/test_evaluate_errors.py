@@ -41,20 +41,6 @@ def test_errors_are_those_of_the_definition(lengths):
         np.testing.assert_allclose(values, percent, rtol=1e-12)
 
 
-def test_the_start_and_the_rest_make_up_the_whole():
-    lengths = (700, 41, 600)
-    truth, estimate = episodes(lengths)
-    (found,) = summarise(estimate[None], truth, np.array(lengths), DT)
-    for b, length in enumerate(lengths):
-        size = np.abs(truth[:length, b]).max(axis=0)
-        error = (estimate - truth)[:length, b]
-        np.testing.assert_allclose(
-            found.start_percent[b], 100 * np.sqrt(np.mean(error[:50] ** 2, axis=0)) / size, rtol=1e-12
-        )
-        rest = 100 * np.sqrt(np.mean(error[50:] ** 2, axis=0)) / size if length > 50 else 0.0
-        np.testing.assert_allclose(found.rest_percent[b], rest, rtol=1e-9, atol=1e-6)
-
-
 @pytest.mark.parametrize("lengths", [(700, 700), (700, 600)])
 def test_a_largest_value_may_be_negative(lengths):
     """Minus four is the largest absolute value although every sample is below zero."""

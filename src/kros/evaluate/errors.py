@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-START = 50  # samples in which an observer finds out what it does not know at first
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
 
 
@@ -19,15 +18,13 @@ class ErrorSummary:
 
     rms: Array  # (batch, n)
     percent: Array  # (batch, n): `100 rms(x_hat - x) / max|x|` of every episode
-    start_percent: Array  # (batch, n): of the first `START` samples, over the largest value of the episode
-    rest_percent: Array  # (batch, n): the same of the samples behind
     spectra: Array  # (batch, n_freqs, n): Welch's power spectral density of the error
     freqs_hz: Array  # (n_freqs,)
 
     @classmethod
     def joined(cls, parts: Sequence[ErrorSummary]) -> ErrorSummary:
         """Return the summary of one batch after the other."""
-        names = ("rms", "percent", "start_percent", "rest_percent", "spectra")
+        names = ("rms", "percent", "spectra")
         return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def band_power(self, band_hz: tuple[float, float]) -> Array:
@@ -49,13 +46,9 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
         rows = lengths == length
         error[rows, :, length:] = 0.0
         spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
-    first, whole = (np.einsum("bns,bns->bn", part, part) for part in (error[..., :START], error))
-    counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
-    squares = (whole, first, np.maximum(whole - first, 0.0))
-    rms = [np.sqrt(sums / count[:, None]) for sums, count in zip(squares, counts, strict=True)]
-    largest = _largest(truth, lengths)
-    percent, start, rest = (_percent(values, largest) for values in rms)
-    return ErrorSummary(rms[0], percent, start, rest, spectra, np.asarray(np.fft.rfftfreq(_SEGMENT, dt), float))
+    rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None])
+    freqs_hz = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
+    return ErrorSummary(rms, _percent(rms, _largest(truth, lengths)), spectra, freqs_hz)
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:

@@ -152,8 +152,7 @@ class HeldOut:
             for j in range(len(states)) if outcome.estimated is None else sorted(outcome.estimated):
                 row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
                 row |= {"channel": states[j], "rms": summary.rms[places, j].mean()}
-                parts = {"": summary.percent, "start_": summary.start_percent, "rest_": summary.rest_percent}
-                row |= {f"{part}error_percent": values[places, j].mean() for part, values in parts.items()}
+                row["error_percent"] = summary.percent[places, j].mean()
                 row |= {} if power is None else {"gearbox_band_power": power[places, j].mean()}
                 rows.append(row | _true_entry(outcome.true, places, j))
         return rows

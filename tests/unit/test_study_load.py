@@ -30,10 +30,10 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
         config=SimpleNamespace(load=LoadConfig(**options)),
         facts=facts,
         population=population,
-        calibration=None,
         lifting=Lifting(population.states),
         identified=SimpleNamespace(
             kinds=("linear",),
+            parameters={unit: {} for unit in population.unit_ids},
             models=lambda name=None: SimpleNamespace(measured=(0,)),
             population=population,
             sizes=dict.fromkeys(population.states + population.inputs, 7.0),

@@ -142,9 +142,8 @@ class LoadTrial:
         if missing := [name for name in (settings.angle, settings.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
-        phases = context.calibration
-        usable = [u for u in facts.pooled if phases is None or u in phases.units]
-        units = {u: {} if phases is None else {phases.spec.parameter: phases.units[u].phase_rad} for u in usable}
+        units = context.identified.parameters
+        usable = [u for u in facts.pooled if u in units]
         known, others = _known(context, settings, usable)
         free, loaded = facts.identify_on, settings.condition
         places = {free: usable, loaded: [*known, *(usable if free == loaded else ())]}

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..identify import ModelSet, free_run
-from ..observer import Observer, run_observers
+from ..observer import Observer
 from ..observer.sensor import Sensors
+from ..observer.simulate import run_observers
 from .disturb import Disturbance, Run, disturbed_errors
 from .errors import ErrorSummary, summarise
 from .sensor import as_shown

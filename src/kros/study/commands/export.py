@@ -26,7 +26,7 @@ from .field import load_calibration
 
 log = logging.getLogger(__name__)
 
-DEPLOYED, LOAD, KINDS = "deployed", "load", ("koopman", "linear")
+DEPLOYED, LOAD = "deployed", "load"
 _EPISODES, _SAMPLES = 8, 20_000  # that the numerical error is measured on
 
 
@@ -44,7 +44,11 @@ def export_run(
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
         places = {name: store.path("observers", f"{name}.json") for name in names}
-        loads = {f"{k}/{LOAD}": store.path(LOAD, f"{k}.json") for k in KINDS if store.holds(LOAD, f"{k}.json")}
+        loads = {
+            f"{k}/{LOAD}": store.path(LOAD, f"{k}.json")
+            for k in ("koopman", "linear")
+            if store.holds(LOAD, f"{k}.json")
+        }
         if observer not in (known := places | loads):
             hint = f"{did_you_mean(observer, known) or ';'} known are {', '.join(known)}"
             raise ConfigError(f"Run {run}: has no observer {observer!r}{hint}.")
@@ -67,12 +71,13 @@ def held_out(config: StudyConfig, store: Store, observer: Observer) -> HeldOut |
     facts, calibration = RecordingFacts.load(store.path("population")), load_calibration(store)
     try:
         population = open_source(config)
-        phases = {} if calibration is None else calibration.units
-        known = {
-            u: {} if calibration is None else {calibration.spec.parameter: phases[u].phase_rad} for u in facts.groups
+        units = {
+            u: {} if calibration is None else {calibration.spec.parameter: calibration.units[u].phase_rad}
+            for u in population.unit_ids
         }
-        keys = spread([k for k in facts.test if k.unit in population.unit_ids], _EPISODES)
-        batch = EpisodeBatch.read(population, keys, parameters=known)
+        batch = EpisodeBatch.read(
+            population, spread([k for k in facts.test if k.unit in units], _EPISODES), parameters=units
+        )
     except (KrosError, KeyError) as error:
         log.warning("Numerical error: not measured, since the run's recordings cannot be read: %s", error)
         return None

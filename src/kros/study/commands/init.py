@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -15,18 +16,21 @@ from ...data import Population, Role
 from ...data.checks import check_population
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
-from ...data.readers.opening import LOOKS, detect_reader
+from ...data.readers.opening import detect_reader
 from ...data.recording import some
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibration import calibrate
 from ...identify.periodic import PeriodicTerm, periodic_term
 from ...identify.presets import HARMONIC_DRIVE
-from ..config import StudyConfig, validate_config
+from ..config import validate_config
 from ..stages.read import FEWEST, open_source
 from .study_text import LiftingProposal, study_text
 
 log = logging.getLogger(__name__)
+MOST_FINDINGS = 12
+_UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
+NO_LOAD = _UNLOADED_WORDS.split()
 
 
 def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> list[str]:
@@ -39,7 +43,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            says = f"it {LOOKS[reader]}, which says what channels are"
+            says = f"these are {reader} recordings, which say what channels are"
             raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
         data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
     else:
@@ -48,13 +52,17 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
         data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
     folder = out.parent.absolute()
-    condition = _commonest(open_source(validate_config({"data": dict(data)}, folder, str(out))))
-    data |= {} if condition is None else {"identify_on": condition}
-    config = validate_config({"data": dict(data)}, folder, str(out))
-    population, facts, refused = _surveyed(config, work)
-    proposal = LiftingProposal(why="not looked for") if facts is None else propose_lifting(population, facts)
-    findings = [*(discovery.findings if discovery else ()), *(facts.alerts if facts else ())]
-    findings += [f"kros run would refuse this: {refused}"] if refused else []
+    population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
+    unloaded = _unloaded(population)
+    data |= {} if unloaded is None else {"identify_on": unloaded}
+    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not looked for")
+    try:
+        check_population(population, allow_single=True)
+        population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
+        findings += facts.alerts
+        proposal = propose_lifting(population, facts)
+    except DataError as error:
+        findings.append(f"kros run would refuse this: {error}")
     text = study_text(source, data, discovery, proposal, findings)
     validate_config(parse_toml(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -69,23 +77,13 @@ def _source(source: Path, out: Path) -> str:
         return str(source.absolute())
 
 
-def _commonest(population: Population) -> str | None:
-    """Return the condition that most units have, where none has the name of the one without load."""
+def _unloaded(population: Population) -> str | None:
+    """Return the condition without load where its name is not the default, else the one that most units have."""
     conditions = population.conditions
     if len(conditions) < 2 or UNLOADED in conditions:
         return None
-    return max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
-
-
-def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFacts | None, str]:
-    """Open and check the recordings as a study does; return what it would refuse them for in place of the facts."""
-    population = open_source(config)
-    try:
-        check_population(population, allow_single=True)
-        data = config.data
-        return *survey(population, work, identify_on=data.identify_on, on_nan=data.on_nan), ""
-    except DataError as error:
-        return population, None, str(error)
+    named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD]
+    return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
 
 
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
@@ -141,10 +139,13 @@ def _lines(
     episodes = f"{len(population.episodes)} episodes ({each} for each unit and condition)"
     period = f"every {population.sample_period_s:g} s"
     lines = [f"{number}, conditions {', '.join(population.conditions)}, {episodes}, {period}"]
-    lines += [] if discovery is None else [f"  {discovery.reading}", *column_lines(discovery.columns)]
+    if discovery is not None:
+        lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
     functions = "; ".join(proposal.lifting.get("functions", ()))
     lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
-    lines += [f"looks wrong: {text}" for text in findings]
+    lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
+    more = len(findings) - MOST_FINDINGS
+    lines += [f"looks wrong: {more} further points, which are written at the start of the study"] if more > 0 else []
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

@@ -8,11 +8,11 @@ the most conspicuous unit       --> against the cover of all the others         
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -39,42 +39,55 @@ class DiagnosticSettings:
 
 
 DEFAULT = DiagnosticSettings()
-Task = tuple[Path, Callable[[], VariationAndNoise | UnitResiduals]]
+
+
+class _Result(Protocol):
+    def save(self, folder: Path) -> None:
+        """Write into a folder."""
+
+
+Task = tuple[Path, Callable[[], _Result]]
 
 
 def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
-    tasks = [task for kind, one in sets.items() if one.nominal >= 0 for task in _noise(context, kind, one, folder)]
+    tasks: list[Task] = [
+        (folder / kind / "noise", noise)
+        for kind, one in sets.items()
+        if one.nominal >= 0
+        for noise in _noise(context, kind, one)
+    ]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
-    work = [partial(_attempt, place, task) for place, task in tasks]
+    work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
         if result is not None:
             result.save(place)
 
 
-def _attempt(place: Path, task: Callable[[], Any]) -> Any:
+def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
     try:
         return task()
     except KrosError as error:
-        log.warning("%s: not in the report: %s", place.parent.name, error)
+        log.warning("%s: not in the report: %s", name, error)
         return None
 
 
-def _noise(context: Context, name: str, uncertain: UncertainModel, folder: Path) -> list[Task]:
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], VariationAndNoise]]:
     """Compare variation and noise over some units, the nominal one among them; not with single episodes."""
     units = uncertain.unit_ids
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
+    models = context.identified.models(name)
     try:
         samples = resampling(context, name, chosen)
     except KrosError as error:
         log.info("%s: variation and noise are not separated: %s", name, error)
-        return []
-    models, nominal = context.identified.models(name), chosen.index(uncertain.nominal_id)
-    return [(folder / name / "noise", partial(_compared, samples, models, uncertain.form, nominal))]
+        return
+    nominal = chosen.index(uncertain.nominal_id)
+    yield partial(_compared, samples, models, uncertain.form, nominal)
 
 
 def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> VariationAndNoise:

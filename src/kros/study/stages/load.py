@@ -23,8 +23,9 @@ from ...data.flat_tops import FoundLimit
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
-from ...motor_drive import AngleLoad, LoadSettings, TorqueScale, known_load, load_observer
-from ...motor_drive.signals import load_accuracy
+from ...motor_drive import AngleLoad
+from ...motor_drive.observer import LoadSettings, load_observer
+from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import Observer, run_observer
 from ..engine.context import Context
 

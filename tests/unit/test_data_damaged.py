@@ -149,7 +149,7 @@ def test_resampling_to_more_samples_than_anybody_wants() -> None:
 
 @pytest.mark.parametrize("name", ["", " ", "a\nb", "a\0", "\udcff"])
 def test_names_that_are_none(name: str) -> None:
-    for data in ({name: [samples(0)]}, {"a": {name: [samples(0)]}}, {"a": {"c": {name: samples(0)}}}):
+    for data in ({name: [samples(0)]}, {"a": {name: [samples(0)]}}, {EpisodeKey("a", "c", name): samples(0)}):
         with pytest.raises(DataError, match="name"):
             from_arrays(data, CHANNELS, 0.01)
     with pytest.raises(DataError, match="channel"):
@@ -239,14 +239,14 @@ def test_files_elsewhere_are_not_read(stored: Path) -> None:
 @pytest.mark.parametrize(
     "copied",
     [
-        {"a": {"c": {"1": 0, "2": 1, "9": 0}}, "b": {"c": {"1": 2, "2": 3}}},
-        {"a": {"c": {"1": 0, "2": 1}}, "b": {"c": {"1": 2, "2": 0}}},
-        {"a": {"c": {"1": 0, "2": 1}, "d": {"7": 0}}, "b": {"c": {"1": 2}}},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("a", "c", "9"): 0, ("b", "c", "1"): 2},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("b", "c", "1"): 2, ("b", "c", "2"): 0},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("a", "d", "7"): 0, ("b", "c", "1"): 2},
     ],
     ids=["within a unit", "between units", "between conditions"],
 )
 def test_copies_are_refused_and_named(tmp_path: Path, copied: Any) -> None:
-    data = {u: {c: {e: samples(seed) for e, seed in es.items()} for c, es in cs.items()} for u, cs in copied.items()}
+    data = {EpisodeKey(*place): samples(seed) for place, seed in copied.items()}
     population = from_arrays(data, CHANNELS, 0.01)
     with pytest.raises(DataError, match=r"[Ee]pisode \d of unit \w .* episode 1 of unit a \(c\)"):
         scan_digests(population)

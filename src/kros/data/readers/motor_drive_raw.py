@@ -13,6 +13,7 @@ import io
 import logging
 import math
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -28,7 +29,6 @@ from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import ChannelMapping, CsvMapping
-from .parquet import in_threads
 
 logger = logging.getLogger(__name__)
 
@@ -160,7 +160,8 @@ def write_raw(population: Population, out: Path | str) -> None:
             needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
             raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
     with whole_folder(Path(out)) as folder:
-        in_threads(lambda group: _write_folder(population, folder, *group), enumerate(population.groups()))
+        with ThreadPoolExecutor() as pool:
+            list(pool.map(lambda group: _write_folder(population, folder, *group), enumerate(population.groups())))
 
 
 def _write_folder(population: Population, folder: Path, index: int, keys_of: tuple[str, str, Any]) -> None:

@@ -21,7 +21,7 @@ from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -31,7 +31,7 @@ from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, whole_folder
-from ..arrow import fill, from_numpy, repeated
+from ..arrow import from_numpy, repeated, to_numpy
 from ..checks import Look, check_period, check_structure, refuse_copies, usable_episodes
 from ..population import Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble
@@ -40,9 +40,7 @@ from .tables import BLOCK
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
 Array = npt.NDArray[np.float64]
-Version = tuple[int, int, int]
 Place = tuple[str, int, int]
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
@@ -55,25 +53,23 @@ _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 
 
 class ArrayCache:
-    """Read-only arrays by key, the latest asked for, at most so many bytes in all."""
+    """Read-only arrays by key, the latest ones, at most so many bytes in all."""
 
     def __init__(self, limit: int) -> None:
-        self.limit, self.size = limit, 0
+        self.limit, self.size, self.lock = limit, 0, Lock()
         self.arrays: OrderedDict[Hashable, Array] = OrderedDict()
-        self._lock = Lock()
 
     def take(self, key: Hashable, read: Callable[[], Array]) -> Array:
         """Return the array of a key, read where it is not there."""
-        with self._lock:
+        with self.lock:
             if key in self.arrays:
                 self.arrays.move_to_end(key)
                 return self.arrays[key]
         array = read()
         array.flags.writeable = False
-        with self._lock:
-            if array.nbytes <= self.limit and key not in self.arrays:
-                self.arrays[key] = array
-                self.size += array.nbytes
+        with self.lock:
+            self.size += array.nbytes - (self.arrays[key].nbytes if key in self.arrays else 0)
+            self.arrays[key] = array
             while self.size > self.limit:
                 self.size -= self.arrays.popitem(last=False)[1].nbytes
         return array
@@ -95,75 +91,79 @@ class ParquetRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: Place) -> Recording:
         """Return one episode."""
-        path = self.file(place)
-        require_regular(path, sys.maxsize)
-        status = path.stat()
-        version = (status.st_ino, status.st_size, status.st_mtime_ns)  # a file written anew is read anew
-        known_by = (str(path), version, place, key, self.columns)
-        return Recording(key, _CACHE.take(known_by, lambda: next(self._values(key, path, version, place))))
+        file = _Group(self.file(place), place, key)
+        return Recording(key, _CACHE.take((file, self.columns), lambda: next(file.read(self.columns))))
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
         """Return the samples of an episode in blocks, read one after the other."""
-        path, status = self.file(self.places[key]), self.file(self.places[key]).stat()
-        return self._values(key, path, (status.st_ino, status.st_size, status.st_mtime_ns), self.places[key], rows)
+        return _Group(self.file(self.places[key]), self.places[key], key).read(self.columns, rows)
 
-    def _values(
-        self, key: EpisodeKey, path: Path, version: Version, place: Place, rows: int | None = None
-    ) -> Iterator[Array]:
-        """Return the samples of an episode from its file, whole or in blocks."""
+
+@dataclass(frozen=True)
+class _Group:
+    """A row group of a file, which is read anew where the file was written anew."""
+
+    path: Path
+    place: Place
+    key: EpisodeKey
+    version: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_regular(self.path, sys.maxsize)
+        status = self.path.stat()
+        object.__setattr__(self, "version", (status.st_ino, status.st_size, status.st_mtime_ns))
+
+    def read(self, columns: tuple[str, ...], rows: int | None = None) -> Iterator[Array]:
+        """Return the samples, shape (n_samples, n_columns), whole or in blocks of `rows`."""
         try:
-            for table in _read_group(path, version, place, [*KEYS, *self.columns], rows):
-                values = np.empty((table.num_rows, len(self.columns)))
-                for column, channel in enumerate(self.columns):
-                    fill(values[:, column], table.column(channel))
+            for table in self._tables([*KEYS, *columns], rows):
                 table.select(KEYS).validate(full=True)
                 for name in KEYS:
-                    wanted, actual = getattr(key, name), table.column(name).unique().to_pylist()
-                    _require(actual == [wanted], path, f"the index says {name} {wanted!r}, the samples say {actual!r}")
-                yield values
+                    wanted, actual = getattr(self.key, name), table.column(name).unique().to_pylist()
+                    self._require(actual == [wanted], f"the index says {name} {wanted!r}, the samples say {actual!r}")
+                yield np.column_stack([to_numpy(table.column(channel)) for channel in columns])
         except DataError:
             raise
         except _ARROW_ERRORS as error:
-            pass_on_shortage(error, path)
-            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
+            pass_on_shortage(error, self.path)
+            raise DataError(f"Reading {self.key} from {self.path}: {shortened(str(error))}; {AGAIN}.") from error
+
+    def _tables(self, columns: list[str], rows: int | None) -> Iterator[Any]:
+        """Read columns after the checks of length and types, pages against their checksums."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        _, group, samples = self.place
+        options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+        options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
+        with parquet.ParquetFile(self.path, metadata=_metadata(self.path, self.version), **options) as file:
+            actual = file.metadata.row_group(group).num_rows
+            self._require(actual == samples, f"{samples} samples are expected in row group {group}, found {actual}")
+            if samples > limits.MAX_SAMPLES:
+                advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
+                raise DataError(f"Reading {self.path}: an episode has {samples} samples; {advice}.")
+            for name in columns:
+                kind, label = str(file.schema_arrow.field(name).type), name in KEYS
+                wanted = "text" if label else "numbers of type double"
+                fits = "string" in kind if label else kind == "double"
+                self._require(fits, f"column {name!r} should hold {wanted}, found {kind}")
+            if rows is None:
+                yield file.read_row_group(group, columns=columns, use_threads=False)
+                return
+            for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+                yield pa.Table.from_batches([part])
+
+    def _require(self, condition: bool, problem: str) -> None:
+        if not condition:
+            raise DataError(f"Reading {self.path}: {shortened(problem)}; files were changed, {AGAIN}.")
 
 
 @lru_cache(maxsize=64)
-def _metadata(path: Path, version: Version) -> Any:
+def _metadata(path: Path, version: tuple[int, ...]) -> Any:
     """Return the description of all row groups of a file, which are read one by one."""
     from pyarrow import parquet
 
     return parquet.read_metadata(path)
-
-
-def _read_group(path: Path, version: Version, place: Place, columns: list[str], rows: int | None) -> Iterator[Any]:
-    """Read one row group, perhaps in blocks, after its length and the types of its columns, pages against checksums."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    _, group, samples = place
-    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
-    options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
-    with parquet.ParquetFile(path, metadata=_metadata(path, version), **options) as file:
-        actual = file.metadata.row_group(group).num_rows
-        _require(actual == samples, path, f"{samples} samples are expected in row group {group}, found {actual}")
-        if samples > limits.MAX_SAMPLES:
-            advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
-            raise DataError(f"Reading {path}: an episode has {samples} samples; {advice}.")
-        for name in columns:
-            kind, wanted = str(file.schema_arrow.field(name).type), "text" if name in KEYS else "numbers of type double"
-            fits = "string" in kind if name in KEYS else kind == "double"
-            _require(fits, path, f"column {name!r} should hold {wanted}, found {kind}")
-        if rows is None:
-            yield file.read_row_group(group, columns=columns, use_threads=False)
-            return
-        for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
-            yield pa.Table.from_batches([part])
-
-
-def _require(condition: bool, path: Path, problem: str) -> None:
-    if not condition:
-        raise DataError(f"Reading {path}: {shortened(problem)}; files were changed, {AGAIN}.")
 
 
 def read_parquet(folder: Path | str) -> Population:
@@ -381,16 +381,6 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
     ['a@default.parquet', 'population.json']
     """
     with whole_folder(Path(out)) as folder:
-        groups = list(population.groups())
-        records = in_threads(lambda group: write_group(population, group[0], group[1], folder), groups)
-        write_index(population, records, folder, converted)
-
-
-def in_threads(function: Callable[[Any], T], tasks: Iterable[Any]) -> list[T]:
-    """Map a function over tasks in threads, one per processor; what has not begun when one fails is left."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        futures = [pool.submit(function, task) for task in tasks]
-        try:
-            return [future.result() for future in futures]
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+        with ThreadPoolExecutor() as pool:
+            groups = [pool.submit(write_group, population, unit, c, folder) for unit, c, _ in population.groups()]
+            write_index(population, [group.result() for group in groups], folder, converted)

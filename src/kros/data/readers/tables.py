@@ -20,7 +20,7 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
-from ..arrow import fill
+from ..arrow import to_numpy
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -81,7 +81,7 @@ def read_columns(
     for i, name in enumerate(wanted if table is not None else ()):
         column = table.column(name)
         if i > 0 or timestamp is None:
-            fill(values[i], column)
+            values[i] = to_numpy(column)
         else:
             values[i] = seconds_of(column, timestamp) if path.suffix != PARQUET else _since_first(column)
     return values

@@ -257,18 +257,8 @@ def test_copies_are_refused_and_named(tmp_path: Path, copied: Any) -> None:
 
 @pytest.mark.parametrize("period", [1.0, 0.5, 60.0, 1e-6])
 def test_unusual_periods_are_said(period: float) -> None:
-    assert "unusual" in period_alerts(samples(0, 500), CHANNELS, period)[0]
-    assert period_alerts(samples(0, 500), CHANNELS, 0.01) == ()
-
-
-@pytest.mark.parametrize("scale", [1e3, 1e-3, 1e6])
-def test_a_speed_that_is_no_slope_is_said(scale: float) -> None:
-    t = np.arange(2000) * 1e-2
-    motion = np.column_stack([np.sin(t), np.cos(t), np.sign(np.sin(3 * t))])
-    assert period_alerts(motion, CHANNELS, 1e-2) == ()
-    found = [a for a in period_alerts(motion, CHANNELS, 1e-2 * scale) if "slope" in a]
-    assert len(found) >= 1
-    assert "'v' is the slope of 'x'" in found[0]
+    assert "unusual" in period_alerts(period)[0]
+    assert period_alerts(0.01) == ()
 
 
 def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ import logging
 import math
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from hashlib import sha256
 from numbers import Real
 from typing import Any
@@ -15,16 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core import limits
-from ..core.errors import ConfigError, DataError
+from ..core.errors import DataError
 from ..core.files import shortened
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from .recording import CHECK, title, usable
 
 logger = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-Look = Callable[[EpisodeKey, Array], None]
-
-ON_NAN = ("error", "drop_episode")
 
 
 class NonFiniteError(DataError):
@@ -210,35 +207,29 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
 
 
-def scan_digests(
-    population: Population, on_nan: str = "error", look: Look | None = None
-) -> list[tuple[EpisodeKey, str]]:
-    """Read and check every episode; return the usable ones with their digests. `look` is called with every episode."""
-    groups = (usable_episodes(population, keys, on_nan, look) for _, _, keys in population.groups())
+def scan_digests(population: Population, on_nan: str = "error") -> list[tuple[EpisodeKey, str]]:
+    """Read and check every episode; return the usable ones with their digests."""
+    groups = (usable_episodes(population, keys, on_nan) for _, _, keys in population.groups())
     digests = [(key, digest) for group in groups for key, _, digest in group]
     refuse_copies(digests)
     return digests
 
 
 def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
+    population: Population, keys: Iterable[EpisodeKey], on_nan: str = "error"
 ) -> Iterator[tuple[EpisodeKey, Array, str]]:
     """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
-    if on_nan not in ON_NAN:
-        raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
     watch = GroupWatch(population.columns)
     for key in keys:
         try:
             values = population.source(key)
             check_episode(values, key, population.columns)
         except NonFiniteError as error:
-            if on_nan == "error":
+            if on_nan != "drop_episode":
                 raise
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(key, values)
-        if look is not None:
-            look(key, values)
         yield key, values, digest_of(values)
     watch.check()
 

@@ -82,7 +82,9 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not files:
         kinds = ".csv, .tsv, .txt, .dat, .parquet, or these with .gz"
-        raise DataError(f"Looking at {source}: there are no files of recordings ({kinds}); save them as CSV or Parquet.")
+        raise DataError(
+            f"Looking at {source}: there are no files of recordings ({kinds}); save them as CSV or Parquet."
+        )
     if not selected:
         problem = f"no file matches --files {expression!r}"
         raise DataError(f"Looking at {source}: {problem}; correct the expression, or leave it out.")
@@ -142,7 +144,9 @@ def _columns(
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
         problem = "the files looked at have fewer than three rows of numbers"
         raise DataError(f"Looking at {source}: {problem}; check the folder.")
-    time, keys, notes = None, {"sample_period_s": period_s}, {}
+    time: int | None = None
+    keys: dict[str, Any] = {"sample_period_s": period_s}
+    notes: dict[str, str] = {}
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)

@@ -125,7 +125,9 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
     """Yield every episode of a mapping from units, from units and conditions, or from keys."""
     if not isinstance(data, Mapping):
         actual = f"found {shortened(repr(data))}"
-        raise DataError(f"from_arrays needs a mapping from units to lists of episodes, {actual}; see its documentation.")
+        raise DataError(
+            f"from_arrays needs a mapping from units to lists of episodes, {actual}; see its documentation."
+        )
     for unit, of_unit in data.items():
         if isinstance(unit, EpisodeKey):
             yield unit, of_unit
@@ -134,7 +136,9 @@ def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
         for condition, episodes in conditions.items():
             if isinstance(episodes, str | bytes | Mapping) or not isinstance(episodes, Iterable):
                 actual = f"found {shortened(repr(episodes))}"
-                raise DataError(f"from_arrays: unit {unit} ({condition}) needs a list of episodes, {actual}; correct it.")
+                raise DataError(
+                    f"from_arrays: unit {unit} ({condition}) needs a list of episodes, {actual}; correct it."
+                )
             yield from ((EpisodeKey(str(unit), str(condition), str(i)), one) for i, one in enumerate(episodes))
 
 

@@ -159,9 +159,8 @@ def write_raw(population: Population, out: Path | str) -> None:
         if not named or key.condition not in ("load", "noload"):
             needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
             raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
-    with whole_folder(Path(out)) as folder:
-        with ThreadPoolExecutor() as pool:
-            list(pool.map(lambda group: _write_folder(population, folder, *group), enumerate(population.groups())))
+    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
+        list(pool.map(lambda group: _write_folder(population, folder, *group), enumerate(population.groups())))
 
 
 def _write_folder(population: Population, folder: Path, index: int, keys_of: tuple[str, str, Any]) -> None:

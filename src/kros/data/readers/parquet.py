@@ -14,9 +14,9 @@ import logging
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
@@ -26,14 +26,15 @@ from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, whole_folder
 from ..arrow import from_numpy, repeated, to_numpy
-from ..checks import Look, check_period, check_structure, refuse_copies, usable_episodes
-from ..population import Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
+from ..checks import check_structure, refuse_copies, usable_episodes
+from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
 from .tables import BLOCK
@@ -42,6 +43,7 @@ logger = logging.getLogger(__name__)
 
 Array = npt.NDArray[np.float64]
 Place = tuple[str, int, int]
+Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # with their samples and digests
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
 AGAIN = "convert the recordings again"
@@ -198,53 +200,18 @@ def read_parquet(folder: Path | str) -> Population:
     """
     folder = Path(folder)
     content, _ = load_artifact(folder, INDEX)
-    what = f"Reading {folder / 'population.json'}"
     try:
-        columns = [_channel(c) for c in (*content["channels"], *content.get("truths", ()))]
-        units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
-        places = _places(content["groups"])
-        period = check_period(content["sample_period_s"], what)
-        metadata = dict(content["metadata"])
-        scaling = {name: Scaling(**scale) for name, scale in content.get("scaling", {}).items()}
-    except DataError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{what}: not as kros writes it ({error!r}); {AGAIN}.") from error
+        index = TypeAdapter(_Index).validate_python(content)
+        places = _places(index.groups)
+    except ValueError as error:
+        what = f"Reading {folder / 'population.json'}: not as kros writes it"
+        raise DataError(f"{what} ({shortened(str(error))}); {AGAIN}.") from error
     missing = sorted({name for name, _, _ in places.values() if not (folder / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; {AGAIN}.")
-    channels = columns_in_order(columns)
+    channels = columns_in_order((*index.channels, *index.truths))
     recordings = ParquetRecordings(places, str(folder), tuple(c.name for c in channels))
-    return assemble(recordings, channels, units, period, metadata, scaling=scaling)
-
-
-def _channel(row: Mapping[str, Any]) -> Channel:
-    """Return a channel of the index."""
-    of = _text(row.get("of", ""))
-    return Channel(_text(row["name"]), Role(row["role"]), _text(row["unit"]), row.get("measured") is True, of)
-
-
-def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, Place]:
-    """Return where every episode is."""
-    places: dict[EpisodeKey, Place] = {}
-    for g in groups:
-        unit, condition, name = _text(g["unit"]), _text(g["condition"]), _text(g["file"])
-        if name in ("", ".", "..") or Path(name).name != name:
-            raise ValueError(f"the file {name!r} is not beside the index")
-        for row_group, (episode, samples) in enumerate(zip(g["episodes"], g["samples"], strict=True)):
-            key = EpisodeKey(unit, condition, _text(episode))
-            if key in places:
-                raise ValueError(f"{key} occurs twice")
-            if type(samples) is not int or samples < 0:
-                raise TypeError(f"{samples!r} is no number of samples")
-            places[key] = name, row_group, samples
-    return places
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} should be text")
-    return value
+    return assemble(recordings, channels, index.units, index.sample_period_s, index.metadata, scaling=index.scaling)
 
 
 @dataclass(frozen=True)
@@ -265,22 +232,43 @@ class GroupRecord:
         return list(zip(keys, self.digests, strict=True)) if self.digests else []
 
 
+@dataclass(frozen=True)
+class _Index:
+    """Content of `population.json`."""
+
+    sample_period_s: float
+    channels: tuple[Channel, ...]
+    units: tuple[Unit, ...]
+    metadata: dict[str, Any]
+    groups: tuple[GroupRecord, ...]
+    truths: tuple[Channel, ...] = ()
+    scaling: dict[str, Scaling] = field(default_factory=dict)
+
+
+def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
+    """Return where every episode is."""
+    places: dict[EpisodeKey, Place] = {}
+    for g in groups:
+        if g.file in ("", ".", "..") or Path(g.file).name != g.file:
+            raise ValueError(f"the file {g.file!r} is not beside the index")
+        for row_group, (episode, samples) in enumerate(zip(g.episodes, g.samples, strict=True)):
+            key = EpisodeKey(g.unit, g.condition, episode)
+            if key in places or samples < 0:
+                raise ValueError(f"{key} occurs twice, or has {samples} samples")
+            places[key] = g.file, row_group, samples
+    return places
+
+
 def write_group(
-    population: Population,
-    unit: str,
-    condition: str,
-    folder: Path | str,
-    on_nan: str = "error",
-    look: Look | None = None,
+    population: Population, unit: str, condition: str, folder: Path | str, episodes: Episodes | None = None
 ) -> GroupRecord:
-    """Read, prepare, check and write all episodes of one unit and condition."""
+    """Write the usable episodes of one unit and condition; by default they are read, prepared and checked here."""
     keys = population.keys(unit, condition)
-    if not keys:
-        raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        written = list(_write_episodes(population, keys, temporary, on_nan, look))
+        usable = usable_episodes(population, keys) if episodes is None else episodes
+        written = list(_write_episodes(population, usable, temporary))
         if not written:
             text = "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN."
             logger.warning(text, unit, condition, len(keys))
@@ -288,8 +276,8 @@ def write_group(
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    episodes, samples, digests = zip(*written, strict=True)
-    return GroupRecord(unit, condition, path.name, episodes, samples, digests)
+    names, samples, digests = zip(*written, strict=True)
+    return GroupRecord(unit, condition, path.name, names, samples, digests)
 
 
 def group_file(unit: str, condition: str) -> str:
@@ -300,9 +288,7 @@ def group_file(unit: str, condition: str) -> str:
     return f"{name}.parquet"
 
 
-def _write_episodes(
-    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None
-) -> Iterator[tuple[str, int, str]]:
+def _write_episodes(population: Population, episodes: Episodes, path: Path) -> Iterator[tuple[str, int, str]]:
     """Write usable episodes one behind the other; yield episode, number of samples and digest."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -321,7 +307,7 @@ def _write_episodes(
         "write_page_checksum": True,
     }
     with parquet.ParquetWriter(path, schema, **options) as writer:
-        for key, values, digest in usable_episodes(population, keys, on_nan, look):
+        for key, values, digest in episodes:
             n = len(values)
             signals = [from_numpy(column) for column in (np.arange(n, dtype=np.int64), *values.T)]
             arrays = [*(repeated(getattr(key, name), n) for name in KEYS), *signals]
@@ -380,7 +366,6 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
     ...     print(sorted(path.name for path in Path(folder, "recordings").iterdir()))
     ['a@default.parquet', 'population.json']
     """
-    with whole_folder(Path(out)) as folder:
-        with ThreadPoolExecutor() as pool:
-            groups = [pool.submit(write_group, population, unit, c, folder) for unit, c, _ in population.groups()]
-            write_index(population, [group.result() for group in groups], folder, converted)
+    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
+        groups = [pool.submit(write_group, population, unit, c, folder) for unit, c, _ in population.groups()]
+        write_index(population, [group.result() for group in groups], folder, converted)

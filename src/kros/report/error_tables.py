@@ -12,8 +12,6 @@ from ..data.population import natural_key
 from ..evaluate import unit_interval
 
 Rows = Sequence[Mapping[str, Any]]
-PAPER = "koopman_edmd/mixed"
-"""The paper's own observer, which powers at the gearbox frequency are compared with."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +27,6 @@ class ErrorCell:
     worst_rms: float | None = None
     true_mean: float | None = None  # against the true signal, percent of its largest value
     lag_s: float | None = None  # of the estimate behind the true signal
-    band_db: float | None = None
 
 
 @dataclass(frozen=True)
@@ -74,13 +71,9 @@ def _tables(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None) -
         grouped: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
         for row in (r for r in rows if r["condition"] == condition):
             grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
-        published = grouped.get(PAPER, {})
         cells = {
-            observer: {
-                c: _cell(units, published.get(c, []), _interval(units, intervals, (observer, condition, c)))
-                for c, units in channels.items()
-            }
-            for observer, channels in grouped.items()
+            name: {c: _cell(units, _interval(units, intervals, (name, condition, c))) for c, units in channels.items()}
+            for name, channels in grouped.items()
         }
         names = tuple(dict.fromkeys(c for channels in grouped.values() for c in channels))
         ranked = frozenset(c for c in names if condition == identify_on or condition != "load" or c != "current")
@@ -99,12 +92,11 @@ def _interval(rows: Rows, intervals: Mapping[Any, Any] | None, key: tuple[str, s
     return float(low), float(high)
 
 
-def _cell(rows: Rows, published: Rows, interval: tuple[float, float] | None) -> ErrorCell:
+def _cell(rows: Rows, interval: tuple[float, float] | None) -> ErrorCell:
     """Summarise the units of one observer and channel."""
-    band_db = _band_db(rows, published)
     lost = len({r["unit"] for r in rows if r["error_percent"] is None})
     if lost:
-        return ErrorCell(band_db=band_db, diverged=lost)
+        return ErrorCell(diverged=lost)
     worst = max(rows, key=lambda r: float(r["error_percent"]))
     rms = _known(rows, "rms")
     return ErrorCell(
@@ -116,7 +108,6 @@ def _cell(rows: Rows, published: Rows, interval: tuple[float, float] | None) -> 
         worst_rms=float(max(rms)) if rms else None,
         true_mean=_mean(_known(rows, "true_error_percent")),
         lag_s=_mean(_known(rows, "true_lag_s")),
-        band_db=band_db,
     )
 
 
@@ -128,13 +119,3 @@ def _known(rows: Rows, key: str) -> list[float]:
 
 def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
-
-
-def _band_db(rows: Rows, published: Rows) -> float | None:
-    """Return the ratio of mean powers around the gearbox frequency over the units that both have, dB."""
-    powers, others = ({r["unit"]: r.get("gearbox_band_power") for r in part} for part in (rows, published))
-    pairs = np.array([[powers[unit], others[unit]] for unit in powers if unit in others], float)
-    if not pairs.size or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
-        return None
-    mean = pairs.mean(axis=0)
-    return float(10 * np.log10(mean[0] / mean[1]))

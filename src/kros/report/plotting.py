@@ -16,7 +16,7 @@ PLOTS = {
     "Population": "recordings:population_figure",
     "IdentifiedModels": "models:identified_figure",
     "UncertainModels": "uncertainty:sets_figure",
-    "Design": "synthesis:design_figure",
+    "Design": "episodes:design_figure",
     "RunResult": ":run_figure",
     "UncertainModel": "uncertainty:uncertain_figure",
 }
@@ -30,11 +30,10 @@ def plot(result: Any, **options: Any) -> Figure:
     ----------
     result : one of the classes in `PLOTS`
         A population: its first episode. Models: Bode plots. Uncertain models: forms, weights, every unit relative to
-        the weights. A design: the correction filter. A run: the estimates.
+        the weights. A design: the estimates on a held-out episode. A run: the estimates.
     **options
-        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for an uncertain model entry
-        by entry; ``models`` of a design or an `UncertainModel`, the models behind it; ``name`` of a run, any of its
-        figures.
+        ``kind`` of identified and uncertain models, such as ``"linear"``; ``models`` of a design, the identified models
+        behind it; ``models`` of an `UncertainModel`, the `ModelSet` behind it; ``name`` of a run, any of its figures.
 
     Returns
     -------

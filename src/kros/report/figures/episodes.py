@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.errors import ConfigError
 from ...data import EpisodeBatch
 from ...data.population import Channel, Role
+from ...design import Design
 from ...evaluate.errors import error_spectrum
 from ...evaluate.sensor import as_shown
 from ...identify.identified import IdentifiedModels
-from ...observer import Observer, run_observer
+from ...observer import run_observer
 from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
 from ..names import (
     Look,
@@ -228,9 +230,11 @@ def steady_stretches(speed: Array) -> list[tuple[int, int]]:
     return sorted(stretches)
 
 
-def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
-    """Draw estimates on the first held-out episode of the units behind the models."""
-    facts = models.facts
+def design_figure(design: Design, models: IdentifiedModels | None = None) -> Figure:
+    """Draw estimates of an observer on the first held-out episode of the units behind its models."""
+    if models is None:
+        raise ConfigError("Plot of a design: give models= the identified models, whose recordings it runs on.")
+    observer, facts = design.observer, models.facts
     key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
     y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)

@@ -162,12 +162,8 @@ def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
 
 
-def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
+def uncertain_figure(model: UncertainModel, models: ModelSet | None = None) -> Figure:
     """Draw forms and weights of an uncertain model, and with its models every unit relative to the weights."""
-    if entries:
-        if models is None:
-            raise ConfigError("Plot of an uncertain model: entries need models= the ModelSet that it was made of.")
-        return entries_figure({models.name: beside(model, models)}, {models.name: entry_names(model.form, models)})
     figure, axes = grid(2, 2, 2.4, sharex=True)
     draw_forms(axes[0, 0], model)
     legend(figure, axes[0, 0], 3)
@@ -184,9 +180,9 @@ def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entr
     return figure
 
 
-def sets_figure(models: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
+def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
     """Draw the uncertain model of one kind, the first by default."""
     name = kind or next(iter(models.sets))
     if name not in models.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
-    return uncertain_figure(models.sets[name], models.models.models(name), entries)
+    return uncertain_figure(models.sets[name], models.models.models(name))

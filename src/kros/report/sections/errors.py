@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ..content import Column, Section, Table, build
-from ..error_tables import PAPER, ErrorCell, ErrorTable, left_out_tables
+from ..error_tables import ErrorCell, ErrorTable, left_out_tables
 from ..facts import Facts
 from ..names import (
     BASELINES,
@@ -84,8 +84,6 @@ def left_out(facts: Facts) -> Section | None:
         about = [Column("observer", [observer_label(name) for name in table.cells])]
         about += [Column(title, [_count(e.get(key), folds) for e in entries], g) for key, (title, g) in parts.items()]
         caption = f"Units left out{in_condition(table.condition)}; small: 95 % interval of the mean over units"
-        if any(cell.band_db is not None for cells in table.cells.values() for cell in cells.values()):
-            caption += f"; band: power at the gearbox frequency relative to “{observer_label(PAPER)}”"
         tables.append(_table(caption, about, [(table, name) for name in table.cells], facts, sortable=True))
     return Section("left-out", "Units left out", [text, *failed], tables=tables)
 
@@ -102,19 +100,18 @@ def _table(caption: str, about: Sequence[Column], rows: Rows, facts: Facts, **op
 
 
 def _channel(channel: str, unit: str, rows: Rows, details: bool) -> list[Column]:
-    """Return the columns of one channel; `details` are intervals and powers at the gearbox frequency."""
+    """Return the columns of one channel; `details` are intervals."""
     cells = [table.cells[name].get(channel, ErrorCell()) for table, name in rows]
     ranked, group = all(channel in table.ranked for table, _ in rows), words(channel)
     intervals = ["–".join(number(v, 2) for v in c.interval) if c.interval and details else "" for c in cells]
     means = ["diverged" if c.diverged else c.mean for c in cells]
-    columns = [
+    return [
         Column("mean (%)", means, group, best=ranked, notes=intervals),
         Column("worst (%)", [c.worst for c in cells], group, best=ranked),
         Column(f"RMS ({unit})" if unit else "RMS", [c.rms for c in cells], group),
         Column("against the true signal (%)", [c.true_mean for c in cells], group),
         Column("lag (ms)", [None if c.lag_s is None else 1e3 * c.lag_s for c in cells], group),
     ]
-    return [*columns, *([Column("band (dB)", [c.band_db for c in cells], group)] if details else [])]
 
 
 def _compared(facts: Facts) -> Mapping[str, Sequence[str]]:

@@ -1,20 +1,21 @@
-"""Systems to and from python-control, with the names of their signals.
+"""Systems to and from python-control, with the names of their signals, and how models of it differ.
 
 kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
 from ..identify import ModelSet
-from ..uncertainty import ResponseUncertainty, UncertainModel
+from ..uncertainty import Form, ResponseUncertainty, UncertainModel, quantify
 
 try:
     import control
@@ -104,20 +105,13 @@ def to_control(
     >>> from_control(system).A
     array([[0.5]])
     """
-    if system.batch_shape:
-        return [
-            to_control(system[i], name=name, states=states, inputs=inputs, outputs=outputs)
-            for i in range(system.batch_shape[0])
-        ]
-    counts = {"states": system.n_states, "inputs": system.n_inputs, "outputs": system.n_outputs}
     signals = {"states": states, "inputs": inputs, "outputs": outputs}
-    for kind, names in signals.items():
-        if names is not None and (
-            isinstance(names, str) or len(names) != counts[kind] or len(set(names)) != counts[kind]
-        ):
-            raise DimensionError(
-                f"to_control: {counts[kind]} {kind} need as many different names, found {names!r}; correct the list."
-            )
+    if system.batch_shape:
+        return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
+    for (kind, names), count in zip(signals.items(), (system.n_states, system.n_inputs, system.n_outputs), strict=True):
+        if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == count):
+            problem = f"{count} {kind} need as many different names, found {names!r}"
+            raise DimensionError(f"to_control: {problem}; correct the list.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
@@ -151,14 +145,11 @@ def from_control(system: Any) -> StateSpace:
     [[0.5]]
     """
     if not is_system(system):
-        raise DimensionError(
-            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
-        )
+        needs = "needs a control.StateSpace or control.TransferFunction"
+        raise DimensionError(f"from_control: {needs}, found {type(system).__name__}.")
     if system.dt is None or system.dt is True:
-        raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
-            "C, D, 0.001), or 0."
-        )
+        advice = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
+        raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {advice}.")
     if isinstance(system, control.TransferFunction):
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
@@ -224,19 +215,13 @@ def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> d
     >>> len(systems), systems[motors.unit_ids[0]].input_labels
     (2, ['voltage'])
     """
-    asked = models.unit_ids if units is None else tuple(units)
-    unknown = [unit for unit in asked if unit not in models.unit_ids]
-    if unknown or isinstance(units, str):
-        raise DimensionError(
-            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the "
-            "list."
-        )
-    systems = models.systems(asked)
-    names = models.lifting.names
-    return {
-        unit: to_control(systems[i], name=unit, states=names, inputs=models.inputs, outputs=names)
-        for i, unit in enumerate(asked)
-    }
+    wanted = models.unit_ids if units is None else tuple(units)
+    if isinstance(units, str) or not set(wanted) <= set(models.unit_ids):
+        problem = f"units {units!r}, the models are of {list(models.unit_ids)}"
+        raise DimensionError(f"models_to_control: {problem}; correct the list.")
+    systems, names = models.systems(wanted), models.lifting.names
+    labels = {"states": names, "inputs": models.inputs, "outputs": names}
+    return {unit: to_control(systems[i], name=unit, **labels) for i, unit in enumerate(wanted)}
 
 
 def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
@@ -254,16 +239,12 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
     0.01
     """
     if isinstance(model, UncertainModel):
-        nominal, scaled = (
-            to_control(model.nominal_system, name="nominal"),
-            to_control(model.scaled_nominal(), name="scaled_nominal"),
-        )
+        nominal = to_control(model.nominal_system, name="nominal")
+        scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
         certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
         if model.sample_period_s == 0:
-            certificate = (
-                f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map, "
-                "checked between the points of the grid; from there on residuals count as constant"
-            )
+            axis = f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map"
+            certificate = f"{axis}, checked between the points of the grid; from there on residuals count as constant"
     else:
         G, certificate = model.nominal_response, model.certificate
         nominal, scaled = (
@@ -281,6 +262,64 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
         model=model,
         certificate=certificate,
     )
+
+
+def quantify_models(
+    models: Sequence[Any] | Mapping[str, Any],
+    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
+    freqs_hz: npt.ArrayLike | None = None,
+    **options: Any,
+) -> UncertaintyForControl:
+    """Quantify how models of python-control differ from a nominal one.
+
+    Parameters
+    ----------
+    models : sequence or mapping of control.StateSpace, control.TransferFunction or control.FRD
+        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or
+        all response data.
+    form : Form or str
+    freqs_hz : array_like, shape (frequency,), Hz, optional
+        Response data bring their own.
+    **options
+        Of `kros.uncertainty.quantify`: ``nominal`` (also as a system or response data), ``output_scale`` and others.
+
+    Returns
+    -------
+    UncertaintyForControl
+
+    Raises
+    ------
+    DimensionError
+        Outputs, inputs, time or frequencies differ.
+    DataError
+        Fewer than two models, unstable or improper ones, NaN.
+    ConfigError
+        Frequencies given twice; unknown forms.
+
+    Examples
+    --------
+    >>> import control
+    >>> from kros.interop import quantify_models
+    >>> lags = [control.tf([gain], [1, 1]) for gain in (0.9, 1.0, 1.2)]
+    >>> found = quantify_models(lags, "output_multiplicative")
+    >>> found.model.nominal_id, found.left.dt, round(float(abs(found.left(1j))), 6)
+    ('1', 0.0, 0.2)
+    """
+    if is_system(models) or not isinstance(models, Sequence | Mapping):
+        raise DimensionError(f"quantify_models: found one model, {type(models).__name__}; give a list of at least two.")
+    if not models:
+        raise DataError("quantify_models: found no models; give at least two.")
+    if isinstance(models, Mapping):
+        options["unit_ids"], models = tuple(models), list(models.values())
+    kinds = {is_system(model) for model in models}
+    if len(kinds) > 1 or not (kinds == {True} or all(hasattr(model, "frdata") for model in models)):
+        names = sorted({type(model).__name__ for model in models})
+        problem = f"found {' and '.join(names)} in one list"
+        raise DimensionError(f"quantify_models: {problem}; give all as systems or all as control.FRD.")
+    if is_system(options.get("nominal")):
+        options["nominal"] = from_control(options["nominal"])
+    systems = [from_control(model) for model in models] if kinds == {True} else models
+    return uncertainty_to_control(quantify(systems, form, freqs_hz, **options))
 
 
 def _label(name: str) -> str:

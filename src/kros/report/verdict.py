@@ -12,7 +12,7 @@ from typing import Any
 
 from .error_tables import ErrorTable, left_out_tables
 from .facts import Facts
-from .names import BASELINES, condition_label, joined, minus, model_label, number, observer_label, some_of, words
+from .names import BASELINES, condition_label, joined, number, observer_label, some_of, words
 from .names import split_observer as split
 
 Row = Mapping[str, Any]
@@ -24,7 +24,6 @@ class Thresholds:
 
     better: float = 0.05  # share by which all mean errors of another observer are smaller
     improved: float = 0.01  # share by which a correction must reduce the error of the model alone
-    small_set: float = 5.0  # ratio of a model's simulation error to the size of its uncertain set
     noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
@@ -74,7 +73,7 @@ class Verdict:
 def judge(facts: Facts) -> Verdict:
     """Return the verdict on a run."""
     reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
-    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates, _small_set):
+    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates):
         reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
     known = [reason.status for reason in reasons]
     status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
@@ -224,24 +223,6 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield "The weights do not bound all units that they were fitted to.", "Raise their order.", "uncertainty"
     for fold, why in facts.get("left_out", {}).get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
-
-
-def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
-    """Yield an uncertain set that is far smaller than the simulation errors of its models."""
-    entry = facts.get("uncertainty", {}).get(facts.model, {})
-    peak = entry.get("peak_db", {}).get(entry.get("form"))
-    errors = facts.get("models", {}).get(facts.model, {}).get("freerun_error_percent", {})
-    known = {channel: error["median"] for channel, error in errors.items() if error.get("median") is not None}
-    if peak is None or not known:
-        return
-    channel, size = max(known, key=lambda c: known[c]), 100 * 10 ** (peak / 20)
-    if known[channel] > THRESHOLDS.small_set * size:
-        text = (
-            f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
-            f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
-            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from the units."
-        )
-        yield text, "Do not read a bound over the set as a bound on the error.", "spread"
 
 
 def undecided(rows: Sequence[Row]) -> list[Row]:

@@ -22,13 +22,14 @@ from kros.core.errors import ConfigError, DataError
 from kros.core.lti import StateSpace
 from kros.identify import PhaseCalibration, PhaseSpec
 from kros.identify.calibration import UnitPhase
-from kros.report import plot, render, write_figures
+from kros.report import plot
 from kros.report.figures import FIGURES, draw, draw_all
 from kros.report.figures.entries import beside, entry_names
 from kros.report.figures.recordings import phase_figure
 from kros.report.figures.synthesis import scaled_filter
 from kros.report.figures.uncertainty import published_bounds
-from kros.report.files import to_svg
+from kros.report.files import to_svg, write_figures
+from kros.report.html import render
 from kros.report.names import observer_label
 from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, from_arrays, prepare, read, write_parquet, write_raw
-from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+from kros.data import Channel, Role, from_arrays, prepare, read, write_parquet
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, write_raw
 from kros.data.readers.opening import detect_reader
 
 MAPPING: dict[str, Any] = {

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, from_arrays, prepare, write_raw
-from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, read_motor_drive_raw
+from kros.data import EpisodeKey, from_arrays, prepare
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, read_motor_drive_raw, write_raw
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
 N = 1100

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from .control import (
         UncertaintyForControl,
         from_control,
-        models_to_control,
         quantify_models,
         to_control,
         uncertainty_to_control,
@@ -30,7 +29,6 @@ __all__ = [
     "KoopmanRegressor",
     "UncertaintyForControl",
     "from_control",
-    "models_to_control",
     "quantify_models",
     "to_control",
     "uncertainty_to_control",

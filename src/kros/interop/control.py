@@ -14,7 +14,6 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
-from ..identify import ModelSet
 from ..uncertainty import Form, ResponseUncertainty, UncertainModel, quantify
 
 try:
@@ -185,43 +184,6 @@ def _realised(model: Any) -> StateSpace:
     B = np.concatenate([np.zeros((0, m)), *(b for _, b, _ in blocks)])
     C = np.concatenate([np.zeros((p, 0)), *(c for _, _, c in blocks)], axis=1)
     return StateSpace(A.reshape(n, n), B, C, D, float(model.dt))
-
-
-def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return the models of units as `control.StateSpace`, from inputs to lifted states, by unit.
-
-    Parameters
-    ----------
-    models : ModelSet
-    units : sequence of str, optional
-        Default: all.
-
-    Returns
-    -------
-    dict of str to control.StateSpace
-        States and outputs are named after the lifted functions, the system after the unit.
-
-    Raises
-    ------
-    DimensionError
-        An unknown unit.
-
-    Examples
-    --------
-    >>> import kros
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> models = kros.identify(motors, refine=False)
-    >>> systems = kros.interop.models_to_control(models.sets["linear_edmd"])
-    >>> len(systems), systems[motors.unit_ids[0]].input_labels
-    (2, ['voltage'])
-    """
-    wanted = models.unit_ids if units is None else tuple(units)
-    if isinstance(units, str) or not set(wanted) <= set(models.unit_ids):
-        problem = f"units {units!r}, the models are of {list(models.unit_ids)}"
-        raise DimensionError(f"models_to_control: {problem}; correct the list.")
-    systems, names = models.systems(wanted), models.lifting.names
-    labels = {"states": names, "inputs": models.inputs, "outputs": names}
-    return {unit: to_control(systems[i], name=unit, **labels) for i, unit in enumerate(wanted)}
 
 
 def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:

@@ -121,34 +121,10 @@ def read_motor_drive_raw(source: Path | str) -> Population:
 
 
 def write_raw(population: Population, out: Path | str) -> None:
-    """Write the paper's raw layout, ``<out>/batch_b/<group>/<stamp>_<serial>_<load|noload>/*_<episode>.csv``.
+    """Write recordings before preparation, in the reader's channels and units, as a folder that is whole or not there.
 
-    Parameters
-    ----------
-    population : Population
-        Drives *before* preparation, in the reader's channels and units (rad and rad/s at the gear output, fraction of
-        full scale): episodes still hold the 1000 samples at rest and the offset of the position. Targets are written
-        one row later than the measurements they belong to, so reading back gives one sample less (and 1000 less at
-        rest).
-    out : Path
-        Folder to make, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        Other channels, or names that the layout cannot hold.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.data import write_raw
-    >>> from kros.plants import HarmonicDrivePopulation
-    >>> drives = HarmonicDrivePopulation(n_units=2, n_episodes=1, seconds=2.0, conditions=("noload",))
-    >>> with TemporaryDirectory() as folder:
-    ...     write_raw(drives.simulate().raw, f"{folder}/raw")  # as recorded, before preparation
-    ...     print(len(list(Path(folder).rglob("*.csv"))))
-    2
+    Targets are written one row later than the measurements that they belong to, so reading back gives one sample less
+    (and 1000 less at rest).
     """
     names, expected = tuple(c.name for c in population.channels), tuple(c.name for c in CHANNELS)
     if names != expected:

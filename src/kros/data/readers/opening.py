@@ -8,8 +8,9 @@ from typing import Any
 
 from ...core.errors import ConfigError, DataError
 from ..population import Population
+from ..prepare import parse_steps
 from ..prepare import prepare as prepared
-from ..steps import Step, parse_steps
+from ..steps import Step
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import CsvMapping
 from .motor_drive_raw import is_raw_layout, read_motor_drive_raw

@@ -169,35 +169,7 @@ def _metadata(path: Path, version: tuple[int, ...]) -> Any:
 
 
 def read_parquet(folder: Path | str) -> Population:
-    """Read a population that `write_parquet` wrote.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds `population.json`.
-
-    Returns
-    -------
-    Population
-        Lazy: only `population.json` is read.
-
-    Raises
-    ------
-    DataError
-        No population there, or one of another schema.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> import kros
-    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
-    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, sample_period_s=0.01, **names)
-    >>> with TemporaryDirectory() as folder:
-    ...     kros.data.write_parquet(population, f"{folder}/recordings")
-    ...     print(kros.data.read_parquet(f"{folder}/recordings"))
-    Population(1 unit, 1 condition, 1 episode every 0.01 s; states x (measured); inputs u)
-    """
+    """Return a population that `write_parquet` wrote; only `population.json` is read at once."""
     folder = Path(folder)
     content, _ = load_artifact(folder, INDEX)
     try:

@@ -4,23 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
-import pyarrow as pa
-
-from kros.data.arrow import to_numpy
-
-
-def test_nulls_slices_and_chunks() -> None:
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        chunks = []
-        for n in rng.integers(0, 40, size=3):
-            listed = [None if rng.random() < 0.3 else float(v) for v in rng.standard_normal(n)]
-            start = int(rng.integers(0, n + 1))
-            chunks.append(pa.array(listed, pa.float64()).slice(start))
-        column = pa.chunked_array(chunks, pa.float64())
-        np.testing.assert_array_equal(to_numpy(column), column.to_numpy())
-
 
 def test_reading_and_writing_leave_pandas_alone(tmp_path: Path) -> None:
     """Workers start without the half second that pandas costs."""

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from kros.core import limits
-from kros.core.errors import ConfigError, DataError
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, from_pykoop, prepare, read, steps, write_parquet
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
@@ -132,13 +132,6 @@ def test_periods_that_are_none(period: Any) -> None:
         from_arrays({"a": [samples(0)]}, CHANNELS, period)
     with pytest.raises(DataError):
         from_pykoop(np.column_stack([np.zeros(80), samples(0)]), 1, period)
-
-
-@pytest.mark.parametrize("cutoff", [0.0, -1.0, 50.0, 51.0, float("nan"), float("inf")])
-def test_cut_offs_lie_between_zero_and_nyquist(cutoff: float) -> None:
-    population = from_arrays({"a": [samples(0)]}, CHANNELS, 0.01)
-    with pytest.raises(ConfigError, match=r"below the Nyquist frequency of 50 Hz"):
-        prepare(population, [steps.Differentiate("x", "w", cutoff)])
 
 
 def test_resampling_to_more_samples_than_anybody_wants() -> None:

@@ -99,15 +99,6 @@ def test_predictions_stand_where_they_belong() -> None:
     assert np.array_equal(model.predict(X[::-1]), model.predict(X)[::-1])
 
 
-def test_a_trajectory_needs_only_the_first_state() -> None:
-    X = recording()
-    model = regressor().fit(X)
-    hidden = X.copy()
-    first = np.flatnonzero(np.diff(X[:, 0], prepend=-1))
-    hidden[np.setdiff1d(np.arange(len(X)), first), 1:3] = 99.0
-    assert np.allclose(model.predict_trajectory(hidden), X[:, 1:3], atol=1e-9)
-
-
 def test_alpha_is_that_of_the_normal_equations() -> None:
     X, alpha = episode(80), 0.7
     model = KoopmanRegressor(["sin(x0)"], n_inputs=1, alpha=alpha).fit(X)
@@ -117,23 +108,11 @@ def test_alpha_is_that_of_the_normal_equations() -> None:
     assert np.allclose(np.concatenate([model.A_, model.B_], axis=1), U, atol=1e-12)
 
 
-def test_a_diverging_prediction_scores_minus_infinity() -> None:
-    growth = np.array([[1e-3], [0.1], [10.0], [1000.0], [1e5]])
-    model = KoopmanRegressor(["x0**9"], alpha=1e-9).fit(growth)
-    model.A_ = np.array([[2.0, 1.0], [0.0, 0.0]])
-    assert model.set_params(horizon=None).score(growth * 1e3) == -np.inf
-
-
 # ------------------------------------------------------------------------------------------------------------- layouts of rows
 
 
 def test_one_array_is_one_episode() -> None:
     assert is_exact(regressor(episode_feature=False).fit(episode()))
-
-
-def test_episodes_are_not_joined() -> None:
-    assert is_exact(regressor().fit(recording()))
-    assert not is_exact(regressor(episode_feature=False).fit(recording()[:, 1:]))
 
 
 def test_pairs_of_rows_in_any_order() -> None:

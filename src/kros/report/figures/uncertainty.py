@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -82,24 +82,41 @@ def draw_forms(axes: Axes, model: UncertainModel) -> None:
 def weights(run: RunFolder) -> tuple[Figure, str]:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
     chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
-    figure, axes = grid(len(chosen), 3, 2.0, sharex=True)
-    for row, (name, model) in zip(axes, chosen.items(), strict=True):
-        _weights_row(row, model, run.models[name])
-        ratio_panel(row[2], run.unit_residuals[name])
-        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
-        panel.set_title(title)
-    label_below(axes[-1])
+    rows = {n: (model, run.models[n], run.unit_residuals[n]) for n, model in chosen.items()}
     parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
-    return figure, (
+    return weights_figure(rows), (
         "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free "
         f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
     )
 
 
-def _weights_row(row: Sequence[Axes], model: UncertainModel, models: ModelSet | None) -> None:
-    """Draw left weights and right weights."""
-    names = models.inputs if models is not None and model.form in _INPUT_SIDE else ()
+def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResiduals]]) -> Figure:
+    """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
+    figure, axes = grid(len(rows), 3, 2.0, sharex=True)
+    for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
+        _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
+        ratio_panel(row[2], residuals)
+        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
+        panel.set_title(title)
+    label_below(axes[-1])
+    return figure
+
+
+def uncertain_figure(model: UncertainModel) -> Figure:
+    """Draw the weights of an uncertain model, and its largest residual in every form."""
+    figure, axes = grid(1, 3, 2.6, sharex=True)
+    _draw_weights(axes[0], model)
+    draw_forms(axes[0, 2], model)
+    legend(figure, axes[0, 2], 3)
+    for panel, title in zip(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"), strict=True):
+        panel.set_title(title)
+    label_below(axes[0])
+    return figure
+
+
+def _draw_weights(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] = ()) -> None:
+    """Draw left and right weights over the optimal bound."""
     fitted = model.weight.magnitudes(model.freqs_hz)
     cover = in_gauge(model.cover, fitted)
     _side(row[0], model.freqs_hz, fitted.left, cover.left, names)
@@ -162,27 +179,10 @@ def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
 
 
-def uncertain_figure(model: UncertainModel, models: ModelSet | None = None) -> Figure:
-    """Draw forms and weights of an uncertain model, and with its models every unit relative to the weights."""
-    figure, axes = grid(2, 2, 2.4, sharex=True)
-    draw_forms(axes[0, 0], model)
-    legend(figure, axes[0, 0], 3)
-    _weights_row(axes[1], model, models)
-    if models is None:
-        axes[0, 1].remove()
-    else:
-        ratio_panel(axes[0, 1], beside(model, models))
-        axes[0, 1].set_title("units relative to the weights (dB)")
-    axes[0, 0].set_title(f"largest residual (dB), nominal {model.nominal_id}")
-    axes[1, 0].set_title("left weight (dB)")
-    axes[1, 1].set_title("right weight (dB)")
-    label_below(axes[1])
-    return figure
-
-
 def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
-    """Draw the uncertain model of one kind, the first by default."""
+    """Draw the weights of one kind of model, the first by default."""
     name = kind or next(iter(models.sets))
     if name not in models.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
-    return uncertain_figure(models.sets[name], models.models.models(name))
+    model, identified = models.sets[name], models.models.models(name)
+    return weights_figure({name: (model, identified, beside(model, identified))})

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -29,7 +29,6 @@ from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
-Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
 _RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
 
@@ -57,17 +56,17 @@ class Discovery:
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
+def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
     """Describe a folder of text tables or of Parquet files of any layout."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
-    mapping, notes = _names(list(alike), wanted.files)
+    mapping: dict[str, Any] = {"files": _names(list(alike), wanted.files)}
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
-    columns, keys, why = _columns(source, head, list(alike.values()), wanted.period_s)
-    columns = _decided(columns, wanted, ask)
+    columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
+    columns = _decided(columns, wanted)
     mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
     population = read_csv_folder(source, mapping | _exclusion(strange))
-    draft = Discovery(mapping, (), tuple(columns), population, notes | why)
+    draft = Discovery(mapping, (), tuple(columns), population, notes)
     findings = [f"{len(strange)} files are not like the others and left alone: {some(strange)}"] if strange else []
     return _examined(source, draft, findings, [name for name in strange if re.search(mapping["files"], name)], work)
 
@@ -91,17 +90,14 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     return selected
 
 
-def _names(paths: Sequence[str], expression: str | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the key of a mapping that says what names of files mean, and what it rests on."""
+def _names(paths: Sequence[str], expression: str | None) -> str:
+    """Return the expression that says what names of files mean."""
     names = infer_names(paths)
-    if expression is not None:
-        return {"files": expression}, {}
-    if names.other is not None:
+    if expression is None and names.other is not None:
         choice = f"--files '{names.other}' or --files '{names.pattern}'"
         two = f"{some(paths, 3)} can be episodes of one unit or units with one recording each"
         raise ConfigError(f"Names of files: {two}; choose, {choice}.")
-    guess = "a guess from the order of the words in file names: look at the units and episodes below"
-    return {"files": names.pattern}, {} if names.sure else {"files": guess}
+    return names.pattern if expression is None else expression
 
 
 def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
@@ -213,34 +209,26 @@ def _channel(column: TableColumn) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
-def _decided(columns: Sequence[TableColumn], wanted: Wanted, ask: Ask | None) -> list[TableColumn]:
-    """Return the columns with the parts that were named or asked for, else proposed."""
-    decided = assign(columns, wanted.measured, wanted.inputs)
-    if ask is not None and not (wanted.measured and wanted.inputs):
-        decided = list(ask(decided))
-    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
-    for part, (what, option) in needed.items():
-        if not any(c.part is part for c in decided):
-            free = [c for c in decided if c.part is not ColumnPart.TIME]
-            names = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
-            problem = f"no column is {what} by its name; name it, {option} NAME"
-            raise ConfigError(f"Roles: {problem}. The columns are {names}.")
-    if any(c.part is ColumnPart.STATE for c in decided):
-        return decided
-    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
-
-
-def assign(columns: Sequence[TableColumn], measured: Sequence[str], inputs: Sequence[str]) -> list[TableColumn]:
-    """Return the columns with measured states and inputs as named, where any are named."""
+def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
+    """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
     decided = list(columns)
     freed = {ColumnPart.MEASURED: ColumnPart.STATE, ColumnPart.INPUT: ColumnPart.LEFT_OUT}
-    for part, names in ((ColumnPart.MEASURED, measured), (ColumnPart.INPUT, inputs)):
+    for part, names in ((ColumnPart.MEASURED, wanted.measured), (ColumnPart.INPUT, wanted.inputs)):
         places = [_place(decided, name) for name in names]
         if places:
             decided = [replace(c, part=freed[part]) if c.part is part else c for c in decided]
         for i in places:
             decided[i] = replace(decided[i], part=part, why="as named")
-    return decided
+    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
+    for part, (what, option) in needed.items():
+        if not any(c.part is part for c in decided):
+            free = [c for c in decided if c.part is not ColumnPart.TIME]
+            known = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
+            problem = f"no column is {what} by its name; name it, {option} NAME"
+            raise ConfigError(f"Roles: {problem}. The columns are {known}.")
+    if any(c.part is ColumnPart.STATE for c in decided):
+        return decided
+    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
 
 
 def _place(columns: Sequence[TableColumn], name: str) -> int:
@@ -312,8 +300,6 @@ def _too_few(population: Population) -> Iterator[str]:
     if len(units) < 2:
         until = "models can be identified (kros run ... --until identify), and a population takes at least two"
         yield f"one unit ({units[0]}): {until}"
-    elif len(units) < 4:
-        yield f"{len(units)} units: what differs between units is hardly known from so few, and no outlier can be told"
     lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
     if lacks := [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]:
         yield f"not every unit was recorded in every condition: {some(lacks)}"

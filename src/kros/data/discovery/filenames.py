@@ -44,7 +44,6 @@ class FileNames:
     """What the paths of a folder say."""
 
     pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
-    sure: bool  # whether words in the names decided; false where places alone did
     other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
 
 
@@ -64,8 +63,8 @@ def infer_names(paths: Sequence[str]) -> FileNames:
             alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
             numbered = alone and _counts(columns[roles.index(UNIT)])
             episodes: Roles = [EPISODE if role == UNIT else role for role in roles]
-            return FileNames(pattern, sure, _pattern(cut, episodes, ending) if numbered else None)
-    return FileNames(rf"^(?P<unit>.+){ending}$", False)
+            return FileNames(pattern, _pattern(cut, episodes, ending) if numbered else None)
+    return FileNames(rf"^(?P<unit>.+){ending}$")
 
 
 def _counts(words: Sequence[str]) -> bool:

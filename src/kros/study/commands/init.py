@@ -15,7 +15,7 @@ from ...core.files import parse_toml
 from ...core.work import Progress, Work
 from ...data import Population, Role
 from ...data.checks import check_population
-from ...data.discovery.discover import Ask, Discovery, Wanted, discover
+from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
 from ...data.readers.opening import LOOKS, detect_reader
 from ...data.recording import some
@@ -43,7 +43,7 @@ class Initialised:
     findings: tuple[str, ...]
 
 
-def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progress: Progress) -> Initialised:
+def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> Initialised:
     """Write a study for a folder of recordings."""
     if out.exists():
         raise ConfigError(f"Output {out}: exists; name another file, --out FILE, or remove it.")
@@ -57,7 +57,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progres
             raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
         data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
     else:
-        discovery = discover(source, wanted, ask, work)
+        discovery = discover(source, wanted, work)
         data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}
         data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}

@@ -125,7 +125,7 @@ def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure,
 
 def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
     """Draw a row a state: the episode, a part of it, the error over time, and the error's power spectral density."""
-    figure, axes = grid(sum(len(block.states) for block in blocks), 4, 1.05, width_ratios=(1.2, 1, 1.2, 1))
+    figure, axes = grid(sum(len(block.states) for block in blocks), 4)
     first = 0
     for block in blocks:
         panels = axes[first : first + len(block.states)]
@@ -158,10 +158,10 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
         if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
             draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
             freqs, density = error_spectrum(error, signals.sample_period_s)
-            row[3].plot(freqs[1:], density[1:], look.style, color=look.colour, lw=1.0)
+            row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
             frequency_axis(row[3], freqs, "", 4)
     logarithmic(row[3])
-    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size=7)
+    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size="small")
     if signals.band_hz is not None:
         row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 

@@ -11,7 +11,7 @@ from ...uncertainty import OutlierModel
 from ..canvas import Axes, Figure, grid, name_units, note, units_axis
 from ..names import condition_label, number, some_of, words
 from ..run_folder import RunFolder
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 
 
 def scores(run: RunFolder) -> tuple[Figure, str]:
@@ -35,7 +35,7 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
 def scores_figure(conditions: Mapping[str, OutlierModel]) -> Figure:
     """Draw scores with their ranges, a column a condition."""
     units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
-    figure, axes = grid(1, len(conditions), 1.9, sharey=True)
+    figure, axes = grid(1, len(conditions), sharey=True)
     for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):
         _panel(panel, model, units)
         panel.set_title(condition_label(condition))
@@ -50,13 +50,13 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
+        axes.plot([place, place], ends, color=tone.light, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
         (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
             note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
     if np.isfinite(model.threshold_db):
-        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=0.9, ls="--")
+        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
     axes.margins(y=0.15)

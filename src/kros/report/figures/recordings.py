@@ -38,7 +38,7 @@ def _read(run: RunFolder, key: EpisodeKey) -> Shown:
 def signals(run: RunFolder) -> tuple[Figure, str]:
     """Draw one episode in at most two conditions, side by side, with references."""
     shown, channels, targets = recorded_episodes(run)[:2], run.states[:5], references(run.channels)
-    figure, axes = grid(len(channels), len(shown), 1.1, sharey="row", sharex="col")
+    figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
     for column, episode in zip(axes.T, shown, strict=True):
         for i, channel in enumerate(channels):
             if channel.name in targets:
@@ -60,7 +60,7 @@ def population_figure(population: Population) -> Figure:
         raise ConfigError("Plot: the population has no episodes; read some first.")
     key = population.episodes[0]
     values = population.read(key)
-    figure, axes = grid(len(population.channels), 1, 1.1, sharex=True)
+    figure, axes = grid(len(population.channels), 1, sharex=True)
     time_s = np.arange(len(values)) * population.sample_period_s
     for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
         draw_lines(panel, time_s, {channel.name: (line, _RECORDED if channel.role is Role.STATE else _REFERENCE)})
@@ -73,7 +73,7 @@ def population_figure(population: Population) -> Figure:
 def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
     spec = run.calibration.spec
-    figure, axes = grid(1, 1, 2.3)
+    figure, axes = grid(1, 1)
     panel, frequency = axes[0, 0], 0.0
     for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
         freqs, density, frequency = _tracking(run, shown)
@@ -82,7 +82,7 @@ def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     top = 0.5 / run.sample_period_s
     for multiple in range(1, min(6, int(top / frequency)) + 1):
         place = multiple * frequency
-        panel.axvline(place, color=Tone.SOFT.light, lw=0.7, ls=":", zorder=1)
+        panel.axvline(place, color=Tone.SOFT.light, lw=DRAWING.thin, ls=":", zorder=1)
         note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
     panel.set_xlim(0, min(top, 6.6 * frequency))
     panel.set_xlabel("frequency (Hz)")
@@ -124,7 +124,7 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
     """Draw phase, lag and concentration of every unit; units that are set aside are drawn hollow."""
     units = list(calibration.units)
     values = [calibration.units[u] for u in units]
-    figure, axes = grid(1, 3, 1.9)
+    figure, axes = grid(1, 3)
     columns = (
         (np.degrees([v.phase_rad for v in values]), "phase (°)"),
         (np.degrees([v.lag_rad for v in values]), "lag (°)"),
@@ -139,7 +139,7 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
         units_axis(panel, units)
     axes[0, 0].set_ylim(-12, 372)
     axes[0, 0].set_yticks([0, 90, 180, 270, 360])
-    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=0.8, ls="--")
-    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=0.8, ls="--")
+    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
+    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
     axes[0, 2].set_ylim(min(0.7, columns[2][0].min() - 0.02), 1.03)
     return figure

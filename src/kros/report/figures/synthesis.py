@@ -25,7 +25,7 @@ def bode(run: RunFolder) -> tuple[Figure, str]:
     chosen = [m for m in best_models(run.models) if any(n.startswith(f"{m}/") for n in robust)]
     if not chosen:
         raise NotShownError("no robust observer has been synthesized")
-    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
+    figure, axes = grid(1, len(chosen), sharey=True)
     for panel, name in zip(axes[0], chosen, strict=True):
         syntheses = {n: s for n, s in robust.items() if n.startswith(f"{name}/")}
         _panel(panel, _curves(run, name, syntheses), run.models[name])
@@ -56,8 +56,8 @@ def _panel(axes: Axes, curves: Sequence[Curve], models: ModelSet) -> None:
     for label, response, colour, line in curves:
         size = decibel(np.linalg.norm(response, 2, axis=(-2, -1)))
         if np.isfinite(size).any():
-            axes.plot(freqs, size, line, color=colour, lw=1.4, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
+            axes.plot(freqs, size, line, color=colour, label=label)
+    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
     frequency_axis(axes, freqs)
 
 

@@ -49,11 +49,11 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
     text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
-    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
+    figure, axes = grid(1, len(chosen), sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
         for form, (freqs, bound) in published.get(name, {}).items():
-            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
+            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light)
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(figure, axes[0, 0], 3)
@@ -72,10 +72,10 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
     """Draw the bounds of all forms over frequency, the form in use thick."""
     for form, bound in model.bounds.items():
-        width, label = 2.4 if form is model.form else 1.2, words(form.value)
+        width, label = DRAWING.broad if form is model.form else None, words(form.value)
         style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
         axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
+    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
     frequency_axis(axes, model.freqs_hz)
 
 
@@ -92,7 +92,7 @@ def weights(run: RunFolder) -> tuple[Figure, str]:
 
 def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResiduals]]) -> Figure:
     """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
-    figure, axes = grid(len(rows), 3, 2.0, sharex=True)
+    figure, axes = grid(len(rows), 3, sharex=True)
     for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
         _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
         ratio_panel(row[2], residuals)
@@ -105,7 +105,7 @@ def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResidu
 
 def uncertain_figure(model: UncertainModel) -> Figure:
     """Draw the weights of an uncertain model, and its largest residual in every form."""
-    figure, axes = grid(1, 3, 2.6, sharex=True)
+    figure, axes = grid(1, 3, sharex=True)
     _draw_weights(axes[0], model)
     draw_forms(axes[0, 2], model)
     legend(figure, axes[0, 2], 3)
@@ -150,9 +150,9 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     names = [residuals.unit_ids[k] for k in rows]
     lines_of_units(axes, freqs, levels, Tone.BLUE.light, "units", names)
     first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
-    axes.plot(freqs, levels[first], color=Tone.INK.light, lw=1.1)
+    axes.plot(freqs, levels[first], color=Tone.INK.light)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
-    axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
+    axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
     frequency_axis(axes, freqs, "", 4)
 
 

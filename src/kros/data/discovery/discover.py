@@ -22,9 +22,9 @@ from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
 from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
-from ..recording import some, usable
+from ..recording import CHECK, some, usable
 from .dialect import TableHead, look_at
-from .examine import RULE, examine
+from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
@@ -246,15 +246,15 @@ def _examined(
 ) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    examined = examine(population, work)
-    wrong, counts = dict(examined.wrong), examined.counts
+    looks = examine(population, work)
+    wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
+    nan, counts = [s.nan for s in good if s.nan], Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
     if not counts:
-        key, why = next(iter((wrong | examined.nan).items()))
-        raise DataError(f"Looking at {source}: none of {len(population.episodes)} episodes can be used; {key}: {why}.")
-    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
-    findings += examined.nan.values()
+        why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
+        raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
+    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()] + nan
     few = [group for group, n in counts.items() if n < 2]
-    if 2 * len(few) > len(counts) and examined.shortest >= RULE.pieces * RULE.shortest_piece:
+    if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
@@ -263,18 +263,25 @@ def _examined(
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
-    prepare: tuple[dict[str, Any], ...] = ()
-    if examined.resample_s is not None:
-        prepare = ({"step": "resample", "period_s": examined.resample_s},)
-        recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-        text = f"time is uneven: everything is brought to a period of {examined.resample_s:g} s {recorded}"
-        if examined.uneven is not None:
-            key, sample = examined.uneven
-            text += f", the worst step in {_relative(population, source, key)} at sample {sample}"
-        findings.append(text)
-    findings += _too_few(retained)
-    reading, nan = _reading(retained, source), bool(examined.nan)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), nan, reading)
+    prepare, text = _resampling(population, source, good)
+    findings += [*text, *_too_few(retained)]
+    reading = _reading(retained, source)
+    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), bool(nan), reading)
+
+
+def _resampling(
+    population: Population, source: Path, looks: Sequence[EpisodeLook]
+) -> tuple[tuple[dict[str, Any], ...], list[str]]:
+    """Return the step that brings uneven time to one period, and a sentence about it; nothing where time is even."""
+    median, worst = median_period(looks), max(looks, key=lambda s: s.uneven)
+    period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
+    if not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks):
+        return (), []
+    recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
+    text = f"time is uneven: everything is brought to a period of {period_s:g} s {recorded}"
+    if uneven:
+        text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
+    return ({"step": "resample", "period_s": period_s},), [text]
 
 
 def _reading(population: Population, source: Path) -> str:

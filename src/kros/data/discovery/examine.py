@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,7 +12,7 @@ from ...core.errors import DataError
 from ...core.work import Work
 from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import EpisodeKey, Population
-from ..recording import CHECK, check_increasing
+from ..recording import check_increasing
 
 
 @dataclass(frozen=True)
@@ -47,38 +47,19 @@ class EpisodeLook:
     digest: str = ""
 
 
-@dataclass(frozen=True)
-class Examined:
-    """What all episodes look like."""
-
-    wrong: dict[EpisodeKey, str]  # episodes that cannot be used, with the reason
-    resample_s: float | None  # period to resample to, where time is uneven
-    nan: dict[EpisodeKey, str]  # episodes with NaN or infinity, and where
-    counts: Counter[tuple[str, str]]  # usable episodes by unit and condition
-    shortest: int  # samples of the shortest of them
-    uneven: tuple[EpisodeKey, int] | None  # where time is most uneven
-
-
-def examine(population: Population, work: Work | None = None) -> Examined:
-    """Read every episode once, as it was recorded."""
+def examine(population: Population, work: Work | None = None) -> list[EpisodeLook]:
+    """Read every episode once, as it was recorded, and say what is wrong with it alone or beside the others."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
-    median = float(np.median([s.period_s for s in looks if not s.wrong] or [np.nan]))
+    median = median_period(looks)
     looks = [_without_gap(look, median) for look in looks]
-    wrong = {s.key: s.wrong for s in looks if s.wrong}
-    copies = copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong)
-    wrong |= {key: f"a copy of {other}" for key, other in copies}
-    good = [s for s in looks if s.key not in wrong]
-    worst = max((s for s in good if s.uneven[0] > CHECK.time), key=lambda s: s.uneven, default=None)
-    different = any(abs(s.period_s - median) > CHECK.period * median for s in good)
-    return Examined(
-        wrong,
-        resample_s=float(f"{median:.3g}") if worst is not None or different else None,
-        nan={s.key: s.nan for s in good if s.nan},
-        counts=Counter((s.key.unit, s.key.condition) for s in good if not s.nan),
-        shortest=min((s.n_samples for s in good), default=0),
-        uneven=None if worst is None else (worst.key, worst.uneven[1]),
-    )
+    copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
+    return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
+
+
+def median_period(looks: Sequence[EpisodeLook]) -> float:
+    """Return the median of the sampling periods of usable episodes, s."""
+    return float(np.median([s.period_s for s in looks if not s.wrong] or [np.nan]))
 
 
 def _without_gap(look: EpisodeLook, median: float) -> EpisodeLook:

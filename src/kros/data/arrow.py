@@ -1,4 +1,4 @@
-"""Between NumPy and Arrow through bare buffers: `pyarrow.array` and `to_numpy` import pandas, which costs half a second."""
+"""Between NumPy and Arrow through bare buffers: the ways of pyarrow import pandas, which costs half a second."""
 
 from __future__ import annotations
 

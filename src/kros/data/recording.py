@@ -91,7 +91,7 @@ def title(key: EpisodeKey) -> str:
     return f"E{str(key)[1:]}"
 
 
-def some(names: Sequence[str], most: int = 4) -> str:
+def some(names: Sequence[str], most: int = 8) -> str:
     """Return the first of some names for a message, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 

@@ -32,7 +32,7 @@ _BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
-    """Write every figure of a run as PNG and PDF to a folder; return the names of the files, in the order of the report."""
+    """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import floor, isfinite, log10
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
-from ..data.recording import some
 from .theme import Tone
 
 
@@ -154,11 +153,6 @@ def squared(unit: str) -> str:
 def joined(parts: Sequence[str]) -> str:
     """Return a list for a sentence: with commas, and an "and" before the last."""
     return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
-
-
-def some_of(names: Sequence[str], most: int = 8) -> str:
-    """Return the first names of a list, and how many more there are."""
-    return some(names, most)
 
 
 def episode_title(key: EpisodeKey) -> str:

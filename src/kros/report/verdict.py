@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from ..data.recording import some
 from .error_tables import ErrorTable, left_out_tables
 from .facts import Facts
-from .names import BASELINES, condition_label, joined, number, observer_label, some_of, words
+from .names import BASELINES, condition_label, joined, number, observer_label, words
 from .names import split_observer as split
 
 Row = Mapping[str, Any]
@@ -110,7 +111,7 @@ def _numbers(facts: Facts) -> list[Number]:
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
-        notes = [some_of(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
+        notes = [some(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
         numbers.append(Number(str(len(flagged)), f"of {len({r['unit'] for r in rows})}", "units flagged", notes))
     return numbers
 
@@ -174,7 +175,7 @@ def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield _inconclusive(few, rows), "Score against at least 8 units in one condition.", "units"
     remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
     if remarks:
-        yield f"Units with a remark: {some_of(remarks)}.", "See their rows.", "units"
+        yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
 def _inconclusive(rows: Sequence[Row], every: Sequence[Row]) -> str:
@@ -214,7 +215,7 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         action = "Test it in parallel before anything depends on it."
         yield "No certificate at run time covers the observer.", action, "certificates"
     if outside := facts.entry.get("set_outside"):
-        text = f"Outside the set of recorded signals that the certificate covers: {some_of(outside)}."
+        text = f"Outside the set of recorded signals that the certificate covers: {some(outside)}."
         yield text, "Do not rely on the bounds for these units.", "certificates"
     if facts.observers and all(split(name)[1] in BASELINES for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
@@ -236,7 +237,7 @@ def units_text(rows: Sequence[Row]) -> str:
     for row in rows:
         units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
     named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
-    return some_of([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
+    return some([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
 
 
 def certificates(facts: Facts) -> list[str]:

@@ -198,7 +198,7 @@ def _pattern(cut: Cut, roles: Roles, ending: str) -> str:
 
 
 def _group(role: str | None, values: set[str], several: bool) -> str:
-    """Return the expression of what stands at one place or at several."""
+    """Return the expression of the words at one place or at several."""
     if role is None:
         return quoted(next(iter(values)))
     if role == "other":

@@ -175,11 +175,10 @@ class LimitedFile:
         self._given += len(content)
         limit = min(limits.MAX_TEXT_BYTES, max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size))
         if self._given > limit:
-            advice = "which recordings never do; split or unpack it, or raise MAX_TEXT_BYTES or MAX_RATIO in kros.core.limits"
-            problem = (
-                f"unpacks to more than {limit} bytes, {limit / max(self._size, 1):.3g} times its {self._size} bytes"
-            )
-            raise DataError(f"Reading {self._path}: {problem}, {advice}.")
+            advice = "split or unpack it, or raise MAX_TEXT_BYTES or MAX_RATIO in kros.core.limits"
+            ratio = limit / max(self._size, 1)
+            problem = f"unpacks to more than {limit} bytes, {ratio:.3g} times its {self._size} bytes"
+            raise DataError(f"Reading {self._path}: {problem}; {advice}.")
         return content
 
 

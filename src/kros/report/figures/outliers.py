@@ -7,9 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...data.population import natural_key
+from ...data.recording import some
 from ...uncertainty import OutlierModel
 from ..canvas import Axes, Figure, grid, name_units, note, units_axis
-from ..names import condition_label, number, some_of, words
+from ..names import condition_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
 
@@ -26,7 +27,7 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
     rate = number(100 * first.false_alarm_rate, 2)
     text = f"{about}. The threshold has a false-alarm rate of {rate} % for a good unit"
     text += "; with so few units the rate rests on an exponential tail. " if first.extrapolated else ". "
-    text += f"Above it: {some_of(flagged)}." if flagged else "No unit is above it."
+    text += f"Above it: {some(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
     return scores_figure(models), text

@@ -6,10 +6,11 @@ import numpy as np
 
 from ...core.errors import ConfigError
 from ...data.population import OUTLIERS, EpisodeKey, Population, Role
+from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
 from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
-from ..names import Look, episode_title, minus, some_of, squared, words
+from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
@@ -116,7 +117,7 @@ def phase(run: RunFolder) -> tuple[Figure, str]:
     weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
     mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
     text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
-    text += f" Concentration below {DRAWING.concentrated:g}: {some_of(weak)}." if weak else ""
+    text += f" Concentration below {DRAWING.concentrated:g}: {some(weak)}." if weak else ""
     return phase_figure(calibration, run.set_aside), text
 
 

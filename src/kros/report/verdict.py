@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ..data.recording import some
-from .error_tables import ErrorTable, left_out_tables
+from .error_tables import ErrorTable, tables_of
 from .facts import Facts
 from .names import BASELINES, condition_label, joined, number, observer_label, words
 from .names import split_observer as split
@@ -136,7 +136,7 @@ def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
     elif hidden and not_improved(table, facts.deployed, hidden) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
-    left = left_out_tables(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
+    left = tables_of(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
     cells = left[0].cells.get(facts.deployed, {}) if left else {}
     if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."

@@ -175,8 +175,6 @@ def survey(
     episodes = [e for group in groups for e in group.episodes if e.key.unit not in set(chosen.reserve)]
     resolution = {m: min(g.resolution[m] for g in groups) for m in retained.measured}
     facts = replace(_facts(population, retained, episodes, chosen), resolution=resolution)
-    for name, limit in facts.limits.items():
-        log.info("%s is limited at %s.", name, limit)
     for alert in facts.alerts:
         log.warning("%s", alert)
     return retained, facts

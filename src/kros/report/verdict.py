@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ..data.recording import some
-from .error_tables import ErrorTable, tables_of
+from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
 from .names import BASELINES, condition_label, joined, number, observer_label, words
 from .names import split_observer as split
@@ -102,12 +102,12 @@ def _numbers(facts: Facts) -> list[Number]:
     """Return the errors of at most two hidden channels, and how many units are flagged."""
     numbers = []
     for channel in facts.hidden[:2]:
-        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else None
-        if cell is not None and cell.mean is not None:
+        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
+        if cell.mean is not None:
             notes = [f"RMS {number(cell.rms)} {facts.unit(channel)}".strip()] if cell.rms else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
-            true = f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}"
-            notes += [true] if cell.true_mean else []
+            if cell.true_mean:
+                notes.append(f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)

@@ -52,7 +52,7 @@ class Signals:
     @classmethod
     def of(cls, run: RunFolder) -> Signals:
         """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
-        size = DRAWING.zoom if run.calibrated else len(run.shown[0].time_s) // 8
+        size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].time_s) // 8
         band = run.evaluation.get("band_hz")
         return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 

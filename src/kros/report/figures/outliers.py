@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ...data.population import natural_key
@@ -16,7 +14,7 @@ from ..theme import DRAWING, Tone
 
 
 def scores(run: RunFolder) -> tuple[Figure, str]:
-    """Draw one point a unit with its range, flagged ones in the colour of alarm."""
+    """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
     models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
     first = next(iter(models.values()))
     flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
@@ -30,19 +28,14 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
     text += f"Above it: {some(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
-    return scores_figure(models), text
-
-
-def scores_figure(conditions: Mapping[str, OutlierModel]) -> Figure:
-    """Draw scores with their ranges, a column a condition."""
-    units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
-    figure, axes = grid(1, len(conditions), sharey=True)
-    for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):
+    units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
+    figure, axes = grid(1, len(models), sharey=True)
+    for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
         _panel(panel, model, units)
         panel.set_title(condition_label(condition))
         units_axis(panel, units)
     axes[0, 0].set_ylabel("score (dB)")
-    return figure
+    return figure, text
 
 
 def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:

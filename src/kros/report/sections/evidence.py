@@ -32,27 +32,20 @@ def recordings(facts: Facts) -> Section:
     text += f" Set aside as outliers: {some(aside)}." if aside else ""
     text += f" Dropped for bad samples: {some(study['dropped'])}." if study.get("dropped") else ""
     channels, sensor = study.get("channels", {}), study.get("sensor", {})
-    roles = [_role(c, facts) for c in channels]
+    roles = dict.fromkeys(study.get("inputs", ()), "input") | dict.fromkeys(facts.measured, "measured")
     declared = [", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v) for c in channels]
     columns = [
         Column("channel", [words(c) for c in channels]),
         Column("unit", [u or "–" for u in channels.values()]),
-        Column("role", roles),
+        Column("role", [roles.get(c, "estimated") for c in channels]),
         Column("resolution", [study.get("resolution", {}).get(c) for c in channels]),
         Column("declared sensor", declared),
-        Column("limits", [_limit(study.get("limits", {}).get(c)) for c in channels]),
+        Column("limits", [limit_text(study.get("limits", {}).get(c)) for c in channels]),
     ]
     return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
 
 
-def _role(channel: str, facts: Facts) -> str:
-    """Return whether a channel is an input, measured at run time or estimated."""
-    if channel in facts.study.get("inputs", ()):
-        return "input"
-    return "measured" if channel in facts.measured else "estimated"
-
-
-def _limit(limit: Mapping[str, Any] | None) -> str:
+def limit_text(limit: Mapping[str, Any] | None) -> str:
     """Return a limit and where units were seen at it."""
     if limit is None:
         return ""

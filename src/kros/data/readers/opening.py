@@ -16,12 +16,7 @@ from .csv_mapping import CsvMapping
 from .motor_drive_raw import is_raw_layout, read_motor_drive_raw
 from .parquet import INDEX, read_parquet
 
-LOOKS = {
-    "motor-drive-raw": "holds a folder 'population' or 'outliers'",
-    "parquet": "holds population.json",
-    "csv": "holds CSV files",
-}
-READERS = tuple(LOOKS)
+READERS = ("motor-drive-raw", "parquet", "csv")
 
 
 def detect_reader(source: Path | str) -> str | None:
@@ -66,7 +61,7 @@ def read(
     ConfigError
         Unknown reader or option, invalid mapping or step.
     DataError
-        No such folder, an empty one, one that another reader fits, or recordings that cannot be used.
+        No such folder, an empty one, or recordings that cannot be used.
 
     Examples
     --------

@@ -17,7 +17,7 @@ from ...data import Population, Role
 from ...data.checks import check_population
 from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
-from ...data.readers.opening import LOOKS, detect_reader
+from ...data.readers.opening import detect_reader
 from ...data.recording import some
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
@@ -53,7 +53,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> I
     reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            says = f"it {LOOKS[reader]}, which says what channels are"
+            says = f"these are {reader} recordings, which say what channels are"
             raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
         data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
     else:

@@ -23,11 +23,11 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.files import whole_folder
-from ..arrow import from_numpy
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import ChannelMapping, CsvMapping
+from .tables import from_numpy
 
 
 @dataclass(frozen=True)

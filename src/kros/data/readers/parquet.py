@@ -32,12 +32,11 @@ from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, whole_folder
-from ..arrow import from_numpy, repeated, to_numpy
 from ..checks import check_structure, refuse_copies, usable_episodes
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
-from .tables import BLOCK
+from .tables import BLOCK, from_numpy, repeated, to_numpy
 
 logger = logging.getLogger(__name__)
 

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
-from ..arrow import to_numpy
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -277,3 +276,33 @@ def seconds_of(column: Any, order: str) -> Array:
     good = np.flatnonzero(~bad)
     since = 10**9 * (whole - (whole[good[0]] if good.size else 0)) + number("fraction")
     return np.where(bad, np.nan, 1e-9 * since)
+
+
+# Between NumPy and Arrow through bare buffers: the ways of pyarrow import pandas, which costs half a second.
+
+
+def from_numpy(values: npt.NDArray[Any]) -> Any:
+    """Return an Arrow array without nulls that shares the memory of contiguous numbers."""
+    import pyarrow as pa
+
+    return pa.Array.from_buffers(
+        pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(np.ascontiguousarray(values))]
+    )
+
+
+def repeated(text: str, count: int) -> Any:
+    """Return a dictionary-encoded Arrow array that holds one text `count` times."""
+    import pyarrow as pa
+
+    content = text.encode()
+    offsets = np.array([0, len(content)], np.int32)
+    dictionary = pa.StringArray.from_buffers(1, pa.py_buffer(offsets), pa.py_buffer(content))
+    return pa.DictionaryArray.from_arrays(from_numpy(np.zeros(count, np.int32)), dictionary)
+
+
+def to_numpy(column: Any) -> npt.NDArray[np.float64]:
+    """Return the numbers of a float64 Arrow column, NaN for nulls."""
+    import pyarrow.compute as pc
+
+    missing = from_numpy(np.array([np.nan]))[0]
+    return np.asarray(np.from_dlpack(pc.fill_null(column, missing).combine_chunks()))

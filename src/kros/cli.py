@@ -100,8 +100,8 @@ def init(
 
     wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
     with make_progress(False) as progress:
-        study = init_study(folder, out, wanted, progress)
-    _say(study.lines)
+        lines = init_study(folder, out, wanted, progress)
+    _say(lines)
 
 
 @app.command()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -264,7 +264,7 @@ def _examined(
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good)
-    findings += [*text, *_too_few(retained)]
+    findings += [*text, *_lacking(retained)]
     reading = _reading(retained, source)
     return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), bool(nan), reading)
 
@@ -301,12 +301,9 @@ def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
     return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
 
 
-def _too_few(population: Population) -> Iterator[str]:
-    """Yield what there is too little of."""
-    units, counts = population.unit_ids, {(u, c): len(keys) for u, c, keys in population.groups()}
-    if len(units) < 2:
-        until = "models can be identified (kros run ... --until identify), and a population takes at least two"
-        yield f"one unit ({units[0]}): {until}"
-    lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
-    if lacks := [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]:
-        yield f"not every unit was recorded in every condition: {some(lacks)}"
+def _lacking(population: Population) -> list[str]:
+    """Report units that were not recorded in every condition."""
+    recorded = {(u, c) for u, c, _ in population.groups()}
+    lacking = {u: [c for c in population.conditions if (u, c) not in recorded] for u in population.unit_ids}
+    lacks = [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]
+    return [f"not every unit was recorded in every condition: {some(lacks)}"] if lacks else []

@@ -90,15 +90,6 @@ def test_the_score_is_that_of_predictions_one_by_one() -> None:
     assert model.set_params(horizon=h).score(X) == pytest.approx(r2, abs=1e-12)
 
 
-def test_predictions_stand_where_they_belong() -> None:
-    X = recording()
-    model = regressor().fit(X)
-    inside = np.flatnonzero(np.diff(X[:, 0]) == 0)
-    assert np.allclose(model.predict(X)[inside], X[inside + 1, 1:3], atol=1e-12)
-    assert np.allclose(model.predict_trajectory(X), X[:, 1:3], atol=1e-9)
-    assert np.array_equal(model.predict(X[::-1]), model.predict(X)[::-1])
-
-
 def test_alpha_is_that_of_the_normal_equations() -> None:
     X, alpha = episode(80), 0.7
     model = KoopmanRegressor(["sin(x0)"], n_inputs=1, alpha=alpha).fit(X)

@@ -101,6 +101,17 @@ max_order, tolerance_db and false_alarm_rate.
     uncertainty.nominal uncertainty.max_order uncertainty.tolerance_db uncertainty.false_alarm_rate
 Flagged units are no longer dropped by a study itself; name them under data.exclude.
     uncertainty.drop_outliers
+Classes of single results of quantification are no longer public; use what quantify, choose_nominal, fit_magnitude and
+score_outliers return.
+    kros.uncertainty.Cover kros.uncertainty.FittedMagnitude kros.uncertainty.NominalChoice kros.uncertainty.OutlierScore
+    kros.uncertainty.Weight
+Bounds of residuals over every nominal are no longer a function; use sigma_max of residual, or choose_nominal.
+    kros.uncertainty.bounds
+Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
+response data, with from_control for transfer functions and uncertainty_to_control for the result.
+    kros.interop.quantify_models
+Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
+    kros.uncertainty.VariationAndNoise kros.uncertainty.variation_and_noise
 What the fit of a weight is made of is no longer public; use quantify.
     kros.uncertainty.ResidualSystems kros.uncertainty.fit_weight kros.uncertainty.optimal_cover
     kros.uncertainty.FitSettings

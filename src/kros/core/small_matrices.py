@@ -105,9 +105,3 @@ def pseudo_inverse_first(matrices: Array) -> Array:
     if weak.any():
         out[:, :, weak] = entries_first(np.linalg.pinv(np.moveaxis(columns[:, :, weak], -1, 0)))
     return out
-
-
-def lower_factor(pseudo_inverse: Array) -> Array:
-    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s."""
-    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
-    return entries_first(np.conj(np.swapaxes(R, -1, -2)))

@@ -5,16 +5,15 @@ kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
-from ..uncertainty import Form, ResponseUncertainty, UncertainModel, quantify
+from ..uncertainty import ResponseUncertainty, UncertainModel
 
 try:
     import control
@@ -46,9 +45,10 @@ class UncertaintyForControl:
     Examples
     --------
     >>> import control
-    >>> from kros.interop import quantify_models
-    >>> lags = [control.tf([1 - pole], [1, -pole], 0.01) for pole in (0.88, 0.9, 0.91)]
-    >>> found = quantify_models(lags, "additive")
+    >>> import kros
+    >>> from kros.interop import uncertainty_to_control
+    >>> lags = [control.ss([[pole]], [[1 - pole]], [[1]], [[0]], 0.01) for pole in (0.88, 0.9, 0.91)]
+    >>> found = uncertainty_to_control(kros.quantify(lags, "additive"))
     >>> found.model.nominal_id, found.nominal.ninputs, found.left.dt
     ('1', 1, 0.01)
     """
@@ -143,7 +143,7 @@ def from_control(system: Any) -> StateSpace:
     >>> from_control(control.tf([1.0], [1.0, -0.5], 0.01)).A.tolist()
     [[0.5]]
     """
-    if not is_system(system):
+    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
         needs = "needs a control.StateSpace or control.TransferFunction"
         raise DimensionError(f"from_control: {needs}, found {type(system).__name__}.")
     if system.dt is None or system.dt is True:
@@ -153,11 +153,6 @@ def from_control(system: Any) -> StateSpace:
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
     return StateSpace(A, B, C, D, float(system.dt))
-
-
-def is_system(model: Any) -> bool:
-    """Tell whether a model is known at every frequency."""
-    return isinstance(model, (control.StateSpace, control.TransferFunction))
 
 
 def _realised(model: Any) -> StateSpace:
@@ -224,64 +219,6 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
         model=model,
         certificate=certificate,
     )
-
-
-def quantify_models(
-    models: Sequence[Any] | Mapping[str, Any],
-    form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
-    freqs_hz: npt.ArrayLike | None = None,
-    **options: Any,
-) -> UncertaintyForControl:
-    """Quantify how models of python-control differ from a nominal one.
-
-    Parameters
-    ----------
-    models : sequence or mapping of control.StateSpace, control.TransferFunction or control.FRD
-        At least two, with names where it is a mapping; all with the same outputs, inputs and time, and all systems or
-        all response data.
-    form : Form or str
-    freqs_hz : array_like, shape (frequency,), Hz, optional
-        Response data bring their own.
-    **options
-        Of `kros.uncertainty.quantify`: ``nominal`` (also as a system or response data), ``output_scale`` and others.
-
-    Returns
-    -------
-    UncertaintyForControl
-
-    Raises
-    ------
-    DimensionError
-        Outputs, inputs, time or frequencies differ.
-    DataError
-        Fewer than two models, unstable or improper ones, NaN.
-    ConfigError
-        Frequencies given twice; unknown forms.
-
-    Examples
-    --------
-    >>> import control
-    >>> from kros.interop import quantify_models
-    >>> lags = [control.tf([gain], [1, 1]) for gain in (0.9, 1.0, 1.2)]
-    >>> found = quantify_models(lags, "output_multiplicative")
-    >>> found.model.nominal_id, found.left.dt, round(float(abs(found.left(1j))), 6)
-    ('1', 0.0, 0.2)
-    """
-    if is_system(models) or not isinstance(models, Sequence | Mapping):
-        raise DimensionError(f"quantify_models: found one model, {type(models).__name__}; give a list of at least two.")
-    if not models:
-        raise DataError("quantify_models: found no models; give at least two.")
-    if isinstance(models, Mapping):
-        options["unit_ids"], models = tuple(models), list(models.values())
-    kinds = {is_system(model) for model in models}
-    if len(kinds) > 1 or not (kinds == {True} or all(hasattr(model, "frdata") for model in models)):
-        names = sorted({type(model).__name__ for model in models})
-        problem = f"found {' and '.join(names)} in one list"
-        raise DimensionError(f"quantify_models: {problem}; give all as systems or all as control.FRD.")
-    if is_system(options.get("nominal")):
-        options["nominal"] = from_control(options["nominal"])
-    systems = [from_control(model) for model in models] if kinds == {True} else models
-    return uncertainty_to_control(quantify(systems, form, freqs_hz, **options))
 
 
 def _label(name: str) -> str:

@@ -44,7 +44,7 @@ class LoadSettings:
     corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
     limit: float | None = None  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
-    start_trust: float = 1e-6  # of the estimator; the load of the first sample is in its tracking error
+    start_trust: float = 1e-4  # of the estimator; the load of the first sample is in its tracking error
 
 
 def load_observer(

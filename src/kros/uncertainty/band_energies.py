@@ -28,7 +28,6 @@ from ..core.linalg import adjoint
 from .settings import BANDS
 
 Array = npt.NDArray[Any]
-# of the largest energy, in every direction: the iteration needs its square above rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +39,8 @@ class BandEnergies:
 
     def __post_init__(self) -> None:
         edges, energy = check_edges(self.edges), np.asarray(self.energy, dtype=complex)
-        if energy.ndim < 3 or energy.shape[-3] != len(edges) - 1 or energy.shape[-1] != energy.shape[-2]:
-            raise DimensionError(
-                f"Band energies: needs (..., {len(edges) - 1}, n, n) for these bands, found {energy.shape}."
-            )
+        if energy.ndim < 3 or energy.shape[-3:] != (len(edges) - 1, *energy.shape[-1:] * 2):
+            raise DimensionError(f"Band energies: needs (..., {len(edges) - 1} bands, n, n), found {energy.shape}.")
         object.__setattr__(self, "edges", edges)
         object.__setattr__(self, "energy", energy)
 
@@ -110,21 +107,17 @@ def cover(energies: Array, weight: Array | None = None) -> Array:
 
 def _least(E: Array) -> Array:
     """Return the iteration's ``sum_k E_k Y_k`` in every band, for matrices (b, k, n, n)."""
-    count, many, n = E.shape[:3]
-    found, left = np.empty((count, n, n), complex), np.arange(count)
+    _, many, n = E.shape[:3]
     G = np.broadcast_to(np.eye(n) / np.sqrt(many), E.shape).astype(complex)  # Y_k = G_k^H G_k
-    for turn in range(1, BANDS.iterations + 1):
-        rows = (G @ E).reshape(len(E), many * n, n)
-        G = (rows @ _power(adjoint(rows) @ rows, -0.5)).reshape(E.shape)
-        if turn % BANDS.turns and turn < BANDS.iterations:
-            continue
-        found[left] = now = (E @ (adjoint(G) @ G)).sum(axis=1)
-        root = _power(now, -0.5)[:, None]
-        on = np.linalg.eigvalsh(root @ E @ root)[..., -1].max(axis=1) > BANDS.enough
-        if not on.any():
+    for _ in range(0, BANDS.iterations, BANDS.turns):
+        for _ in range(BANDS.turns):
+            rows = (G @ E).reshape(len(E), many * n, n)
+            G = (rows @ _power(adjoint(rows) @ rows, -0.5)).reshape(E.shape)
+        covers = (E @ (adjoint(G) @ G)).sum(axis=1)
+        root = _power(covers, -0.5)[:, None]
+        if np.linalg.eigvalsh(root @ E @ root)[..., -1].max() <= BANDS.enough:
             break
-        left, E, G = left[on], E[on], G[on]
-    return found
+    return np.asarray(covers)
 
 
 def _touching(M: Array, E: Array) -> Array:

@@ -8,9 +8,10 @@ import numpy as np
 
 from ...core.errors import ConfigError
 from ...identify import ModelSet
-from ...uncertainty import Cover, Form, UncertainModel, bounds
+from ...uncertainty import Form, UncertainModel, residual, sigma_max
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals
+from ...uncertainty.weights.cover import Cover
 from ..canvas import (
     Array,
     Axes,
@@ -66,7 +67,8 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
     response = models.scaled_responses(freqs, model.unit_ids)
     rows = {form: model.nominals.get(form) for form in _PUBLISHED}
     nominals = {f: model.unit_ids.index(unit) if unit in model.unit_ids else 0 for f, unit in rows.items()}
-    return {f: (freqs, bounds(f, response, paper=True, nominals=[row])[0]) for f, row in nominals.items()}
+    sizes = {f: sigma_max(residual(f, response[row], response, paper=True)) for f, row in nominals.items()}
+    return {f: (freqs, np.delete(size, nominals[f], axis=0).max(axis=0)) for f, size in sizes.items()}
 
 
 def draw_forms(axes: Axes, model: UncertainModel) -> None:

@@ -61,7 +61,7 @@ def worst_case_h2(
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
     fit : callable, optional
-        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
+        ``fit(freqs_hz, magnitude, dt, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
         default `kros.uncertainty.fit_magnitude`.
     bounded : bool
         False: only the design, neither certified nor bounded from below, for those who design many and compare them on
@@ -95,7 +95,7 @@ def worst_case_h2(
 
         fit = fit_magnitude
     channels = Channels(problem, design_grid(problem))
-    order = {"order": None, "max_order": max_order, "tolerance_db": tolerance_db}
+    order = {"max_order": max_order, "tolerance_db": tolerance_db}
     shaping = channels.shaping(channels.average(), partial(fit, **order), "above")
     start = time.perf_counter()
     controller = design(problem, shaping)
@@ -147,7 +147,9 @@ def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
     orders, bounds = sorted({min(order, max_order) for order in _BOUND_ORDERS}), []
     for order, spectrum in product(orders, spectra):
-        shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, order=order), "below"), spectrum)
+        shaping = proofs.lowered(
+            apart.shaping(spectrum, partial(fit, max_order=order, tolerance_db=0.0), "below"), spectrum
+        )
         plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
         squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
         bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))

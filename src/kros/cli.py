@@ -8,7 +8,6 @@ become messages in `kros.edge`.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -100,28 +99,9 @@ def init(
     from .study.engine.progress import make_progress
 
     wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
-    ask = _ask_parts if _on_terminal() else None
-    with make_progress(False, asks=ask is not None) as progress:
-        study = init_study(folder, out, wanted, ask, progress)
-    _say(study.lines)
-
-
-def _on_terminal() -> bool:
-    return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _ask_parts(columns: Any) -> Any:
-    """Ask which columns are measured and which are inputs; Return takes what is proposed."""
-    from .data.discovery.discover import assign
-    from .data.discovery.roles import ColumnPart
-    from .study.commands.init import column_lines
-
-    _say(column_lines(columns))
-    answers = []
-    for part, what in ((ColumnPart.MEASURED, "Measured states"), (ColumnPart.INPUT, "Inputs")):
-        proposed = ", ".join(c.name for c in columns if c.part is part)
-        answers.append([n for n in typer.prompt(what, default=proposed).replace(",", " ").split() if n])
-    return assign(columns, *answers)
+    with make_progress(False) as progress:
+        lines = init_study(folder, out, wanted, progress)
+    _say(lines)
 
 
 @app.command()

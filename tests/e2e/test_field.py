@@ -173,7 +173,7 @@ def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
         assert not out.exists()
 
     refused("position", "'rad'", "'deg'", "scale")
-    refused("looks like csv", "TOML with [data]", data=tmp_path / "logged")
+    refused("there is no file", "TOML with [data]", data=tmp_path / "logged")
     text = data.read_text().replace("deg", "rad")
     data.write_text(text.replace('{ name = "target_velocity", role = "input", column = "target_velocity" },', ""))
     refused("target_velocity is missing")

@@ -54,7 +54,7 @@ class ConfigError(KrosError, ValueError):
     Examples
     --------
     >>> from kros.core import ConfigError
-    >>> from kros.data.steps import parse_steps
+    >>> from kros.data.prepare import parse_steps
     >>> try:
     ...     parse_steps([{"step": "trim", "stat": 1000}])
     ... except ConfigError as error:

@@ -75,7 +75,7 @@ Random members of the uncertain set are no longer drawn in a study; the certific
 shows disturbed measurements.
     kros.evaluate.MonteCarlo kros.evaluate.sample_errors evaluate.monte_carlo
 Readers of one format are no longer public; use kros.read, which finds the format or is told it.
-    kros.data.read_csv_folder kros.data.read_motor_drive_raw
+    kros.data.read_csv_folder kros.data.read_motor_drive_raw kros.data.read_parquet
 The check of a population and the class of a split are no longer public; kros.identify checks, split_episodes splits.
     kros.data.Split kros.data.check_population
 The function run_study is no longer part of kros; use kros.run, which takes a study too.
@@ -158,6 +158,14 @@ status, and let kros.synthesize make the others.
     kros.observer.run_observers
 Errors of single units against the bound are no longer public; kros.synthesize checks them, the design has bound_holds.
     kros.synthesis.UnitCheck kros.synthesis.check_units
+The raw layout of motor drives is no longer written by a public function; use kros simulate --format raw.
+    kros.data.write_raw
+Tables of preparation steps are no longer parsed by a public function; use kros.read, which takes them as prepare.
+    kros.data.steps.parse_steps
+Report and figures of a run are no longer written by public functions; use kros report and kros figures.
+    kros.report.render kros.report.write_figures
+Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
+    kros.interop.models_to_control
 """
 REMOVED = tuple(
     (" ".join(sentence.split()), " ".join(places.split()))

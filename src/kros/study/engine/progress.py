@@ -73,9 +73,9 @@ def _finished(stage: str, seconds: float, skipped: bool) -> str:
 
 
 @contextmanager
-def make_progress(quiet: bool, asks: bool = False) -> Iterator[Progress]:
-    """Return the progress listener that fits where standard error goes; bars would hide questions."""
-    if quiet or asks:
+def make_progress(quiet: bool) -> Iterator[Progress]:
+    """Return the progress listener that fits where standard error goes."""
+    if quiet:
         yield Progress()
     elif not sys.stderr.isatty():
         yield Lines()

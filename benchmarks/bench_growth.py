@@ -18,7 +18,7 @@ from kros.identify.factors import reduce_episode
 from kros.identify.refine import refine_population
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf
-from kros.uncertainty import bounds, choose_nominal, fit_magnitude, quantify
+from kros.uncertainty import choose_nominal, fit_magnitude, quantify, residual, sigma_max
 from kros.uncertainty.weights.cover import optimal_cover
 
 FORM = "inverse_input_multiplicative"
@@ -76,7 +76,7 @@ def nominal(units: int, freqs: int) -> Work:
 
 def pairs(units: int, freqs: int) -> Work:
     G = problems.responses(units, freqs)
-    return lambda: bounds(FORM, G)
+    return lambda: [sigma_max(residual(FORM, one, G)) for one in G]
 
 
 def response(units: int, freqs: int) -> Work:
@@ -97,7 +97,7 @@ def magnitude(freqs: int) -> Work:
 
 def uncertain_model(units: int) -> Work:
     systems = problems.lags(units)
-    return lambda: quantify(systems, max_max_order=3, tolerance_db=0.0)
+    return lambda: quantify(systems, max_order=3, tolerance_db=0.0)
 
 
 CURVES: dict[str, dict[str, tuple[Callable[[int], Work], tuple[int, ...]]]] = {

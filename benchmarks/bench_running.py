@@ -17,8 +17,8 @@ import pytest
 from kros.core.lti import StateSpace, gain
 from kros.data import EpisodeBatch
 from kros.lifting import Lifting
-from kros.observer import EstimatorSettings, Monitor, Observer, Recordings, Seen, identify_estimator
-from kros.observer.monitor import octaves
+from kros.observer import EstimatorSettings, Observer, Recordings, Seen, identify_estimator
+from kros.observer.monitor import Monitor, octaves
 from kros.plants import HarmonicDrivePopulation
 from kros.synthesis import Injection
 

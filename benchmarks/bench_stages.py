@@ -24,12 +24,13 @@ from problems import DT, QUADRATIC
 
 from kros.core import StateSpace, h2_norm, hinf_norm
 from kros.core.frequency import log_grid
-from kros.data import read, write_raw
+from kros.data import read
+from kros.data.readers.motor_drive_raw import write_raw
 from kros.identify import edmd, free_run
 from kros.identify.factors import reduce_episode
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf, mixed
-from kros.uncertainty import bounds, choose_nominal, fit_magnitude
+from kros.uncertainty import choose_nominal, fit_magnitude
 from kros.uncertainty.weights.bilinear import BilinearAxis
 from kros.uncertainty.weights.cover import optimal_cover
 
@@ -185,7 +186,7 @@ def nominals() -> Stage:
 
 def covers() -> Stage:
     G = problems.responses(10, 20, outputs=2)
-    nominal = int(np.argmin(bounds("additive", G).max(axis=1)))
+    nominal = choose_nominal(G, "additive").index
     E = np.delete(G, nominal, axis=0) - G[nominal]
 
     def ours() -> Any:

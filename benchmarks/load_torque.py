@@ -26,8 +26,9 @@ from kros.evaluate.errors import error_spectrum
 from kros.identify import PhaseSpec
 from kros.identify.calibration import find_segments, resolve_branches, unit_phase
 from kros.lifting import Lifting
-from kros.motor_drive import AngleLoad, LoadSettings, TorqueScale, load_observer
-from kros.motor_drive.signals import load_accuracy, low_passed, without_level
+from kros.motor_drive import AngleLoad
+from kros.motor_drive.observer import LoadSettings, load_observer
+from kros.motor_drive.signals import TorqueScale, load_accuracy, low_passed, without_level
 from kros.observer import Observer, Recordings, identify_estimator, relift_certificate, run_observer
 from kros.observer.residual.models import one_step_rows
 from kros.observer.residual.one_step import one_step_residual

@@ -29,6 +29,7 @@ from kros.design.methods.gains import OpenLoop
 from kros.design.methods.robust import Mixed
 from kros.design.synthesize import tasks_of
 from kros.design.task import DesignTask
+from kros.design.validation import percent_of
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -111,7 +112,7 @@ def solve(task: DesignTask) -> tuple[str, float, bool]:
         replace(task.problem, injection=result.synthesis.injection),
         gain(np.zeros((task.models.lifting.n_lifted, len(task.models.measured))), task.models.sample_period_s),
     )
-    error, free = judge.percent(result.observer), judge.percent(task.observer(task.open_loop()))
+    error, free = percent_of([result.observer, task.observer(task.open_loop())], judge)
     return (
         f"{n_states:2d} states, K {found.controller.n_states:2d} {found.status.value:10s} {used:6.2f} s ({wall:6.2f} s wall) {found.solver:9s} "
         f"H2 {found.h2_norm:.4g} Hinf {found.hinf_norm:.4f} worst case {found.worst_case_h2:.4g} (open {nothing:.4g}) "

@@ -22,15 +22,14 @@ from kros.data import EpisodeBatch, EpisodeKey
 from kros.evaluate.errors import summarise
 from kros.lifting import Lifting
 from kros.observer import (
-    ExtendedKalman,
-    FilteredDifference,
     Observer,
     Runtime,
     run_observer,
-    run_observers,
-    track_parameter,
 )
+from kros.observer.baselines.difference import FilteredDifference
+from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.baselines.learned import Moments
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT = 0.001
@@ -97,9 +96,6 @@ def main() -> None:
     timed(
         "an observer with a delay of 3 samples and limits",
         lambda: every(lambda block: run_observer(late, block.y, block.u, block.phase)),
-    )
-    timed(
-        "phase-locked loop, 32 episodes", lambda: track_parameter(observer(KOOPMAN, 9), block.y, block.u, block.phase)
     )
 
 

@@ -21,8 +21,7 @@ import numpy as np
 import kros
 from kros.core.norms import hinf_norm
 from kros.core.work import Work
-from kros.identify import KoopmanMatrices, ModelSet, free_run
-from kros.identify.refine.model import Refinement
+from kros.identify import ModelSet, free_run
 from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
@@ -66,20 +65,14 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
     """Return errors, ratios and weights of one study."""
     sets = {name: context.identified.models(name) for name in context.identified.kinds}
     errors = {name: percent(context, models) for name, models in sets.items()}
-    refined = {name: Refinement.load(context.store.path("refinement", name)) for name in ("koopman", "linear")}
-    pooled = {name: percent(context, sets[name], found.pooled) for name, found in refined.items()}
     middle = {name: np.median(e, axis=0) for name, e in errors.items()}
     found: dict[str, Any] = {
         "identify_s": round(metrics["timing_s"]["identify"], 1),
         "quantify_s": round(metrics["timing_s"]["quantify"], 1),
     }
     found |= {name: rounded(value) for name, value in middle.items()}
-    found |= {f"{name}/pooled": rounded(np.median(value, axis=0)) for name, value in pooled.items()}
     found["ratio"] = rounded(middle["koopman"] / middle["koopman_edmd"])
     found["koopman_to_linear"] = round(float(middle["koopman"][-1] / middle["linear"][-1]), 3)
-    found["pooled_to_own_edmd_worst"] = {
-        kind: rounded(np.max(pooled[kind] / errors[f"{kind}_edmd"], axis=0)) for kind in ("koopman", "linear")
-    }
     for name in ("koopman", "linear"):
         uncertain = UncertainModel.load(context.store.path("uncertainty", name))
         weight = metrics["uncertainty"][name]["weight"]
@@ -88,18 +81,15 @@ def facts(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
             "fitted_db": round(20 * np.log10(hinf_norm(uncertain.weight.right @ uncertain.weight.left)), 2),
             "overbound_db": round(weight["overbound_db_max"], 2),
             "structure": weight["structure"],
-            "strength": refined[name].strength,
-            "converged": int(refined[name].converged.sum()),
         }
     return found
 
 
-def percent(context: Context, models: ModelSet, pooled: KoopmanMatrices | None = None) -> np.ndarray:
-    """Return the free-run error of every unit on its held-out episodes, with its own model or the pooled one, shape (unit, n)."""
+def percent(context: Context, models: ModelSet) -> np.ndarray:
+    """Return the free-run error of every unit on its held-out episodes, shape (unit, n)."""
     calibration = context.identified.calibration
     out = np.zeros((len(models.unit_ids), models.lifting.n_states))
     for row, unit in enumerate(models.unit_ids):
-        A, B = (models.A[row], models.B[row]) if pooled is None else (pooled.A, pooled.B)
         parts = [
             context.population.read_parts(key) for key in context.facts.keys("test", unit, context.facts.identify_on)
         ]
@@ -109,7 +99,7 @@ def percent(context: Context, models: ModelSet, pooled: KoopmanMatrices | None =
             if not models.lifting.parameters or calibration is None
             else {"phase": np.full(len(x), calibration.units[unit].phase_rad)}
         )
-        run = free_run(A, B, models.lifting, own, x[:, 0], u)
+        run = free_run(models.A[row], models.B[row], models.lifting, own, x[:, 0], u)
         out[row] = np.mean(100 * np.sqrt(np.mean((run - x) ** 2, axis=1)) / np.abs(x).max(axis=1), axis=0)
     return out
 

@@ -16,20 +16,36 @@ import ctypes
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from kros.export import CompiledObserver, HeldOut, export_c
+from kros.data import EpisodeBatch
+from kros.evaluate.sensor import as_arriving
+from kros.export import CompiledObserver, export_c
 from kros.export.c99.numbers import Source
-from kros.observer import Observer, run_observer, sample_status, track_parameter
-from kros.study.commands import export as exporting
+from kros.identify import IdentifiedModels
+from kros.observer import Observer, run_observer
+from kros.observer.screen import screened
+from kros.observer.simulate import Course
+from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
 from kros.study.engine.run_folder import open_finished
+from kros.study.stages.read import open_source
 
 TURN = 2 * np.pi
 LIMIT, UNCERTIFIED = 4, 8
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Held-out recordings: what arrives, (n_samples, batch, q) and (n_samples, batch, m), the truth, and parameters."""
+
+    y: np.ndarray
+    u: np.ndarray
+    states: np.ndarray
+    parameters: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def main() -> None:
@@ -41,7 +57,6 @@ def main() -> None:
     ask.add_argument("--only", nargs="*", default=())
     ask.add_argument("--parts", nargs="*", default=("python", "turns", "day", "clock"))
     given = ask.parse_args()
-    exporting._EPISODES = 1000  # all of them
     kinds, data = read(given.run)
     kinds = {name: kind for name, kind in kinds.items() if not given.only or name in given.only}
     for part in given.parts:
@@ -61,8 +76,12 @@ def read(run: Path) -> tuple[dict[str, tuple[Observer, str | None]], HeldOut]:
             f"{p.parent.name}/{p.stem}": (Observer.load(p), None) for p in paths
         }
         deployed = Observer.load(store.path("observers", "deployed.json"))
-        data = exporting.held_out(config, store, deployed)
-    assert data is not None, "the run's recordings are gone"
+        population, identified = open_source(config), IdentifiedModels.load(run)
+    keys = [key for key in identified.facts.test if key.unit in identified.parameters]
+    batch = EpisodeBatch.read(population, keys, None, identified.parameters)
+    batch = batch.head(int(batch.lengths.min()))
+    y = as_arriving(batch, deployed.sensor, population.states).measurements(deployed.measured)
+    data = HeldOut(y, batch.inputs, batch.states, batch.parameters)
     n, size = deployed.lifting.n_states, np.abs(data.states).max(axis=(0, 1))
     limit = np.full(n, np.inf)
     limit[1 : len(size)] = 0.7 * size[1:]
@@ -100,10 +119,8 @@ def faulty(data: HeldOut, seed: int, share: float = 2e-3) -> tuple[np.ndarray, n
 
 def in_python(observer: Observer, y: np.ndarray, u: np.ndarray, own: dict, track: str | None) -> np.ndarray:
     """Return estimates of the recorded states."""
-    found = (
-        run_observer(observer, y, u, own) if track is None else track_parameter(observer, y, u, own, track).estimates
-    )
-    return found[..., : len(observer.recorded)]
+    loop = None if track is None else PhaseLockedLoop(observer, track, y.shape[1])
+    return Course(observer, y.shape[1], own, loop).take(y, u).estimates[..., : len(observer.recorded)]
 
 
 def in_c(
@@ -137,7 +154,7 @@ def against_python(observer: Observer, track: str | None, data: HeldOut, given: 
     met = UNCERTIFIED | (LIMIT if observer.runtime.lower is not None or observer.runtime.correction is not None else 0)
     while steps < given.steps:
         y, u = (data.y, data.u) if not steps else faulty(data, seed)
-        wanted, bits = in_python(observer, y, u, own, track), sample_status(observer, y, u)
+        wanted, bits = in_python(observer, y, u, own, track), screened(observer, y, u).status
         for precision in apart:
             found, status = in_c(observer, y, u, own, track, precision)
             far = float(np.max(rms(found - wanted) / np.std(wanted, axis=(0, 1))))

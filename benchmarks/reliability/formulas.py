@@ -204,7 +204,7 @@ def judge(text: str, lifting: Lifting, rng: np.random.Generator) -> str:
 
 def judge_slopes(lifting: Lifting, rng: np.random.Generator) -> str:
     """Compare bounds of the slope by x with quotients of differences; empty where these are within."""
-    lower, upper = lifting.slope_bounds({k: BOX[k] for k in ("x", "y")}, {"p": BOX["p"]})
+    lower, upper = lifting.slope_bounds({k: BOX[k] for k in ("x", "y", "p")})
     if not np.isfinite([lower[0, 0], upper[0, 0]]).all():
         return ""
     x, z = (rng.uniform(*BOX["x"], 300) for _ in range(2))

@@ -110,7 +110,7 @@ def gridded(A: np.ndarray, B: np.ndarray, C: np.ndarray, D: np.ndarray, dt: floa
     """Largest gain on a dense grid around the poles, refined between the neighbours of its highest points."""
     system, freqs = StateSpace(A, B, C, D, dt), dense(A, dt)
     gains = np.linalg.norm(system.frequency_response(freqs), 2, axis=(-2, -1))
-    best = float(gains.max())
+    best = max(float(gains.max()), float(np.linalg.norm(D, 2)) if dt == 0 and D.size else 0.0)  # the grid ends before D
     for k in np.argsort(-gains)[:5]:
         low, high = freqs[max(k - 1, 0)], freqs[min(k + 1, len(freqs) - 1)]
         for _ in range(6):

@@ -114,7 +114,6 @@ def population(rng: np.random.Generator) -> Recorded:
         A=np.zeros((n, 2, 2)),
         B=np.zeros((n, 2, 1)),
         parameters={},
-        residual_covariance=np.zeros((n, 2, 2)),
         output_scale=peak[:2],
         input_scale=peak[2:],
         alpha=10.0,

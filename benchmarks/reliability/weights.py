@@ -290,11 +290,12 @@ def _tolerance(case: Case, weight: Any, E: Array, freqs_hz: Array) -> tuple[str,
     loose = loose_db(weight, E, freqs_hz)
     if loose is None:
         return "bound holds", False
-    if weight.within_tolerance and loose > case.tolerance_db + TIGHT_DB:
+    within = weight.overbound_db_max <= case.tolerance_db
+    if within and loose > case.tolerance_db + TIGHT_DB:
         return f"said to be within the tolerance and {loose:.2f} dB loose", True
-    if not weight.within_tolerance and loose < case.tolerance_db - TIGHT_DB and E.shape[2:] == (1, 1):
+    if not within and loose < case.tolerance_db - TIGHT_DB and E.shape[2:] == (1, 1):
         return "said to be beyond the tolerance and is within", True
-    return "bound holds, " + ("within" if weight.within_tolerance else "said to be beyond") + " the tolerance", False
+    return "bound holds, " + ("within" if within else "said to be beyond") + " the tolerance", False
 
 
 def judged(judge: Callable[[Case], tuple[str, bool]], case: Case) -> tuple[str, bool]:

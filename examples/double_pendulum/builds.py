@@ -71,7 +71,7 @@ def fit(population: Population) -> dict[str, KoopmanMatrices]:
     keys = {unit: population.keys(unit) for unit in population.unit_ids}
     factor = combine(episode_factors(population, keys, LIFTING))
     alpha = 4 * smallest_stabilising_alpha([(factor.R, LIFTING.n_lifted)])
-    refined, _ = refine_population(population, keys, LIFTING, {}, factor, options=OPTIONS)
+    refined = refine_population(population, keys, LIFTING, {}, factor, options=OPTIONS)
     return {"refined": refined, "EDMD": edmd(factor.R, LIFTING.n_lifted, alpha)}
 
 

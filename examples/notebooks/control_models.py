@@ -4,8 +4,9 @@ Uncertainty of models you have: lists of python-control systems
 
 I have a model of every machine. What are the nominal model and the weights for robust control?
 
-The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss``,
-``control.tf`` or ``control.frd``, continuous or discrete. Nominal and weights are returned as systems of python-control.
+The models may come from any identification. You need no recordings, liftings or observers. The models are ``control.ss`` or
+``control.frd``, continuous or discrete (``kros.interop.from_control`` converts a ``control.tf``). Nominal and weights are
+returned as systems of python-control.
 """
 
 # %%
@@ -60,11 +61,12 @@ print(models["axis 1"])
 # kros computes all six. An axis has two outputs and one input. A form with one residual at the input cannot represent
 # differences between the outputs; ``misfit`` is the approximation error.
 
-from kros.interop import quantify_models
+import kros
+from kros.interop import uncertainty_to_control
 from kros.uncertainty import Form
 
 freqs_hz = np.geomspace(0.1, 100, 120)
-results = {form: quantify_models(models, form, freqs_hz) for form in Form}
+results = {form: uncertainty_to_control(kros.quantify(models, form, freqs_hz)) for form in Form}
 print("form                           nominal  peak (dB)  misfit  states of the weights")
 for form, result in results.items():
     model, states = result.model, f"{result.left.nstates} and {result.right.nstates}"
@@ -151,4 +153,4 @@ print(f"largest over all axes and frequencies: {max(largest.values()):.5f}")
 print("poles of the left weight, stable:", bool(np.all(chosen.left.poles().real < 0)))
 points = 2 * np.pi * freqs_hz
 measured = [control.frd(system, points) for system in models.values()]
-print(quantify_models(measured, Form.OUTPUT_MULTIPLICATIVE).certificate)
+print(kros.quantify(measured, Form.OUTPUT_MULTIPLICATIVE).certificate)

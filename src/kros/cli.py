@@ -225,10 +225,10 @@ def export_c(
     track: Track = None,
 ) -> None:
     """Write an observer as C99 source with a self-test."""
-    from .study.commands.export import export_run, numerical_error
+    from .study.commands.export import export_run
 
     path = export_run(run_folder, out, name, observer, precision=precision, track=track)
-    _say([numerical_error(path), f"C source in {path}; start with {path / 'README.md'}"])
+    _say([f"C source in {path}; start with {path / 'README.md'}"])
 
 
 @export.command("fmu")

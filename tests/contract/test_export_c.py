@@ -1,6 +1,5 @@
 """Generated C against the observer in Python: estimates, status bits, precision after many turns, and compilers that complain about nothing."""
 
-import json
 import re
 import shutil
 import subprocess
@@ -8,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import LIMITS, MACHINES, apart, drive, filters, in_python, samples, watched
+from machines import LIMITS, MACHINES, apart, drive, in_python, samples, watched
 
 from kros.core.errors import ConfigError, DataError
-from kros.export import CompiledObserver, HeldOut, LoadOutput, export_c
+from kros.export import CompiledObserver, LoadOutput, export_c
 from kros.export.c99.golden import Golden
 from kros.loops import find_compiler
 from kros.motor_drive import AngleLoad
@@ -51,24 +50,6 @@ def test_the_selftest_leaves_out_bits_at_a_threshold(factor, tmp_path):
     assert not masked.sure[1, -1] & 8
     assert masked.sure[1, -1] & 4
     assert CompiledObserver.build(export_c(exact, tmp_path / "c", "drive")).selftest() == 0
-
-
-@needs_compiler
-@pytest.mark.parametrize("precision", ["double", "float"])
-def test_a_machine_that_is_told_its_condition(precision, tmp_path):
-    observer, (y, u) = MACHINES["monitor"](), samples(800, faults=False)
-    folder = export_c(observer, tmp_path / "c", "drive", precision)
-    compiled = CompiledObserver.build(folder, flags=(*STRICT, "-Wno-unused-function"))
-    outside = []
-    for condition in (None, *observer.monitor.bounds):
-        wanted, found = in_python(observer, y, u, condition=condition)[1], compiled.run(y, u, condition=condition)[1]
-        np.testing.assert_array_equal(found, wanted)
-        outside.append(int(np.count_nonzero(wanted & 8)))
-    assert outside[1] < outside[0] < outside[2]
-    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
-        compiled.run(y, u, condition="loaded")
-    with pytest.raises(ConfigError, match="condition 'loaded' is unknown"):
-        in_python(observer, y, u, condition="loaded")
 
 
 @needs_compiler
@@ -158,25 +139,6 @@ def test_everything_compiles_without_a_warning(precision, tmp_path):
     subprocess.run(["cc", "size.c", "-o", "size"], cwd=folder, check=True)
     printed = subprocess.run(["./size"], cwd=folder, check=True, capture_output=True, text=True).stdout
     assert f'"state_bytes": {printed},' in (folder / "manifest.json").read_text()
-
-
-@needs_compiler
-def test_the_numerical_error_on_held_out_recordings(tmp_path):
-    """Beside the truth that is known; columns that cancel, a reference's and a measurement's, cost single precision nothing."""
-    observer, (y, u) = replace(filters(), seen=None), samples(3000, faults=False)
-    A, B = observer.A.copy(), observer.B.copy()
-    A[1:5, 0], B[1:5, 0] = 900.0 + A[1:5, 0], -900.0
-    observer = replace(observer, A=A, B=B)
-    y = u[:, :1] + 1e-4 * y  # it follows its target closely
-    states = observer.run(y[:, None], u[:, None])[..., :3] + 1e-3 * np.random.default_rng(0).normal(size=(3000, 1, 3))
-    states[..., 2] = np.nan
-    folder = export_c(observer, tmp_path / "c", "drive", "float", held_out=HeldOut(y[:, None], u[:, None], states))
-    found = json.loads((folder / "manifest.json").read_text())["numerical_error"]
-    assert found["samples"] == 3000
-    assert found["difference"] < 8e-5
-    assert abs(found["loss_percent"]["velocity"]) < 0.2  # its two filters are larger than the estimate, and single too
-    assert found["loss_percent"]["current"] is None
-    assert not list(folder.glob("*.so"))
 
 
 @pytest.mark.skipif(shutil.which("cppcheck") is None, reason="cppcheck is not on the PATH")

@@ -6,11 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from machines import drive, in_python, samples, watched
+from machines import drive, in_python, samples
 
 from kros.core.errors import ConfigError
 from kros.export import export_fmu
-from kros.export.text import plain
 from kros.loops import find_compiler
 
 
@@ -69,35 +68,6 @@ def test_two_instances_at_once_and_after_a_reset(fmi, from_source, track, tmp_pa
 
 def set_values(unit, fmi, references, values):
     (unit.setReal if fmi == 2 else unit.setFloat64)(references, list(values))
-
-
-@pytest.mark.skipif(find_compiler() is None, reason="no C compiler is on the PATH")
-@pytest.mark.parametrize("fmi", [2, 3])
-def test_the_monitor_is_told_the_condition(fmi, tmp_path):
-    """By the number of a recorded condition, as a start value; status bits as in Python."""
-    fmpy = pytest.importorskip("fmpy", reason="FMPy (the extra fmu) is not installed")
-    from fmpy.validation import validate_fmu
-
-    observer, (y, u) = watched(drive(), bound=0.06), samples(400, faults=False)
-    path = str(export_fmu(observer, tmp_path / "drive.fmu", fmi, "drive"))
-    assert validate_fmu(path) == []
-    (told,) = (v for v in fmpy.read_model_description(path).modelVariables if v.name == "condition")
-    assert (told.variability, [item.name for item in told.declaredType.items]) == (
-        "tunable",
-        ["unknown", *map(plain, observer.monitor.bounds)],
-    )
-    dtype = [("time", float)] + [(name, float) for name in ("position", "target", "rate")]
-    rows = np.array([(k * 1e-3, *y[k], *u[k]) for k in range(len(y))], dtype)
-    found = {}
-    for condition in (None, *observer.monitor.bounds):
-        numbers = {item.name: int(item.value) for item in told.declaredType.items}
-        start = {"position": y[0, 0]} | ({} if condition is None else {"condition": numbers[plain(condition)]})
-        result = fmpy.simulate_fmu(
-            path, stop_time=0.4, step_size=1e-3, output_interval=1e-3, start_values=start, input=rows, output=["status"]
-        )
-        found[condition] = result["status"][1:]
-        np.testing.assert_array_equal(found[condition], in_python(observer, y, u, condition=condition)[1])
-    assert len({bits.tobytes() for bits in found.values()}) == 3
 
 
 def test_the_same_observer_gives_the_same_bytes(tmp_path):

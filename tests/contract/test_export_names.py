@@ -28,7 +28,7 @@ HOSTILE = {
     "cmake": 'x ]=] ) execute_process(COMMAND touch EVIL) # ${EVIL} "',
     "markup": "x\"'><!-- EVIL ]]> & &#10; | `EVIL` <script>",
 }
-SLOTS = ("observer", "measured state", "hidden state", "input", "condition", "unit of measure", "note", "load")
+SLOTS = ("observer", "measured state", "hidden state", "input", "unit of measure", "note", "load")
 
 
 def named(slot, text):
@@ -37,8 +37,6 @@ def named(slot, text):
     states, inputs = list(observer.lifting.states), list(observer.inputs)
     if slot == "observer":
         observer = replace(observer, name=text)
-    elif slot == "condition":
-        observer = replace(observer, monitor=replace(observer.monitor, bounds={text: 1.0}))
     elif slot == "unit of measure":
         observer = replace(observer, about={"units_of_measure": {"position": text}})
     elif slot == "note":

@@ -6,7 +6,6 @@ import stat
 import subprocess
 import sys
 import zipfile
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -14,15 +13,13 @@ import pytest
 from families import FAMILIES, INPUT_FUNCTIONS, INPUTS, STATES
 from machines import LIMITS, MACHINES, drive, samples
 
-from kros.core.artifacts import read_json
 from kros.core.errors import ConfigError
-from kros.export import HeldOut, export_c, export_fmu
+from kros.export import export_fmu
 from kros.identify.free_run import free_run
 from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 from kros.loops import compiler, find_compiler, library, recursion
-from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.simulate import run_innovations, run_observer, run_observers
 
 needs_compiler = pytest.mark.skipif(find_compiler() is None, reason="no C compiler on this machine")
@@ -138,30 +135,6 @@ def test_free_runs_and_sensitivities_of_all_liftings_are_alike(family, both):
 
 
 @needs_compiler
-@pytest.mark.parametrize("measured", [(0,), (0, 1)])
-@pytest.mark.parametrize(
-    "functions", [(), ("sin(3*position + phase)", "velocity*position"), ("tanh(position[-2])", "voltage[-1]*velocity")]
-)
-def test_extended_kalman_filters_are_alike(functions, measured, both):
-    gamma = ("voltage*velocity",) if functions else ()
-    lifting = Lifting(STATES, functions, ("phase",) if any("phase" in f for f in functions) else (), INPUTS, gamma)
-    rng = np.random.default_rng(3)
-    W = model_of(lifting, 1, rng)[0][0]
-    A = np.vstack([W[:, : lifting.n_lifted], np.zeros((len(functions), lifting.n_lifted))])
-    B = np.vstack([W[:, lifting.n_lifted :], np.zeros((len(functions), 1 + len(gamma)))])
-    Q, R = (
-        np.stack([np.diag([0.01, 0.02]) * scale for scale in (0.1, 1.0, 10.0)]),
-        np.diag([0.01, 0.03])[: len(measured), : len(measured)],
-    )
-    one = ExtendedKalman(lifting, A, B, measured, INPUTS, Q, R, np.eye(2), {"phase": 0.1} if lifting.parameters else {})
-    x, u = recorded(rng, 200, MACHINE_COUNT)
-    y = x[..., list(measured)]
-    y[rng.random(y.shape) < 0.05] = np.nan
-    filters = [one] if lifting.history else [one, replace(one, delay=3)]
-    assert_same(*both(lambda: [kalman.run_all(y, u) for kalman in filters]))
-
-
-@needs_compiler
 def test_recursions_are_alike(both):
     rng = np.random.default_rng(4)
     F, driven = 0.9 * np.eye(5) + 0.02 * rng.normal(size=(5, 5)), rng.normal(size=(200, MACHINE_COUNT, 5))
@@ -256,13 +229,9 @@ def test_a_compiler_that_does_not_work_is_no_obstacle(script, reason, tmp_path, 
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
     monkeypatch.setattr(compiler, "run_tool", partial(compiler.run_tool, seconds=0.5))
-    (y, u), observer = (a[:, None] for a in samples(50, faults=False)), drive()
-    held_out = HeldOut(y, u, np.zeros((*y.shape[:2], len(observer.recorded))))
+    observer = drive()
     for use in (
         lambda: compiler.load(SOURCE, FLAGS),
-        lambda: read_json(export_c(observer, tmp_path / "c", "drive", held_out=held_out) / "manifest.json")[
-            "numerical_error"
-        ],
         lambda: next(
             (
                 n

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 import tomllib
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[2]
 RUN, DEV = "requirements.lock", "requirements-dev.lock"
@@ -21,13 +23,15 @@ def requirements(text: str) -> list[str]:
 
 def faults(text: str) -> list[str]:
     """Lines that are not `name==version`, perhaps with a marker, followed by SHA-256 hashes."""
-    good = re.compile(r"[a-z0-9._-]+==[\w.!+]+( *;[^-]*(?:-(?!-)[^-]*)*)?( +--hash=sha256:[0-9a-f]{64})+")
+    good = re.compile(
+        r"[a-z0-9._-]+(?:\[[a-z,]+\])?==[\w.!+]+( *;[^-]*(?:-(?!-)[^-]*)*)?( +--hash=sha256:[0-9a-f]{64})+"
+    )
     return [line[:80] for line in requirements(text) if not good.fullmatch(line)]
 
 
 def pins(name: str) -> dict[str, str]:
     lines = requirements((ROOT / name).read_text(encoding="utf-8"))
-    return dict(line.split(" ", 1)[0].split("==") for line in lines)
+    return dict(re.sub(r"\[.*\]", "", line.split(" ", 1)[0]).split("==") for line in lines)
 
 
 def names(wanted: list[str]) -> set[str]:
@@ -53,6 +57,17 @@ def test_locks_hold_what_the_project_asks_for() -> None:
     )
     assert names(run) <= set(pins(RUN))
     assert names(run + PROJECT["dependency-groups"]["dev"]) <= set(pins(DEV))
+
+
+def test_extras_that_packages_ask_for_are_pinned_with_them() -> None:
+    """pip takes a newer `coverage` for `coverage[toml]` where the lock pins `coverage` alone, and refuses it."""
+    lines = requirements((ROOT / DEV).read_text(encoding="utf-8"))
+    pinned = {line.split("==", 1)[0] for line in lines}
+    asked = [Requirement(text) for d in distributions() for text in d.requires or [] if d.name.lower() in pins(DEV)]
+    known = [
+        r for r in asked if r.extras and r.name in pins(DEV) and (r.marker is None or r.marker.evaluate({"extra": ""}))
+    ]
+    assert {f"{r.name}[{','.join(sorted(r.extras))}]" for r in known} <= pinned
 
 
 def test_development_uses_the_versions_that_are_installed() -> None:

@@ -9,8 +9,9 @@ import numpy as np
 
 from kros.data.readers.parquet import read_parquet
 from kros.identify import PhaseCalibration
-from kros.observer import Observer, run_observer, sample_status
+from kros.observer import Observer, run_observer
 from kros.observer.certificate.error import error_system
+from kros.observer.screen import screened
 
 AT, GOOD = 3000, 2000
 
@@ -33,7 +34,7 @@ def test_what_a_study_hands_over_forgets_faults(demo: Path) -> None:
         measured = list(observer.measured)
         np.testing.assert_array_less(0.5 * largest[measured], observer.seen.measured)
         y, u = (np.repeat(v[:, None], 8, axis=1) for v in (values[:, measured], values[:, n:]))
-        assert not sample_status(observer, y, u).any()  # nothing that was recorded is implausible
+        assert not screened(observer, y, u).status.any()  # nothing that was recorded is implausible
         u[AT, 1, 0], u[AT, 2], y[AT, 3], u[AT, 4, 0] = np.nan, -np.inf, 1e9, 1e9
         y[AT : AT + 100, 5], y[0, 6], u[0, 7] = -1e9, np.nan, np.nan
         found = run_observer(observer, y, u, {"phase": phase} if observer.lifting.parameters else None)[..., :n]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -63,6 +64,16 @@ def field(machines: Population, tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
+@pytest.fixture(scope="module")
+def lifted(demo: Path, tmp_path_factory) -> Path:
+    """The demo's run as if its observer with parameters had been chosen."""
+    run = tmp_path_factory.mktemp("lifted") / "run"
+    shutil.copytree(demo, run)
+    (run / "observers" / "deployed.json").unlink()
+    shutil.copyfile(run / "observers" / "koopman" / "estimator.json", run / "observers" / "deployed.json")
+    return run
+
+
 def one_direction(values: np.ndarray) -> np.ndarray:
     """The longest stretch without motion in reverse: the phase cannot be calibrated there."""
     forward = np.concatenate([[False], values[:, 2] >= -1e-9, [False]])
@@ -113,16 +124,16 @@ def test_csv_and_parquet_say_the_same_with_units_and_sources(kros, demo, field, 
 
 
 def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation_is_smallest(
-    kros, demo, field, tmp_path
+    kros, lifted, field, tmp_path
 ) -> None:
-    result = kros("estimate", demo, field(), tmp_path / "whole.csv")
+    result = kros("estimate", lifted, field(), tmp_path / "whole.csv")
     calibrated = json.loads((tmp_path / "whole.csv-metadata.json").read_text())["parameters"]
     for file in (tmp_path / "logged").iterdir():
         np.savetxt(file, _cut(file), delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
-    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv")
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv")
     assert result.exit_code == 1
     assert "--track phase" in result.stderr
-    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "x.csv", "--track", "phase")
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv", "--track", "phase")
     assert result.exit_code == 0, result.output
     assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
     names, values = table(tmp_path / "x.csv")
@@ -133,7 +144,7 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
         apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
     options = ("--track", "phase", "--parameter", "m001001.phase=1.2")
-    result = kros("estimate", demo, tmp_path / "field.toml", tmp_path / "y.csv", *options)
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "y.csv", *options)
     assert result.output.count("that is given") == 1
     assert np.isfinite(values).all()
 
@@ -152,17 +163,17 @@ def test_missing_samples_are_taken_and_counted(kros, demo, field, tmp_path) -> N
     )
 
 
-def test_what_does_not_fit_is_said(kros, demo, field, tmp_path) -> None:
+def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
     data, out = field(unit="deg"), tmp_path / "x.csv"
 
     def refused(*words: str, data: Path = data, more: tuple[str, ...] = ()) -> None:
-        result = kros("estimate", demo, data, out, *more)
+        result = kros("estimate", lifted, data, out, *more)
         assert result.exit_code == 2, result.output
         assert all(word in result.stderr for word in words), result.stderr
         assert not out.exists()
 
     refused("position", "'rad'", "'deg'", "scale")
-    refused("looks like csv", "TOML with [data]", data=tmp_path / "logged")
+    refused("there is no file", "TOML with [data]", data=tmp_path / "logged")
     text = data.read_text().replace("deg", "rad")
     data.write_text(text.replace('{ name = "target_velocity", role = "input", column = "target_velocity" },', ""))
     refused("target_velocity is missing")

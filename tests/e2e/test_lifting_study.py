@@ -96,13 +96,13 @@ def machines(n_samples):
     ]
     data = {}
     for unit in "123":
-        data[unit] = {"default": {}}
-        for number, length in enumerate(n_samples):
+        data[unit] = []
+        for length in n_samples:
             u = rng.normal(size=(length, 2))
             x = np.zeros((length, 2))
             for k in range(length - 1):
                 x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], 0.8 * x[k, 1] + u[k].sum() * (1 + 0.1 * int(unit))]
-            data[unit]["default"][str(number)] = np.hstack([x, u])
+            data[unit].append(np.hstack([x, u]))
     return from_arrays(data, channels, 0.01)
 
 
@@ -116,7 +116,6 @@ def test_models_with_delays_and_input_functions_are_refined(study, kros, tmp_pat
     models, linear = (ModelSet.load(tmp_path / "run" / "models" / name) for name in ("koopman", "linear"))
     assert (models.lifting.history, models.inputs) == (2, ("u", "w", "v*u"))
     assert (models.A.shape, models.B.shape, linear.B.shape) == ((3, 4, 4), (3, 4, 3), (3, 2, 2))
-    assert (tmp_path / "run" / "refinement" / "koopman" / "refinement.json").is_file()
     truth = np.array([[[0.9, 0.1, 0, 0], [0, 0.8, 1 + 0.1 * unit, 1 + 0.1 * unit]] for unit in (1, 2, 3)])
     found = np.concatenate([models.A[:, :2, :2], models.B[:, :2, :2]], axis=2)
     np.testing.assert_allclose(found, truth, atol=0.03)  # the prior draws units together whose gains differ by a tenth

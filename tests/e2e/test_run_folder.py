@@ -230,7 +230,7 @@ def test_leftovers_are_not_believed(kros, run, pendulums, fast):
     known = kros("check", run, pendulums, "--json", "--workers", 1)
     assert kros("report", run).exit_code == 0
     page = (run / "report.html").read_bytes()
-    for kind in ("models", "uncertainty", "outliers", "synthesis", "refinement"):
+    for kind in ("models", "uncertainty", "outliers", "synthesis"):
         for folder in sorted((run / kind).glob("*")) if (run / kind).is_dir() else ():
             if folder.is_dir():
                 shutil.copytree(folder, run / kind / f"{folder.name}_ghost")

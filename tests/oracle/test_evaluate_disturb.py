@@ -19,7 +19,9 @@ from kros.evaluate.disturb import (
 )
 from kros.evaluate.errors import error_percent
 from kros.lifting import Lifting
-from kros.observer import ExtendedKalman, Observer, run_observers
+from kros.observer import Observer
+from kros.observer.baselines.extended_kalman import ExtendedKalman
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 LINEAR = Lifting(("x", "v"))

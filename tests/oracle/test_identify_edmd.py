@@ -5,7 +5,6 @@ import pytest
 
 from kros.core.errors import IdentificationError
 from kros.identify import Factor, combine, edmd, smallest_stabilising_alpha
-from kros.identify.edmd import residual_covariance
 from kros.identify.factors import lifted_factor, reduce_episode
 from kros.lifting import Lifting
 
@@ -77,20 +76,6 @@ def test_a_new_phase_needs_no_second_pass():
         found = edmd(lifted_R([(x, u)], phase).R[0], 3)
         np.testing.assert_allclose(np.hstack([found.A, found.B]), U, rtol=1e-8, atol=1e-10)
         assert direct.n_samples == len(x) - 1
-
-
-def test_residual_covariance_equals_the_residuals():
-    x, u = simulate(8, noise=0.05)
-    factor = lifted_R([(x, u)])
-    matrices = edmd(factor.R, 3, 2.0)
-    theta = LIFTING.lift(x, {"phase": np.full(len(x), 0.7)})
-    residual = theta[1:] - theta[:-1] @ matrices.A[0].T - u[:-1] @ matrices.B[0].T
-    np.testing.assert_allclose(
-        residual_covariance(factor.R, 3, matrices, factor.n_samples)[0],
-        residual.T @ residual / len(residual),
-        rtol=1e-9,
-        atol=1e-12,
-    )
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -33,10 +33,16 @@ def gears(ratio: float, size: float, units: int = 3, noise: float = 1e-3, travel
     return from_arrays(episodes, CHANNELS, 1e-3)
 
 
+def term_of(population, angle):
+    condition = population.conditions[-1]
+    keys = [k for unit in population.unit_ids for k in population.keys(unit, condition)[:3]]
+    return periodic_term(population, [angle], keys)
+
+
 @pytest.mark.parametrize(("seed", "loop"), [(0, "stiff"), (5, "soft")])
 def test_the_gear_of_the_simulated_drives_is_found(seed, loop):
     drives = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=8, seed=seed, loop=loop).simulate().population
-    term = periodic_term(drives, ["position"])
+    term = term_of(drives, "position")
     assert term is not None
     assert term.ratio == 100
     assert term.above > 20
@@ -44,23 +50,23 @@ def test_the_gear_of_the_simulated_drives_is_found(seed, loop):
 
 @pytest.mark.parametrize("ratio", [23.0, 80.5, 120.0])
 def test_any_ratio_is_found_to_a_part_of_a_turn(ratio):
-    term = periodic_term(gears(ratio, 2e-3), ["angle"])
+    term = term_of(gears(ratio, 2e-3), "angle")
     assert term is not None
     assert term.ratio == pytest.approx(ratio, abs=0.1)
 
 
 def test_nothing_is_found_where_nothing_is_periodic():
     motors = DcMotorPopulation(n_units=4, n_episodes=4, seconds=8, seed=1).simulate().population
-    assert periodic_term(motors, ["position"]) is None
+    assert term_of(motors, "position") is None
     for seed in range(2):
         rng = np.random.default_rng(seed)
         noisy = gears(1.0, 0.0, noise=1e-2 * rng.uniform(0.5, 2))
-        assert periodic_term(noisy, ["angle"]) is None
+        assert term_of(noisy, "angle") is None
 
 
 def test_gravity_is_found_in_pendulums():
     pendulums = PendulumPopulation(n_units=3, n_episodes=4, seconds=8, seed=2).simulate().population
-    term = periodic_term(pendulums, ["position"])
+    term = term_of(pendulums, "position")
     assert term is not None
     assert term.ratio == 1
     assert term.odd

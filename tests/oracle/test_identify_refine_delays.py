@@ -3,18 +3,14 @@ known."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import Factor, KoopmanMatrices, combine, episode_factors, free_run
+from kros.identify import Factor, KoopmanMatrices, combine, free_run
 from kros.identify.factors import lifted_factor, reduce_episode
 from kros.identify.refine import RefineOptions, refine_population
-from kros.identify.refine.episodes import episode_normals
-from kros.identify.refine.model import TrainingData
-from kros.identify.refine.segments import Segments, read_segments
+from kros.identify.refine.segments import Segments
 from kros.identify.refine.sensitivity import normal_equations
 from kros.lifting import Lifting
 
@@ -105,7 +101,7 @@ def rows(models: KoopmanMatrices) -> np.ndarray:
 
 def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     population, keys, factor, W = machines(2, 0.0, seed=5, spread=0.0)
-    models, _ = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
+    models = refine_population(population, keys, BILINEAR, {}, factor, options=OPTIONS)
     np.testing.assert_allclose(rows(models), W, atol=1e-6)
     shift = np.concatenate([models.A, models.B], axis=-1)[:, 3]
     np.testing.assert_allclose(
@@ -114,20 +110,3 @@ def test_exact_recordings_give_the_exact_system_and_its_shift() -> None:
     x = population.read(keys["u0"][0])
     run = free_run(models.A[:1], models.B[:1], BILINEAR, {}, x[None, :4, :2], x[None, :, 2:])[0]
     np.testing.assert_allclose(run, x[:, :2], atol=1e-5)
-
-
-def test_normal_equations_by_episode_add_up_with_delays() -> None:
-    population, keys, factor, _ = machines(2, 0.05, seed=8)
-    options = replace(OPTIONS, strengths=(1.0,))
-    models, refinement = refine_population(population, keys, BILINEAR, {}, factor, options=options)
-    factors = episode_factors(population, keys, BILINEAR)
-    data = TrainingData(population, keys, BILINEAR, {}, factors, np.ones(2, bool))
-    by_episode = episode_normals(models, refinement, data, OPTIONS)
-    segments = read_segments(population, keys, 80, OPTIONS.segments, 0, BILINEAR.history)
-    W, T = np.concatenate([models.A, models.B], axis=-1), refinement.whitening
-    V = np.swapaxes(np.linalg.solve(T, np.swapaxes(W, -1, -2)), -1, -2)
-    whole = normal_equations(V[:, :2], T, BILINEAR, {}, segments, refinement.sigma)
-    place = np.r_[0:12]
-    np.testing.assert_allclose(
-        by_episode.sum(axis=1)[:, place[:, None], place], whole.matrix[:, :-1, :-1], rtol=1e-9, atol=1e-9
-    )

@@ -8,8 +8,9 @@ from batches import batch_of
 
 from kros.core.errors import DataError
 from kros.lifting import Lifting
-from kros.observer import ExtendedKalman, FilteredDifference, Observer, run_observer
-from kros.observer.baselines.extended_kalman import start_covariance
+from kros.observer import Observer, run_observer
+from kros.observer.baselines.difference import FilteredDifference
+from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.baselines.learned import Moments, Ridge
 from kros.synthesis import Injection, kalman
 

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from batches import run_with_status
 from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
 from kros.data import EpisodeBatch
 from kros.lifting import Lifting
-from kros.observer import Observer, Recordings, identify_estimator, run_observer, run_with_status
+from kros.observer import Observer, Recordings, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import reduced

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from batches import track_parameter
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
@@ -12,20 +13,18 @@ from kros.data.population import EpisodeKey
 from kros.design.baselines import Baseline
 from kros.lifting import Lifting
 from kros.observer import (
-    ExtendedKalman,
-    FilteredDifference,
     Observer,
     Runtime,
     SampleStatus,
     Seen,
     relift_certificate,
     run_observer,
-    run_observers,
-    sample_status,
-    track_parameter,
 )
-from kros.observer.baselines.extended_kalman import start_covariance
+from kros.observer.baselines.difference import FilteredDifference
+from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system
+from kros.observer.screen import screened
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200
@@ -151,7 +150,7 @@ def test_the_phase_locked_loop_forgets_too():
     y, u = together()
     found = track_parameter(observer("lifted"), y, u, {"phase": 0.1}, settle_s=0.3)
     require_forgotten(found.estimates)
-    assert np.all(np.abs(found.values[:, 1:] - found.values[:, :1])[LAST + 2000 :] < 0.01)
+    assert np.all(np.abs(found.followed[:, 1:] - found.followed[:, :1])[LAST + 2000 :] < 0.01)
 
 
 @pytest.mark.parametrize("fault", FAULTS)
@@ -167,7 +166,7 @@ def test_one_machine_and_a_batch_judge_alike(kind, delay, fault):
         np.testing.assert_allclose(
             both[:, 0], run_observer(o, y, u)[:, 0], rtol=1e-9, atol=1e-12
         )  # the other machine of the batch does not notice
-        own = sample_status(o, bad_y, bad_u)[:, 0]
+        own = screened(o, bad_y, bad_u).status[:, 0]
         assert all(SampleStatus(int(b)) in s for b, s in zip(own, status, strict=True))
 
 
@@ -204,18 +203,18 @@ def test_what_lies_within_one_and_a_half_times_the_range_is_believed():
     o = observer()
     y, u = recordings(50)
     y[20], u[30, 0, 1] = 2.99, -1.49
-    assert not sample_status(o, y, u).any()
+    assert not screened(o, y, u).status.any()
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(replace(o, seen=None), y, u))
     y[20] = 3.01
     missing = y.copy()
     missing[20] = np.nan
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, missing, u))
-    assert np.flatnonzero(sample_status(o, y, u)).tolist() == [20]
-    assert not sample_status(replace(o, seen=None), 1e6 * y, u).any()
+    assert np.flatnonzero(screened(o, y, u).status).tolist() == [20]
+    assert not screened(replace(o, seen=None), 1e6 * y, u).status.any()
     zero = replace(
         o, seen=Seen(np.array([2.0]), np.array([0.0, 1.0]))
     )  # nothing is known of an input that never was anything but zero
-    assert not sample_status(zero, np.clip(y, -1, 1), u).any()
+    assert not screened(zero, np.clip(y, -1, 1), u).status.any()
 
 
 def test_a_declared_limit_takes_the_place_of_the_range():
@@ -223,7 +222,7 @@ def test_a_declared_limit_takes_the_place_of_the_range():
     y, u = recordings(50)
     y[10:12] = 2.5
     np.testing.assert_array_equal(run_observer(o, y, u), run_observer(o, np.clip(y, -3, 2), u))
-    assert np.flatnonzero(sample_status(o, y, u) == SampleStatus.LIMIT).tolist() == [10, 11]
+    assert np.flatnonzero(screened(o, y, u).status == SampleStatus.LIMIT).tolist() == [10, 11]
     y[10:12] = 4.6  # beyond 1.5 times the declared range
     gone = y.copy()
     gone[10:12] = np.nan
@@ -266,16 +265,10 @@ def test_reset_leaves_nothing_of_the_past():
     np.testing.assert_array_equal(again, [fresh.step(y[k, 0], u[k, 0]) for k in range(30)])
 
 
-def test_observers_that_believe_differently_run_side_by_side():
-    y, u = recordings(40)
-    y[20] = 4.0
-    pair = [observer(), observer(seen=None)]
-    for found, o in zip(run_observers(pair, y, u), pair, strict=True):
-        np.testing.assert_array_equal(found, run_observer(o, y, u))
-
-
 def test_what_does_not_fit_is_named():
     o, (y, u) = observer(), recordings(5)
+    with pytest.raises(DimensionError, match="limits or ranges"):
+        run_observers([o, observer(seen=None)], y, u)
     running = o.start([0.0])
     for make in (
         lambda: o.start([0.0], {"phse": 1.0}),
@@ -342,11 +335,8 @@ def test_baselines_judge_samples_as_observers_do():
         start_covariance(np.ones(2), np.array([[1e-4]]), (0,)),
         {"phase": 0.3},
     )
-    for estimator, states, knows in (
-        (extended, (0, 1), True),
-        (FilteredDifference(2, ((0, 1),), 20.0, DT), (1,), False),
-    ):
-        baseline = Baseline({"": estimator}, (0,), states, {}, knows, seen=SEEN)
+    for estimator, states in ((extended, (0, 1)), (FilteredDifference(2, ((0, 1),), 20.0, DT), (1,))):
+        baseline = Baseline({"": estimator}, (0,), states, {}, seen=SEEN)
         found = baseline.estimate(keys, y, u, {})[..., list(states)]
         away = np.abs(found[:, 1:] - found[:, :1]) / np.sqrt(np.mean(found[:, :1] ** 2, axis=0))
         assert np.all(away[LAST + 2000 :] < 0.01)

@@ -4,12 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from batches import run_with_status
 
 from kros.core import StateSpace
 from kros.export import CompiledObserver, export_c
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Guard, Observer, Runtime, SampleStatus, run_observers, run_with_status
-from kros.observer.simulate import Course
+from kros.observer import FilterBank, Observer, Runtime, SampleStatus
+from kros.observer.runtime import Guard
+from kros.observer.simulate import Course, run_observers
 from kros.synthesis import Injection
 
 DT, SETTLE, BOUND = 0.01, 4, np.array([3.0, 5.0])

@@ -11,8 +11,8 @@ from kros.core.lti import gain
 from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor, monitor_facts
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer, SampleStatus
-from kros.observer.monitor import RECOVERY, Watch, octaves, poisson_interval
+from kros.observer import Observer, SampleStatus
+from kros.observer.monitor import RECOVERY, Monitor, Watch, octaves
 from kros.observer.simulate import run_innovations
 from kros.observer.units import in_sizes
 from kros.plants import HarmonicDrivePopulation
@@ -51,7 +51,6 @@ def test_bands_pass_the_power_that_their_filters_say():
     np.testing.assert_allclose(np.abs(response).max(axis=1), 1, rtol=1e-6)
     noise = rng.normal(size=(400_000, 1, 1))
     monitor = Monitor(filters, 1e-5, 0, np.ones(1), np.ones((1, 6)), np.array([[16, 0, 0, 0, 0, 0]]), 0.02)
-    np.testing.assert_allclose(monitor.centres_hz(0.01), 25.6 / 2.0 ** np.arange(6), rtol=1e-9)
     powers = monitor.mean_squares(noise, np.ones((400_000, 1), dtype=bool))[-1, 0, 0]
     np.testing.assert_allclose(powers, np.mean(np.abs(response) ** 2, axis=1) * (1 - (1 - 1e-5) ** 400_000), rtol=0.05)
 
@@ -123,11 +122,6 @@ def test_what_cannot_be_a_monitor_is_refused():
         replace(drive(), monitor=Monitor(filters, 0.1, 9, np.ones(2), np.ones((2, 3)), np.full((2, 3), [4, 4, 0]), 0.1))
 
 
-def test_poisson_interval_is_that_of_the_tables():
-    np.testing.assert_allclose(poisson_interval(0), (0, 3.689), atol=1e-3)
-    np.testing.assert_allclose(poisson_interval(3), (0.619, 8.767), atol=1e-3)
-
-
 def test_the_bound_is_that_of_one_more_unit():
     """Peaks sample by sample, episodes one after the other, the bound by hand; a unit that shakes is outside."""
     simulated = HarmonicDrivePopulation(n_units=6, n_episodes=3, seconds=3.0, conditions=("noload",), seed=3).simulate()
@@ -167,8 +161,7 @@ def test_the_bound_is_that_of_one_more_unit():
     over = prediction_bound(highest, 0.05) - highest.mean()
     assert abs(highest.mean() + np.sqrt(over**2 + wider)) < 1e-5  # levels are over the bound already
     facts = monitor_facts(monitor)
-    assert (facts["units"], facts["alarms"]) == (6, 0)
-    assert 0.75 * 54 < 3600 * facts["hours"] < 54
+    assert facts["units"] == 6
     loudest = records[max(found, key=found.get)]
     y, u = loudest[:, :1], loudest[:, 3:]
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide

@@ -82,7 +82,9 @@ def response(K):
 def test_known_shaping_filter_gives_its_optimum():
     truth = autoregression()
     reference, best = optimum(truth)
-    found = residual_h2(ResidualProblem(A, C, spectrum(truth)[None], NOISE, SCALE, DT), [Basis(2)], tolerance_percent=0)
+    found = residual_h2(
+        ResidualProblem(A, C, spectrum(truth)[None], NOISE, SCALE, DT), Basis(2, ()), tolerance_percent=0
+    )
     assert (found.status, found.injection, found.method) == (Status.OPTIMAL, Injection.STATE, "residual_h2")
     assert found.h2_norm == pytest.approx(best, rel=1e-5)
     assert achieved(found.controller, truth) == pytest.approx(best, rel=1e-5)
@@ -132,7 +134,7 @@ def test_lifted_rows_are_not_corrected():
 
 def test_shaping_filter_reproduces_covariances():
     truth = autoregression()
-    found = shaping_filter(spectrum(truth), Basis(3), DT)
+    found = shaping_filter(spectrum(truth), Basis(3, ()), DT)
     assert found.is_stable()
 
     def covariances(system):
@@ -145,7 +147,7 @@ def test_shaping_filter_reproduces_covariances():
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("basis", [Basis(1), Basis(8), Basis(0, (0.5, 0.99)), Basis(3, (0.9, -0.5, 0.999))])
+@pytest.mark.parametrize("basis", [Basis(1, ()), Basis(8, ()), Basis(0, (0.5, 0.99)), Basis(3, (0.9, -0.5, 0.999))])
 def test_shaping_filters_are_stable_for_any_spectrum(basis):
     rng = np.random.default_rng(3)
     for _ in range(5):

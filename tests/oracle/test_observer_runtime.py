@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from batches import batch_of
+from batches import batch_of, track_parameter
 
 from kros.core.errors import ConfigError, DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, run_observer, track_parameter
+from kros.observer import Observer, Runtime, run_observer
 from kros.synthesis import Injection, kalman
 
 DT = 0.001
@@ -139,8 +139,8 @@ def test_phase_locked_loop_finds_the_phase_in_both_directions():
     K = kalman(A[:2, :2], np.eye(1, 2), np.diag([1e-12, 1e-6]), np.array([[1e-11]]), DT).controller
     o = Observer("o", lifting, A, B, (0,), ("u",), gain(np.vstack([K.D, [[0.0]]]), DT), Injection.STATE, DT)
     tracked = track_parameter(o, x[..., :1], u, {"phase": true + off}, settle_s=0.3)
-    np.testing.assert_allclose(tracked.values[0], true + off)
-    np.testing.assert_allclose(tracked.values[2000:].mean(axis=0), true, atol=0.05)
+    np.testing.assert_allclose(tracked.followed[0], true + off)
+    np.testing.assert_allclose(tracked.followed[2000:].mean(axis=0), true, atol=0.05)
     running = o.start(x[0, 0, :1], phase=true + off[0])
     running.track("phase", settle_s=0.3)
     sampled = [np.asarray(running.step(*sample)) for sample in zip(x[:300, 0, :1], u[:, 0], strict=False)]
@@ -169,7 +169,7 @@ def test_phase_locked_loop_finds_the_phase_of_a_simulated_drive():
     twice = np.repeat(states[..., :1], 2, axis=1), np.repeat(inputs, 2, axis=1)
     tracked = track_parameter(o, *twice, {"phase": true + np.array([1.0, -1.0])}, settle_s=1.0)
     np.testing.assert_allclose(
-        tracked.values[4000:].mean(axis=0), true, atol=0.2
+        tracked.followed[4000:].mean(axis=0), true, atol=0.2
     )  # the lag of the drive depends on speed, the phase takes it up
 
 

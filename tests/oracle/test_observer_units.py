@@ -10,8 +10,8 @@ from machines import filters
 from kros.core.linalg import least_squares
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import FilteredDifference, Observer, ReliftScales, Runtime, relift_certificate, run_observer
-from kros.observer.baselines.difference import followed
+from kros.observer import Observer, ReliftScales, Runtime, relift_certificate, run_observer
+from kros.observer.baselines.difference import FilteredDifference, followed
 from kros.observer.units import in_sizes
 from kros.synthesis import Injection
 

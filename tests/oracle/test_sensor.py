@@ -12,8 +12,9 @@ from kros.core.lti import gain
 from kros.design.synthesize import measurement_noise
 from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
-from kros.observer import Observer, Runtime, Sensor, run_observers
+from kros.observer import Observer, Runtime, Sensor
 from kros.observer.sensor import require_measured
+from kros.observer.simulate import run_observers
 from kros.observer.units import in_sizes
 from kros.study.config import validate_config
 from kros.synthesis.result import Injection

@@ -83,4 +83,4 @@ def test_modes_without_effect_do_not_loosen_the_bound(dt):
     )
     for p in (plant, other):
         assert hinf(p).status is Status.OPTIMAL
-    assert hinf(other).lower_bound == pytest.approx(hinf(plant).lower_bound, rel=1e-6)
+    assert hinf(other).lower_bound == pytest.approx(hinf(plant).lower_bound, rel=1e-5)  # where the search ends

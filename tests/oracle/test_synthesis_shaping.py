@@ -17,7 +17,7 @@ from kros.uncertainty import fit_magnitude
 Array = npt.NDArray[Any]
 
 DT = 1e-3
-OPTIONS: dict[str, Any] = {"order": None, "max_order": 3, "tolerance_db": 0.5}
+OPTIONS: dict[str, Any] = {"max_order": 3, "tolerance_db": 0.5}
 
 
 def _channels() -> Channels:

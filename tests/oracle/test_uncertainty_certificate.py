@@ -9,10 +9,9 @@ from tests.support.residuals import of_systems
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import Form, fit_magnitude, residual
-from kros.uncertainty.weights.certificate import Method, certify
-from kros.uncertainty.weights.cover import cover_ratio
+from kros.uncertainty.weights.cover import Cover
 from kros.uncertainty.weights.fit import Target, fit_weight
-from kros.uncertainty.weights.pencils import ResidualSystems
+from kros.uncertainty.weights.proof import Method, ResidualSystems, certify
 
 DT = 1e-3
 GRID = np.geomspace(0.1, 500.0, 60)
@@ -43,7 +42,7 @@ def test_realisations_have_the_responses_of_the_residuals(form: str, shape: tupl
     nominal, units = population(3, 2, *shape)
     E = residual(form, nominal.frequency_response(GRID), units.frequency_response(GRID))
     left, right = (gain(np.diag(np.arange(1.0, n + 1)), DT) for n in E.shape[2:])
-    expected = cover_ratio(E, np.tile(np.diag(left.D), (60, 1)), np.tile(np.diag(right.D), (60, 1)))
+    expected = Cover(np.tile(np.diag(left.D), (60, 1)), np.tile(np.diag(right.D), (60, 1))).ratio(E)
     for unit, pencil in enumerate(ResidualSystems(Form(form), nominal, units).ratios(left, right)):
         s = 1j * np.tan(np.pi * GRID[:-1] * DT)
         found = [np.linalg.norm(pencil.C @ np.linalg.solve(x * pencil.F - pencil.A, pencil.B) + pencil.D, 2) for x in s]
@@ -86,12 +85,12 @@ def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
     def ratio(freqs: np.ndarray) -> np.ndarray:
         return np.abs(unit.frequency_response(freqs)[:, :, 0, 0])
 
-    proof = certify(ratio, GRID, ratio(GRID), one, one, ResidualSystems(Form.ADDITIVE, nominal, unit))
+    proof = certify(ratio, GRID, ratio(GRID), ResidualSystems(Form.ADDITIVE, nominal, unit).ratios(one, one), DT)
     assert proof.method is Method.LEVEL_SETS
     assert proof.peak == pytest.approx(hinf_norm(unit[0]), rel=2e-5)
     assert proof.freq_hz == pytest.approx(37.77, rel=1e-4)
     assert ratio(GRID).max() < proof.peak / 2
-    assert certify(ratio, GRID, ratio(GRID), one, one).method is Method.GRID
+    assert certify(ratio, GRID, ratio(GRID), [], DT).method is Method.GRID
 
 
 @pytest.mark.parametrize("form", ["additive", "inverse_input_multiplicative", "inverse_additive"])
@@ -101,8 +100,7 @@ def test_weights_hold_between_grid_points(form: str) -> None:
     weight, _ = fit_weight(residuals, GRID, Target(DT, 3, 3.0))
     assert weight.method is Method.LEVEL_SETS
     freqs = np.linspace(0.0, 500.0, 20001)
-    used = weight.magnitudes(freqs)
-    assert cover_ratio(residuals.at(freqs), used.left, used.right).max() <= 1
+    assert weight.magnitudes(freqs).ratio(residuals.at(freqs)).max() <= 1
 
 
 def test_a_first_order_is_as_good_as_an_exhaustive_search_over_pole_and_zero() -> None:

@@ -52,7 +52,7 @@ def apply(form: Form, G: np.ndarray, E: np.ndarray) -> np.ndarray:
 def test_thousand_random_plants(kind: str, form: Form) -> None:
     G, Gp = pairs(kind, 1)
     exact = np.full(COUNT, form in GENERIC[kind])
-    E, rest = completion(form, G, Gp)
+    E, rest, _ = completion(form, G, Gp)
     size = np.linalg.norm(Gp, 2, axis=(-2, -1))
     error = (
         np.linalg.norm(np.array([apply(form, g, e) for g, e in zip(G, E, strict=True)]) - Gp, 2, axis=(-2, -1)) / size
@@ -97,6 +97,6 @@ def test_the_conditions_of_the_table_are_met_one_by_one(form: Form, side: str, k
 
 def test_what_a_singular_inverse_cannot_reach_is_added_whole() -> None:
     G, Gp = np.eye(2)[None] + 0j, np.diag([1.0, 1e14])[None] + 0j
-    E, rest = completion("inverse_input_multiplicative", G, Gp)
+    E, rest, _ = completion("inverse_input_multiplicative", G, Gp)
     assert not E.any()
     np.testing.assert_array_equal(rest, Gp - G)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from kros.uncertainty import Cover, Form
+from kros.uncertainty import Form
 from kros.uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from kros.uncertainty.weights.cover import Cover
 from kros.uncertainty.weights.entries import fit_entries
 
 DT = 1e-2
@@ -64,16 +63,3 @@ def test_entries_have_their_own_magnitudes(shape: tuple[int, int]) -> None:
     loose = 20 * np.log10(np.abs(found.system.frequency_response(FREQS)) / np.abs(E))
     assert loose.min() >= -1e-9
     assert loose.max() <= 0.05
-
-
-def test_round_trips(tmp_path: Path) -> None:
-    found = static()
-    found.save(tmp_path / "units")
-    again = UnitResiduals.load(tmp_path / "units")
-    assert (again.form, again.unit_ids, again.outside, again.entry_excess) == (
-        found.form,
-        found.unit_ids,
-        found.outside,
-        found.entry_excess,
-    )
-    np.testing.assert_array_equal(again.ratio, found.ratio)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -59,7 +60,6 @@ def test_peaks_between_the_points_of_a_grid_are_covered_and_not_at_the_price_of_
     given = np.array([response(u, GRID) - response(found.nominal_system, GRID) for u in LIGHT])
     loose = -20 * np.log10(largest(found.weight, given, GRID))
     assert loose.max() == pytest.approx(found.overbound_db_max, abs=1e-6)
-    assert found.weight.within_tolerance == (loose.max() <= 1.0)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they
     given = resonances(freqs)
     found = quantify(given, "additive", freqs, sample_period_s=period, max_order=2)
     E = given - found.nominal_response
-    allowed = np.abs(response(found.weight.matrix(), freqs))[:, 0, 0]
+    allowed = np.abs(response(found.weight.left, freqs) @ response(found.weight.right, freqs))[:, 0, 0]
     ratio = np.abs(E).max(axis=0)[:, 0, 0] / allowed
     assert ratio.max() <= 1 + 1e-9
     if (
@@ -97,7 +97,6 @@ def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they
         assert ratio.max() >= 0.5
     loose = -20 * np.log10(ratio.min())
     assert found.overbound_db_max == pytest.approx(loose, abs=1e-6)
-    assert found.weight.within_tolerance == (loose <= 1.0)
 
 
 def test_responses_that_do_not_resolve_a_peak_are_told_so(caplog: pytest.LogCaptureFixture) -> None:
@@ -106,13 +105,11 @@ def test_responses_that_do_not_resolve_a_peak_are_told_so(caplog: pytest.LogCapt
         np.unique(np.concatenate([np.geomspace(1e-3, 0.4, 60), np.linspace(0.028, 0.032, 81)])),
     )
     found = quantify(resonances(coarse), "additive", coarse, sample_period_s=1.0, max_order=1)
-    assert found.unresolved_hz.size
-    assert np.all(np.abs(found.unresolved_hz - 0.03) < 0.003)
-    assert "do not resolve" in found.certificate
+    (peak,) = re.findall(r"do not resolve 1 peaks of the residuals, at ([0-9.]+) Hz", found.certificate)
+    assert abs(float(peak) - 0.03) < 0.003
     assert "more densely" in caplog.text
     caplog.clear()
     resolved = quantify(resonances(fine), "additive", fine, sample_period_s=1.0, max_order=1)
-    assert not resolved.unresolved_hz.size
     assert "resolve" not in resolved.certificate
     assert not caplog.records
 
@@ -170,7 +167,6 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     assert weight.overbound_db_max == pytest.approx(
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )
-    assert not weight.within_tolerance
 
 
 def test_peaks_that_no_grid_point_meets_are_covered() -> None:

@@ -21,9 +21,9 @@ import numpy.typing as npt
 from kros.core.errors import DimensionError
 from kros.observer import Observer
 from kros.observer.certificate.certificate import ReliftCertificate
-from kros.observer.certificate.course import first_error
 from kros.observer.certificate.error import ErrorSystem
-from kros.observer.certificate.search import frozen_gain
+from kros.observer.certificate.proof import frozen_gain
+from kros.observer.certificate.signals import first_error
 from kros.observer.simulate import run_observer
 
 Array = npt.NDArray[np.float64]

@@ -8,10 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from kros.data import EpisodeBatch
-from kros.loops import recursion
 from kros.observer import Observer, ReliftCertificate
-from kros.observer.certificate.course import course
-from kros.observer.certificate.error import ErrorSystem
+from kros.observer.certificate.signals import course, frozen_response
 
 Array = npt.NDArray[np.float64]
 
@@ -30,15 +28,6 @@ class Row:
         return self.error <= self.bound * (1 + 1e-6)
 
 
-def frozen_response(system: ErrorSystem, w: Array, first: Array) -> Array:
-    """Return the scaled error with slopes at rest."""
-    plant = system.moved()
-    start = first @ (np.eye(len(plant.A), first.shape[1]) if system.start is None else system.start).T
-    drive = np.zeros((len(w) + 1, w.shape[1], len(plant.A)))
-    drive[:-1] = w @ plant.B[:, : w.shape[2]].T
-    return np.asarray(recursion(plant.A, drive, start) @ system.C.T)
-
-
 def compared(
     certificate: ReliftCertificate, observer: Observer, batch: EpisodeBatch, estimates: Array | None = None
 ) -> list[Row]:
@@ -48,7 +37,7 @@ def compared(
         w = np.concatenate([seen.omega / scales.residual, seen.noise / scales.noise], axis=-1)
     w[np.isnan(w)] = 0.0
     inside = np.arange(len(seen.error))[:, None] < lengths
-    z = frozen_response(certificate.system(observer), w, seen.first)
+    z, _ = frozen_response(certificate.system(observer), w, seen.first)
     energy = [
         np.sum(np.where(inside[: len(s), :, None], s, 0.0) ** 2, axis=(0, 2)) for s in (z, seen.error / scales.error, w)
     ]

@@ -6,8 +6,8 @@ import numpy as np
 
 from kros.core.lti import StateSpace
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Monitor, Observer, Runtime, Seen
-from kros.observer.monitor import octaves
+from kros.observer import FilterBank, Observer, Runtime, Seen
+from kros.observer.monitor import Monitor, octaves
 from kros.synthesis import Injection
 
 STATES, DT = ("position", "velocity", "current"), 1e-3
@@ -115,9 +115,7 @@ def watched(observer, bound=1.0):
     """With a monitor that is exceeded now and then by what `samples` does."""
     filters, weights = octaves(), np.array([[4, 3, 3, 0, 3, 3]])
     limits = bound * np.full(weights.shape, 0.02)
-    monitor = Monitor(
-        filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, {"with load": 1.0, "*/": -8.0}, first=0.1
-    )
+    monitor = Monitor(filters, 0.02, 50, np.array([0.7]), limits, weights, 0.02, first=0.1)
     return replace(observer, monitor=monitor)
 
 
@@ -132,9 +130,8 @@ def samples(count, turns=0.0, faults=True):
     return y, u
 
 
-def in_python(observer, y, u, track=None, condition=None):
+def in_python(observer, y, u, track=None):
     running = observer.start(y[0])
-    running.condition = condition
     if track is not None:
         running.track(track)
     found = [(np.asarray(running.step(*sample)), int(running.status)) for sample in zip(y, u, strict=True)]

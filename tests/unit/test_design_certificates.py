@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
-from kros.design.certificates import certify_model
+from kros.design.certificates import CertificateSettings, certify_model, guards_of
 from kros.design.synthesize import choose_deployed
 from kros.design.task import Design
 from kros.lifting import Lifting
-from kros.observer import Observer, ReliftScales, ReliftStatus, relift_certificate
+from kros.observer import Observer, ReliftScales, ReliftStatus, Seen, relift_certificate
 from kros.synthesis import Injection, Status, Synthesis
 
 
@@ -81,6 +83,25 @@ def test_wrong_scales_are_refused() -> None:
         relift_certificate(observer("sine", "sin(x)", 0.1), scales=ReliftScales(np.ones(2), np.ones(1), np.ones(1)))
     with pytest.raises(DimensionError, match="finite sizes above zero"):
         ReliftScales(np.zeros(1), np.ones(1), np.ones(1))
+
+
+def test_no_pattern_of_losses_brings_an_estimate_beyond_twice_the_largest_value() -> None:
+    """A model that grows without its correction, with estimates in training that stay near the recordings."""
+    model = np.array([[1.0, 0.1], [0.2, 1.05]]), np.zeros((2, 1)), (0,), ("u",)
+    K, seen = gain([[1.0], [2.0]], 0.1), Seen(np.ones(1), np.ones(1))
+    corrected = Observer("o", Lifting(("x", "v")), *model, K, Injection.STATE, 0.1, seen=seen)
+    t = 0.1 * np.arange(300)
+    batch = batch_of(np.stack([np.sin(t), np.cos(t)], axis=-1)[:, None], np.zeros((300, 1, 1)), 0.1)
+    (guard,) = guards_of([corrected], [batch], CertificateSettings())
+    size, rng = np.abs(batch.states).max(axis=(0, 1)), np.random.default_rng(0)
+    assert guard is not None
+    assert (np.maximum(np.abs(guard.lower), np.abs(guard.upper)) <= 2 * size * (1 + 1e-12)).all()
+    lost = rng.random((300, 20)) < np.linspace(0.1, 0.98, 20)
+    y = np.where(lost[..., None], np.nan, np.tile(batch.states[..., :1], (1, 20, 1)))
+    estimates = replace(corrected, guard=guard).run(y, np.zeros((300, 20, 1)))
+    free = corrected.run(y, np.zeros((300, 20, 1)))
+    worst = [np.abs(x - batch.states).max(axis=(0, 1)) / size for x in (estimates, free)]
+    assert worst[0].max() <= 3 < worst[1].max()
 
 
 def test_deployed_is_the_most_accurate_observer_that_is_certified_as_it_runs() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays
+from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
 from kros.evaluate import held_out
 from kros.evaluate.held_out import HeldOut
 
@@ -42,6 +42,12 @@ def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypat
 def test_no_episodes_are_refused_with_a_reason():
     with pytest.raises(DataError, match="no episodes were named; check the split"):
         HeldOut(population_of(1), (), {}).outcomes(run)
+
+
+def test_an_episode_that_is_named_twice_is_refused():
+    population = population_of(1)
+    with pytest.raises(DataError, match=r"episode 0 of unit .* named more than once"):
+        EpisodeBatch.read(population, [population.episodes[0]] * 2)
 
 
 def test_an_episode_that_does_not_exist_is_named():

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kros.core.lti import StateSpace
-from kros.identify.refine.metric import peak_residual_db
+from kros.identify.refine.metric import peak_residual
 from kros.uncertainty import quantify, residual
 from kros.uncertainty.forms import completion
-from kros.uncertainty.settings import FitSettings
-from kros.uncertainty.weights.certificate import Method
-from kros.uncertainty.weights.cover import cover_ratio
+from kros.uncertainty.settings import FIT
+from kros.uncertainty.weights import fit, residuals
+from kros.uncertainty.weights.proof import Method
 from kros.uncertainty.weights.residuals import Residuals
 
 UNITS, DT = 210, 0.01
@@ -31,13 +33,12 @@ def fleet(n_units: int = UNITS, outputs: int = 2, seed: int = 0) -> StateSpace:
 @pytest.mark.parametrize(
     ("form", "outputs"), [("inverse_input_multiplicative", 2), ("additive", 2), ("output_multiplicative", 1)]
 )
-def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(form, outputs):
+def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(form, outputs, monkeypatch):
     units, freqs = fleet(outputs=outputs), np.geomspace(0.05, 49, 50)
-    options = {"max_order": 2}
-    found, expected = (
-        quantify(units, form, freqs, **options),
-        quantify(units, form, freqs, fit=FitSettings(block=10**6), **options),
-    )
+    found = quantify(units, form, freqs, max_order=2)
+    for module in (fit, residuals):
+        monkeypatch.setattr(module, "FIT", replace(FIT, block=10**6))
+    expected = quantify(units, form, freqs, max_order=2)
     assert found.nominal == expected.nominal
     np.testing.assert_allclose(found.bounds[found.form], expected.bounds[found.form], rtol=1e-9)
     np.testing.assert_allclose(found.misfit, expected.misfit, rtol=1e-9, atol=1e-12)
@@ -51,24 +52,21 @@ def test_weights_of_a_fleet_cover_all_of_it_and_are_those_of_all_units_together(
     )
     assert (found.remainder is None) == (expected.remainder is None)
     for E, weight in pairs:
-        used = weight.magnitudes(dense)
-        assert cover_ratio(E, used.left, used.right).max() <= 1 + 1e-9
-        best = found.cover if weight is found.weight else found.remainder_cover
-        assert best is not None
+        assert weight.magnitudes(dense).ratio(E).max() <= 1 + 1e-9
     E = residual(form, *(s.frequency_response(freqs) for s in (found.nominal_system, units)))
-    assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
+    assert found.cover.ratio(E).max() <= 1 + 1e-9
 
 
 @pytest.mark.parametrize("rounds", [3, 1])
 def test_units_that_were_not_looked_at_join_the_fit_or_lift_the_weights(monkeypatch, rounds):
     units, freqs = fleet(), np.geomspace(0.05, 49, 60)
-    monkeypatch.setattr(Residuals, "deciding", lambda self, freqs_hz, block: np.arange(3))
-    found = quantify(units, "additive", freqs, max_order=2, fit=FitSettings(rounds=rounds))
+    monkeypatch.setattr(Residuals, "deciding", lambda self, freqs_hz: self.of(np.arange(3)))
+    monkeypatch.setattr(fit, "FIT", replace(FIT, rounds=rounds))
+    found = quantify(units, "additive", freqs, max_order=2)
     E = residual("additive", *(s.frequency_response(freqs) for s in (found.nominal_system, units)))
-    used = found.weight.magnitudes(freqs)
-    assert cover_ratio(E, used.left, used.right).max() <= 1 + 1e-9
+    assert found.weight.magnitudes(freqs).ratio(E).max() <= 1 + 1e-9
     assert found.cover_max <= 1
-    assert cover_ratio(E, found.cover.left, found.cover.right).max() <= 1 + 1e-9
+    assert found.cover.ratio(E).max() <= 1 + 1e-9
 
 
 def test_a_fleet_of_units_that_are_all_the_same():
@@ -82,7 +80,7 @@ def test_the_spread_of_models_is_that_of_all_pairs():
     z = np.exp(1j * np.pi * np.logspace(-6, 0, 50))
     G = np.linalg.solve(z[:, None, None] * np.eye(2) - units.A[:, None], units.B[:, None] + 0j)
     peaks = [np.linalg.norm(np.linalg.pinv(G) @ (g - G), ord=2, axis=(-2, -1)).max() for g in G]
-    found = peak_residual_db(units.A, units.B, 50)
-    assert found == pytest.approx(20 * np.log10(min(peaks)), abs=1e-9)
+    found = peak_residual(units.A, units.B, 50)
+    assert found == pytest.approx(min(peaks), rel=1e-9)
     alike = units[np.zeros(5, int)]
-    assert peak_residual_db(alike.A, alike.B, 50) == -np.inf
+    assert peak_residual(alike.A, alike.B, 50) == 0

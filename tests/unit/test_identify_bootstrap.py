@@ -1,16 +1,12 @@
-"""Edges of resampling: weights, missing episodes, responses, segments by episode."""
+"""Edges of resampling: weights, missing episodes, responses."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from kros.core import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit
 from kros.identify import KoopmanMatrices, ModelSamples, bootstrap_edmd, edmd, episode_weights
-from kros.identify.refine.segments import read_segments, segment_owners
 
 
 def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:
@@ -64,31 +60,11 @@ def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
     )
 
 
-@pytest.mark.parametrize("linear", [False, True])
-def test_responses_of_samples_are_those_of_their_models_or_first_order(linear: bool) -> None:
-    made = replace(samples(), linear=linear)
+def test_responses_of_samples_are_those_of_their_models() -> None:
+    drawn = samples()
     freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
     for unit in range(2):
-        found = made.responses(unit, freqs, dt)
+        found = drawn.responses(unit, freqs, dt)
         for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
-            A, B = made.estimate.A[unit], made.estimate.B[unit]
-            Phi = np.linalg.inv(z * np.eye(2) - A)
-            for draw, (As, Bs) in enumerate(zip(made.samples.A[unit], made.samples.B[unit], strict=True)):
-                full = np.linalg.inv(z * np.eye(2) - As) @ Bs
-                np.testing.assert_allclose(
-                    found[draw, k], Phi @ B + Phi @ ((As - A) @ Phi @ B + Bs - B) if linear else full, rtol=1e-7
-                )
-
-
-@pytest.mark.parametrize("lengths", [[50, 50, 50, 50], [50, 50], [50]])
-def test_segments_are_told_apart_by_episode_as_they_were_drawn(lengths: list[int]) -> None:
-    data = {
-        EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0]
-        for e, n in enumerate(lengths)
-    }
-    made = Population(
-        (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__
-    )
-    keys = {"u": tuple(data)}
-    drawn = read_segments(made, keys, horizon=10, count=9, seed=0)
-    np.testing.assert_array_equal(segment_owners(keys, 9)[0], drawn.states[0, 0, 0] // 1000)
+            for draw, (A, B) in enumerate(zip(drawn.samples.A[unit], drawn.samples.B[unit], strict=True)):
+                np.testing.assert_allclose(found[draw, k], np.linalg.inv(z * np.eye(2) - A) @ B, rtol=1e-7)

@@ -29,7 +29,6 @@ def models(n_units=3, seed=0):
         A=A,
         B=rng.normal(size=(n_units, 3, 1)),
         parameters={"phase": np.arange(n_units, dtype=float)},
-        residual_covariance=np.tile(np.eye(3), (n_units, 1, 1)),
         output_scale=np.ones(3),
         input_scale=np.ones(1),
         alpha=90.0,
@@ -58,7 +57,7 @@ def test_models_survive_the_disk(tmp_path):
     population = models()
     population.save(tmp_path)
     again = ModelSet.load(tmp_path)
-    for name in ("A", "B", "residual_covariance", "output_scale", "input_scale"):
+    for name in ("A", "B", "output_scale", "input_scale"):
         np.testing.assert_array_equal(getattr(again, name), getattr(population, name))
     assert (again.lifting, again.channels, again.unit_ids, again.alpha, again.status) == (
         LIFTING,

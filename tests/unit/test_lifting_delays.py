@@ -179,9 +179,9 @@ def test_free_runs_start_from_the_first_recorded_samples():
 @pytest.mark.parametrize(
     ("functions", "message"),
     [
-        (("position[1]",), "is not an earlier value"),
-        (("position[0]",), "is not an earlier value"),
-        (("position[-0]",), "is not an earlier value"),
+        (("position[1]",), "is no earlier value"),
+        (("position[0]",), "is no earlier value"),
+        (("position[-0]",), "is no earlier value"),
         (("position[-1.5]",), "whole number of samples"),
         (("position[-True]",), "whole number of samples"),
         (("position[phase]",), "whole number of samples"),

@@ -28,7 +28,7 @@ def test_evaluation_agrees_with_numpy(text, reference):
         def reference(p, v, q):
             return np.sqrt(1 + p**2) + np.log(2 + v**2) + np.arctan(q) + np.sign(p)
 
-    found = Formula(text, NAMES)(position=p, velocity=v, phase=q)
+    found = Formula(text, NAMES).evaluate({"position": p, "velocity": v, "phase": q})
     np.testing.assert_allclose(found, reference(p, v, q), rtol=1e-13, atol=1e-13)
 
 

@@ -61,7 +61,7 @@ def test_numbers_are_those_of_double_precision():
         "sqrt(2)*pi*x": np.sqrt(2) * np.pi,
         "exp(exp(6))*x": np.exp(np.exp(6)),
     }.items():
-        assert float(Formula(text, ("x",))(x=1.0)) == pytest.approx(value, rel=1e-14)
+        assert float(Formula(text, ("x",)).evaluate({"x": 1.0})) == pytest.approx(value, rel=1e-14)
 
 
 def test_multiplying_out_has_an_end():

@@ -8,8 +8,8 @@ import pytest
 
 from kros.data import Channel, Role, from_arrays
 from kros.lifting import Lifting
-from kros.observer import Monitor, Observer
-from kros.observer.monitor import octaves
+from kros.observer import Observer
+from kros.observer.monitor import Monitor, octaves
 from kros.study.commands.check import monitored
 from kros.study.commands.field import FieldRecordings
 from kros.study.commands.verdict import junit_text, verdict_lines, with_verdict, worst

@@ -33,7 +33,6 @@ def models() -> ModelSet:
         A=A,
         B=np.array([[0.1], [1.0], [0.3]]) + 0.003 * rng.normal(size=(4, 3, 1)),
         parameters={},
-        residual_covariance=np.broadcast_to(np.eye(3), A.shape),
         output_scale=np.array([1.0, 2.0, 0.5]),
         input_scale=np.array([3.0]),
     )

@@ -82,14 +82,6 @@ def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> Non
         model.score("short", G[11][:3])
 
 
-def test_three_units_flag_nothing(tmp_path: Path) -> None:
-    model = score_outliers(responses(3, 5, outlier=True), FREQS)
-    assert not any(s.outlier for s in model.scores)
-    assert all(np.isfinite(s.score_db) for s in model.scores)
-    model.save(tmp_path)
-    assert OutlierModel.load(tmp_path).threshold_db == pytest.approx(model.threshold_db)
-
-
 def test_identical_units_score_zero() -> None:
     G = np.repeat(responses(1, 6), 5, axis=0)
     model = score_outliers(G, FREQS)

@@ -32,7 +32,8 @@ Parts of the uncertainty are no longer public; use quantify, which takes models,
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
     kros.interop: AdoptedModel from_pykoop models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
-    kros.data: read_csv_folder read_motor_drive_raw check_population TrueChannel kros.data.steps: ByDirection Cut Tare
+    kros.data: read_csv_folder read_motor_drive_raw read_parquet check_population TrueChannel kros.data.steps: ByDirection
+    Cut Tare
 Families that join texts, and centres and kernels to choose from, are no longer part of kros; write the formulas.
     kros.lifting: grid_centres latin_hypercube_centres random_centres formulas products Kernel concatenate
 Random members of the uncertain set are no longer drawn; use the certificate, which bounds all of them.
@@ -41,6 +42,43 @@ Disturbed episodes and errors against truth are no longer public objects; use kr
     kros.evaluate: Disturbance DisturbedEpisodes TrueErrors robustness_rows standard_disturbances
 The function run_study and ExportError are no longer part of kros; use kros.run, and KrosError.
     kros.study: run_study kros.core: ExportError
+Controllers are no longer polished or reduced in order; use balred of python-control, and close the plant's loop with
+the result for its norms.
+    kros.synthesis: reduce_controller
+Refined models have no class apart from others; refine_population returns their matrices.
+    kros.identify.refine: Refinement
+Classes of single results of quantification are no longer public; use what quantify, choose_nominal, fit_magnitude and
+score_outliers return.
+    kros.uncertainty: Cover FittedMagnitude NominalChoice OutlierScore Weight
+Bounds of residuals over every nominal are no longer a function; use sigma_max of residual, or choose_nominal.
+    kros.uncertainty: bounds
+Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
+response data, with from_control for transfer functions and uncertainty_to_control for the result.
+    kros.interop: quantify_models
+Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
+    kros.uncertainty: VariationAndNoise variation_and_noise
+The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
+    kros.export: HeldOut
+Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
+    kros.observer: track_parameter Tracked
+Baselines are no longer public classes; name them in observer.baselines of a study, ekf and filtered_difference.
+    kros.observer: ExtendedKalman FilteredDifference
+Bounds for recorded signals are no longer a public function; kros.synthesize computes them, its facts hold
+set_bound_percent.
+    kros.observer: signal_bound SignalBound
+How a load is read and scaled is no longer public; a study with recordings of the condition load estimates load torque.
+    kros.motor_drive: LoadSettings TorqueScale known_load load_observer
+Status bits of a batch, monitors, guards and observers side by side are internal; step a running observer, read its
+status, and let kros.synthesize make the others.
+    kros.observer: run_with_status sample_status Monitor Guard run_observers
+The raw layout of motor drives is no longer written by a public function; use kros simulate --format raw.
+    kros.data: write_raw
+Tables of preparation steps are no longer parsed by a public function; use kros.read, which takes them as prepare.
+    kros.data.steps: parse_steps
+Report and figures of a run are no longer written by public functions; use kros report and kros figures.
+    kros.report: render write_figures
+Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
+    kros.interop: models_to_control
 """
 
 

@@ -67,9 +67,3 @@ def sigma_max_first(matrices: Array) -> Array:
 def pseudo_inverse_first(matrices: Array) -> Array:
     """Return pseudo-inverses, entries first, of matrices (..., p, m)."""
     return entries_first(np.linalg.pinv(matrices))
-
-
-def lower_factor(pseudo_inverse: Array) -> Array:
-    """Return square `L` with `P P^H = L L^H` for entries-first P of shape (r, s, ...), r <= s."""
-    R = np.linalg.qr(np.conj(np.swapaxes(entries_last(pseudo_inverse), -1, -2)), mode="r")
-    return entries_first(np.conj(np.swapaxes(R, -1, -2)))

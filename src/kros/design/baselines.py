@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -16,9 +15,9 @@ from ..data.population import EpisodeKey
 from ..evaluate import error_percent
 from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
-from ..observer import ExtendedKalman, FilteredDifference, Seen
-from ..observer.baselines.difference import cutoffs_hz, followed
-from ..observer.baselines.extended_kalman import start_covariance
+from ..observer import Seen
+from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
+from ..observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
@@ -59,7 +58,6 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    takes_missing: bool = False
     restarts: bool = True
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
@@ -76,29 +74,30 @@ class Baseline:
         samples, estimate = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), np.empty(0)
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
-            run, some = partial(self._piece, self.by_unit[unit]), samples.of(rows)
-            part = restarted(run, some, values) if self.restarts else run(some.y, some.u, values)
+            estimator, some = self.by_unit[unit], samples.of(rows)
+            if isinstance(estimator, ExtendedKalman):
+                part = estimator.run(some.y, some.u, values, some.starts)
+            elif self.restarts:
+                part = restarted(estimator, some, values)
+            else:
+                part = estimator.run(some.y, some.u, values)
             estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
             estimate[:, rows] = part
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
-    def _piece(self, estimator: Estimator, y: Array, u: Array, parameters: Parameters) -> Array:
-        return estimator.run(y if self.takes_missing else hold_missing(y), u, parameters)
 
-
-def restarted(
-    run: Callable[[Array, Array, Mapping[str, Any]], Array], samples: Screened, parameters: Mapping[str, npt.ArrayLike]
-) -> Array:
-    """Run a batch, every member again from each sample at which it starts again to the next; (n_samples, batch, n)."""
+def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+    """Run a batch, missing measurements held, every member again from each sample at which it starts again."""
     n_samples, batch = samples.starts.shape
-    estimate = run(samples.y, samples.u, parameters)
+    estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
         members = np.flatnonzero(samples.starts[begin])
         again = samples.starts[begin + 1 :, members]
         lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
         rows = slice(begin, int(np.max(lasts)) + 1)
         part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
-        estimate[begin + 1 : rows.stop, members] = run(samples.y[rows, members], samples.u[rows, members], part)[1:]
+        y, u = hold_missing(samples.y[rows, members]), samples.u[rows, members]
+        estimate[begin + 1 : rows.stop, members] = estimator.run(y, u, part)[1:]
     return estimate
 
 
@@ -106,8 +105,8 @@ def make_extended(
     training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
 ) -> Baseline:
     """Tune the extended Kalman filter of a nominal model: process noise of two shapes, all run side by side."""
-    data, lifting, n = training.read(), models.lifting, models.lifting.n_states
-    row, C, R, batch = models.index(unit), list(models.measured), np.diag(noise**2), data.batch
+    batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
+    row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
     shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2)}
     shapes[RESIDUAL] = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
@@ -125,10 +124,10 @@ def make_extended(
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
-    short = data.first(settings.extended_samples)
+    short = batch.head(settings.extended_samples)
     percents = [
-        error_percent(estimate, short.batch.states, short.batch.lengths).mean(axis=0)
-        for estimate in filters.run_all(short.measurements(models.measured), short.batch.inputs, short.parameters)
+        error_percent(estimate, short.states, short.lengths).mean(axis=0)
+        for estimate in filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     ]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
     ranks = [rank(p, np.full(n, 100.0), models.measured) for p in bounded]
@@ -138,13 +137,13 @@ def make_extended(
     shape, level, Q = tried[first]
     facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape}
     tuned = {"": replace(filters, Q=Q)}
-    return Baseline(tuned, models.measured, tuple(range(n)), facts, takes_missing=True, seen=training.seen)
+    return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 
 def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Choose the cut-off of the filtered difference and find its scale."""
-    population, data = training.population, training.read()
-    batch, y, period = data.batch, data.measurements(measured), training.population.sample_period_s
+    population, batch = training.population, training.read()
+    y, period = batch.measurements(measured), population.sample_period_s
     pairs = followed(batch, measured)
     if not pairs:
         states = ", ".join(population.states)
@@ -166,7 +165,7 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     """Train the learned estimator on whole training episodes of all units, once for every unit without it."""
     samples = len(training.population.read(training.keys[0])) * len(training.keys)
     step = max(1, samples // Ridge().rows)
-    moments = Moments.of((part.batch for part in training.one_by_one()), measured, step)
+    moments = Moments.of(training.one_by_one(), measured, step)
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)

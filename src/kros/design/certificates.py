@@ -10,28 +10,28 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..data import EpisodeBatch
+from ..evaluate import error_rms
 from ..loops.filtering import recursion
 from ..observer import (
-    Guard,
     Observer,
     ReliftCertificate,
     ReliftScales,
     ReliftStatus,
-    SignalBound,
     relift_certificate,
     run_observer,
-    run_observers,
-    signal_bound,
 )
+from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
+from ..observer.runtime import Guard
 from ..observer.screen import Screen
+from ..observer.simulate import run_observers
 from ..observer.units import factors, in_sizes
-from ..uncertainty.band_energies import BandEnergies
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import TrainingSet, ValidationSet, hidden_mean
+from .validation import TrainingSet, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -45,6 +45,7 @@ class CertificateSettings:
     losses: int = 12  # patterns of lost measurements that are simulated; in the first one they stop
     box: float = 1.5  # operating box in ranges, where slopes of a lifting have no global bounds
     room: float = 1.0  # by which estimates may leave what they and the recordings were in training, in ranges
+    largest: float = 2.0  # most that an estimate may be where measurements are lost, of the largest value in training
 
 
 DEFAULT = CertificateSettings()
@@ -58,13 +59,13 @@ def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSe
     return _certified_models(designs, data, others, task, settings)
 
 
-def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> ValidationSet:
+def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> EpisodeBatch:
     """Return episodes whose signals make the certified set: the start of the first one of every unit, or short ones."""
-    first = training.first_of_units().read().first(settings.samples)
-    return first if len(first.batch.states) > training.settings.short else training.read()
+    first = training.first_of_units().read().head(settings.samples)
+    return first if len(first.states) > training.settings.short else training.read()
 
 
-def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[ValidationSet]:
+def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
     """Return the same of every condition that observers are not certified for."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
     keys = [k for k in task.recordings.keys if k.condition not in home and k.unit in units]
@@ -74,31 +75,21 @@ def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[Va
 
 def _certified_models(
     designs: Sequence[Design],
-    data: ValidationSet,
-    others: Sequence[ValidationSet],
+    batch: EpisodeBatch,
+    others: Sequence[EpisodeBatch],
     task: DesignTask,
     settings: CertificateSettings,
 ) -> list[Design]:
     """Certify corrected models, which run side by side."""
-    observers, batch = [design.observer for design in designs], data.batch
-    first = observers[0]
-    guards = guards_of(observers, [data, *others], settings)
-    scales = scales_of(observers, data, task)
+    observers = [design.observer for design in designs]
+    guards = guards_of(observers, [batch, *others], settings)
+    scales = scales_of(observers, batch, task)
     certificates = [certify_model(o, s, task, settings.box) for o, s in zip(observers, scales, strict=True)]
-    estimates = run_observers(observers, data.measurements(first.measured), batch.inputs, first.own(batch.parameters))
-    arrived = estimates
-    if batch.lost is not None:  # bounds are for measurements that arrive
-        y = batch.measurements(first.measured, arrived=False)
-        arrived = run_observers(observers, y, batch.inputs, first.own(batch.parameters))
-    errors = [data.compare(estimates), *(other.percent_of_all(observers) for other in others)]
-    hidden = np.exp(np.mean([np.log(hidden_mean(percent, first.measured)) for percent in errors], axis=0))
-    lost = loss_error_percent(observers, data, settings)
-    known: dict[bytes, BandEnergies] = {}
-    certified = []
+    hidden = hidden_error_percent(observers, [batch, *others])
+    lost, certified = loss_error_percent(observers, batch, settings), []
     for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
         observer = observers[k]
-        bound = signal_bound(certificate, observer, batch, arrived[k], known)
-        bound = bound.in_sizes(factors(observer, {})[0][: len(bound.states)])
+        bound = signal_bound(certificate, observer, batch).in_sizes(factors(observer, {})[0][: len(observer.recorded)])
         certificate = certificate.in_sizes(observer, {})
         facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
         observer = replace(observer, guard=guards[k])
@@ -108,27 +99,24 @@ def _certified_models(
 
 def _certified_filters(
     design: Design,
-    data: ValidationSet,
-    others: Sequence[ValidationSet],
+    batch: EpisodeBatch,
+    others: Sequence[EpisodeBatch],
     task: DesignTask,
     settings: CertificateSettings,
 ) -> Design:
     """Certify a filter bank; its errors in training are raised to those on units that were left out."""
-    observer, batch = design.observer, data.batch
+    observer = design.observer
     n, measured = len(observer.recorded), observer.measured
-    estimates = run_observer(observer, data.measurements(measured), batch.inputs, observer.own(batch.parameters))
-    error = estimates[..., :n] - batch.states
-    inside = (np.arange(len(error))[:, None] < batch.lengths)[..., None]
-    square = np.sum(np.where(inside, error, 0.0) ** 2, axis=0) / batch.lengths[:, None]
+    estimates = run_observer(observer, batch.measurements(measured), batch.inputs, observer.own(batch.parameters))
+    square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
     units = list(dict.fromkeys(batch.units))
     errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
     sizes, by = task.models.output_scale[:n], factors(observer, {})[0]
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
     growth = design.facts["left_out_to_training"]
     left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
-    percents = [data.compare([estimates])[0], *(other.percent(observer) for other in others)]
-    hidden = float(np.exp(np.mean([np.log(hidden_mean(percent * left_out, measured)) for percent in percents])))
-    lost = float(loss_error_percent([observer], data, settings)[0])
+    hidden = float(hidden_error_percent([observer], [batch, *others], left_out)[0])
+    lost = float(loss_error_percent([observer], batch, settings)[0])
     certificate = filter_certificate(observer, scales)
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
     certificate = replace(certificate, scales=scales)
@@ -150,28 +138,35 @@ def _facts(
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
-def scales_of(observers: Sequence[Observer], data: ValidationSet, task: DesignTask) -> list[ReliftScales]:
+def hidden_error_percent(
+    observers: Sequence[Observer], batches: Sequence[EpisodeBatch], by: float | Array = 1.0
+) -> Array:
+    """Return the mean error of hidden states over conditions, (observer,); errors are multiplied by factors, (n,)."""
+    percents = [percent_of(observers, batch) * by for batch in batches]
+    logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
+    return np.asarray(np.exp(np.mean(logs, axis=0)))
+
+
+def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:
     """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
     known: dict[bytes, ReliftScales] = {}
     for observer in observers:
         model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
         if model not in known:
-            batch, values = data.batch, observer.own(data.batch.parameters)
+            values = observer.own(batch.parameters)
             residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
             known[model] = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
     return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
 
 
-def loss_error_percent(observers: Sequence[Observer], data: ValidationSet, settings: CertificateSettings) -> Array:
+def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, settings: CertificateSettings) -> Array:
     """Return the largest error in percent of the largest value where measurements are lost, shape (observer,)."""
-    rows, first = np.arange(settings.losses) % len(data.batch.keys), observers[0]
-    some = data.part(rows.tolist()).first(int(data.batch.lengths[rows].min()))
-    y, x = some.measurements(first.measured), some.batch.states
+    rows, first = np.arange(settings.losses) % len(batch.keys), observers[0]
+    some = batch.take(rows.tolist()).head(int(batch.lengths[rows].min()))
+    y, x = some.measurements(first.measured), some.states
     lost = losses(np.random.default_rng(0), len(y), len(rows))
     lost[len(y) // 4 :, 0] = True
-    estimates = run_observers(
-        observers, np.where(lost[..., None], np.nan, y), some.batch.inputs, first.own(some.parameters)
-    )
+    estimates = run_observers(observers, np.where(lost[..., None], np.nan, y), some.inputs, first.own(some.parameters))
     size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
@@ -195,38 +190,42 @@ def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, si
 
 
 def guards_of(
-    observers: Sequence[Observer], data: Sequence[ValidationSet], settings: CertificateSettings
+    observers: Sequence[Observer], batches: Sequence[EpisodeBatch], settings: CertificateSettings
 ) -> list[Guard | None]:
     """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
     n, q = observers[0].lifting.n_states, list(observers[0].measured)
     low, high = np.full((len(observers), n), np.inf), np.full((len(observers), n), -np.inf)
-    largest = [np.zeros(o.controller.n_states) for o in observers]
-    for part in data:
-        batch, y, recorded = part.batch, part.measurements(q), part.batch.states.shape[-1]
+    size, largest = np.zeros(n), [np.zeros(o.controller.n_states) for o in observers]
+    for batch in batches:
+        y, recorded = batch.measurements(q), batch.states.shape[-1]
         for first in (0, len(y) // 2):
             x = run_observers(observers, y[first:], batch.inputs[first:], observers[0].own(batch.parameters))
             inside = (np.arange(first, len(y))[:, None] < batch.lengths)[..., None]
             states, least, most = batch.states[first:], np.full(n, np.inf), np.full(n, -np.inf)
             least[:recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
             most[:recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+            size = np.maximum(size, np.maximum(np.abs(least), np.abs(most)))
             low = np.minimum(low, np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least))
             high = np.maximum(high, np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most))
             for i, o in enumerate(observers):
                 nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
                 corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
                 largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
-    return [_guard(o, a, b, c, settings.room) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
+    room, most = settings.room * np.maximum(high - low, np.finfo(float).tiny), settings.largest * size
+    low, high = np.maximum(low - room, np.minimum(low, -most)), np.minimum(high + room, np.maximum(high, most))
+    return [_guard(o, a, b, c, settings) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
 
 
-def _guard(observer: Observer, low: Array, high: Array, correction: Array, room: float) -> Guard | None:
+def _guard(
+    observer: Observer, low: Array, high: Array, correction: Array, settings: CertificateSettings
+) -> Guard | None:
     """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
     if not all(np.isfinite(side).all() for side in (low, high, correction)):
         return None
-    wider = room * np.maximum(high - low, np.finfo(float).tiny)
-    low, high, at = low - wider, high + wider, list(observer.measured)
-    screen = Screen.of(observer).measured
-    low[at], high[at] = np.minimum(low[at], screen.least), np.maximum(high[at], screen.most)
-    return Guard(low, high, (1 + 2 * room) * np.maximum(correction, np.finfo(float).tiny), settling(observer))
+    at, q, screen = list(observer.measured), len(observer.measured), Screen.of(observer)
+    low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
+    correction = (1 + 2 * settings.room) * np.maximum(correction, np.finfo(float).tiny)
+    return Guard(low, high, correction, settling(observer))
 
 
 def in_recorded_units(design: Design) -> Design:

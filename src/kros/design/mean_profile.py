@@ -87,7 +87,7 @@ def make_mean_profile(
     units = dict.fromkeys(unit for of_units in means for unit in of_units)
     facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
     by_unit = {unit: without(unit) for unit in (*units, "")}
-    return Baseline(by_unit, measured, estimated, facts, takes_missing=True, restarts=False, seen=training.seen)
+    return Baseline(by_unit, measured, estimated, facts, restarts=False, seen=training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
@@ -109,7 +109,7 @@ def unit_means(
     profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
     n_samples, read, groups = 0, 0, len({(key.unit, key.condition) for key in training.keys})
     for part in training.one_by_one():
-        (unit,), states, u = part.batch.units, part.batch.states[:, 0, list(estimated)], part.batch.inputs[:, 0]
+        (unit,), states, u = part.units, part.states[:, 0, list(estimated)], part.inputs[:, 0]
         apart = np.array([difference(motion, u, sizes) for motion in motions])
         closest = np.minimum(closest, apart)
         if apart.min() <= settings.same_motion:

@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ..core.work import Work
 from ..observer import Observer
-from ..observer.monitor import WEIGHT, Monitor, octaves, poisson_interval
+from ..observer.monitor import WEIGHT, Monitor, octaves
 from ..observer.simulate import run_innovations
 from ..uncertainty.outliers.tail import LEAST_SCORES, prediction_bound
 from .validation import TrainingSet, spread
@@ -28,6 +28,7 @@ from .validation import TrainingSet, spread
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Group = tuple[str, str]  # unit and condition
+Judged = tuple[Array, npt.NDArray[np.bool_]]  # innovations, (n_samples, q), and which samples are judged
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,6 @@ class MonitorSettings:
     shrink: float = 0.7  # of covariances to their diagonal
     quietest: float = 0.5  # least variance of a band, share of the median
     motions: int = 6  # of a unit; more of them add nothing to a bound
-    moving: float = 0.1  # share of the RMS step of a measurement, below which a machine rests
 
 
 DEFAULT = MonitorSettings()
@@ -63,48 +63,24 @@ def fit_monitor(
         needed = f"its bound needs training episodes of {LEAST_SCORES} units, found {len(units)}"
         log.info("%s has no monitor: %s.", observer.name, needed)
         return None
-    size = np.sqrt(np.mean([e.mean_square() for e in every], axis=0))
+    size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged in every], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
     even, forget, first = np.ones((len(size), len(filters))), 1 / settings.memory, 1 / settings.beginning
-    free = Monitor(filters, forget, settle, size, even, weighted(even), rate, units=len(units), first=first)
-    squares = {group: partial(_mean_squares, free, run) for group, run in episodes.items()}
+    free = Monitor(filters, forget, settle, size, even, weighted(even), rate, len(units), first)
+    # Mean squares are computed wherever they are needed: all of them would fill a memory.
+    squares = {group: partial(free.in_turn, run) for group, run in episodes.items()}
     largest = {
         group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in of()], axis=0), 1e-30))
         for group, of in squares.items()
     }
     weights = weighted(steady(largest, settings))
     peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
-    bound, bounds = _bounds(peaks, units, settings)
+    bound = bound_of_peaks([max((p for (u, _), p in peaks.items() if u == unit), key=max) for unit in units], settings)
     shape = np.mean(list(largest.values()), axis=0)
     limits = 10 ** ((shape - (shape * weights).sum() / WEIGHT + bound) / 10)
-    step = np.sqrt(np.nanmean([e.step_square() for e in every], axis=0))
-    hours = sum(e.moving(settings.moving * step) for e in every) * observer.sample_period_s / 3600
-    loud = [p for group, of in squares.items() if max(peaks[group]) > bound for p in of()]
-    alarms = sum(_alarms(_decibels(p, weights) > bound) for p in loud)
-    return replace(free, limits=limits, weights=weights, bounds=bounds, hours=hours, alarms=alarms)
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """Innovations and measurements of an episode, shape (n_samples, q), and which samples are judged."""
-
-    innovation: Array
-    judged: npt.NDArray[np.bool_]
-    y: Array
-
-    def mean_square(self) -> Array:
-        """Mean square of the innovations that are judged, shape (q,)."""
-        return np.asarray(np.mean(np.minimum(self.innovation[self.judged] ** 2, 1e300), axis=0))
-
-    def step_square(self) -> Array:
-        """Mean square of the steps of measurements, shape (q,)."""
-        return np.asarray(np.nanmean(np.diff(self.y, axis=0) ** 2, axis=0))
-
-    def moving(self, least: Array) -> int:
-        """Return how many judged samples have a step of at least a size, shape (q,), in some measurement."""
-        return int(np.count_nonzero(self.judged[1:] & (np.abs(np.diff(self.y, axis=0)) > least).any(axis=-1)))
+    return replace(free, limits=limits, weights=weights)
 
 
 def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[Group, TrainingSet]]:
@@ -124,31 +100,11 @@ def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
     """Run the observer on episodes as the sensor shows them, and return those in which something is judged."""
-    batch = training.read_whole().batch
+    batch = training.read_whole()
     y = batch.measurements(observer.measured)
     nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
-    episodes = [Judged(nu[:n, i].copy(), judged[:n, i].copy(), y[:n, i].copy()) for i, n in enumerate(batch.lengths)]
-    return [episode for episode in episodes if episode.judged.any()]
-
-
-def _mean_squares(monitor: Monitor, episodes: Sequence[Judged]) -> list[Array]:
-    """Return mean squares of bands; they are computed wherever they are needed, all of them would fill a memory."""
-    return monitor.in_turn([(e.innovation, e.judged) for e in episodes])
-
-
-def _alarms(above: npt.NDArray[np.bool_]) -> int:
-    return int(np.count_nonzero(above[1:] & ~above[:-1]))
-
-
-def _bounds(
-    peaks: Mapping[Group, list[float]], units: Sequence[str], settings: MonitorSettings
-) -> tuple[float, dict[str, float]]:
-    """Return the bound of levels over all conditions, dB, and what is added to it in every condition."""
-    conditions = list(dict.fromkeys(condition for _, condition in peaks))
-    loudest = [max((peaks[u, c] for c in conditions if (u, c) in peaks), key=max) for u in units]
-    bound = bound_of_peaks(loudest, settings)
-    of = {c: [peaks[u, c] for u in units if (u, c) in peaks] for c in conditions if len(conditions) > 1}
-    return bound, {c: bound_of_peaks(p, settings) - bound for c, p in of.items() if len(p) >= LEAST_SCORES}
+    episodes = [(nu[:n, i].copy(), judged[:n, i].copy()) for i, n in enumerate(batch.lengths)]
+    return [(values, good) for values, good in episodes if good.any()]
 
 
 def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings = DEFAULT) -> float:
@@ -204,12 +160,8 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
 
 
 def monitor_facts(monitor: Monitor) -> dict[str, Any]:
-    """Return both rates of false alarms: of one more good unit as stated, and an hour as counted, 95 % interval."""
-    low, high = poisson_interval(monitor.alarms)
-    per_hour = (None, None) if monitor.hours == 0 else (low / monitor.hours, high / monitor.hours)
-    names = ("false_alarm_rate", "units", "hours", "alarms")
-    facts = {name: getattr(monitor, name) for name in names}
-    return facts | {"alarms_per_hour": per_hour, "settle_samples": monitor.settle}
+    """Return what the metrics say of a monitor."""
+    return {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
 
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:

@@ -24,7 +24,7 @@ from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
-from ..observer.sensor import Limit, Sensors, limits_of, require_measured
+from ..observer.sensor import Sensors, require_measured, sides
 from ..synthesis import ObserverProblem
 from ..uncertainty.quantify import UncertainModels
 from .about import about
@@ -194,7 +194,8 @@ def tasks_of(
     identified, covered = uncertain.models, uncertain.sets[kind]
     require_measured(sensor or {}, identified.population.measured)
     recorded = identified.models(kind)
-    models = recorded.normalised()
+    models, n = recorded.normalised(), recorded.lifting.n_states
+    lower, upper = sides(identified.facts.limits, recorded.lifting.states)
     noise = measurement_noise(identified, recorded, sensor or {}) / recorded.output_scale[list(recorded.measured)]
     problem, refusal = usable_problem(models, covered, noise)
     task = partial(
@@ -207,22 +208,17 @@ def tasks_of(
         training=TrainingSet.of(identified, recorded, sensor).normalised(recorded),
         recordings=TrainingSet.whole(identified, recorded, sensor).normalised(recorded),
         covered=covered.unit_ids,
-        limits=_limits(identified, recorded),
+        limits=(lower / recorded.output_scale[:n], upper / recorded.output_scale[:n]),
     )
     return [task(f"{kind}/{m.name}", m) for m in suitable(methods, kind, identified.kinds)]
-
-
-def _limits(identified: IdentifiedModels, models: ModelSet) -> dict[str, Limit]:
-    """Return limits that states reached in the recordings, in channels divided by their ranges."""
-    limits = limits_of({}, identified.facts.limits, identified.population.states)
-    return {name: limit.in_unit(models.sizes[name]) for name, limit in limits.items()}
 
 
 def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Sensors) -> Array:
     """Return the standard deviation of every measurement's noise."""
     names, steps = [models.lifting.states[i] for i in models.measured], np.zeros(len(models.measured))
     if any(one.jitter_samples for one in sensor.values()):
-        steps = TrainingSet.of(identified, models).read().steps(models.measured)
+        states = TrainingSet.of(identified, models).read().states[..., list(models.measured)]
+        steps = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=(0, 1)))
     variances = []
     for name, step in zip(names, steps, strict=True):
         one = sensor.get(name, Sensor())

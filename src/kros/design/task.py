@@ -17,9 +17,9 @@ from ..core.lti import gain
 from ..identify import ModelSet
 from ..lifting import Lifting
 from ..observer import Observer, ReliftCertificate, Runtime
-from ..observer.sensor import Limits, Sensors, delay_of, sides
+from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
-from .validation import TrainingSet, rank
+from .validation import TrainingSet, percent_of, rank
 
 Array = npt.NDArray[np.float64]
 FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
@@ -125,7 +125,7 @@ class DesignTask:
     training: TrainingSet
     recordings: TrainingSet
     covered: tuple[str, ...] = ()
-    limits: Limits = field(default_factory=dict)
+    limits: tuple[Array, Array] | None = None  # of states, (n,) each, infinite where there is none
 
     def observer(
         self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None
@@ -160,8 +160,8 @@ class DesignTask:
     @property
     def runtime(self) -> Runtime:
         """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
-        lower, upper = sides(self.limits, self.models.lifting.states) if self.limits else (None, None)
-        return Runtime(delay_of(self.sensor), lower, upper)
+        limited = self.limits is not None and bool(np.isfinite(self.limits).any())
+        return Runtime(delay_of(self.sensor), *(self.limits if self.limits and limited else (None, None)))
 
     @property
     def selector(self) -> Array:
@@ -182,7 +182,7 @@ class DesignTask:
 
     def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
         """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""
-        limit, *errors = self.training.read().percent_of_all([self.observer(self.open_loop()), *observers])
+        limit, *errors = percent_of([self.observer(self.open_loop()), *observers], self.training.read())
         ranks = [rank(error, limit, self.models.measured) for error in errors]
         first = min(range(len(ranks)), key=lambda i: ranks[i])
         return first, ranks[first][1]

@@ -17,8 +17,9 @@ from ..evaluate import error_rms
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Seen, run_observer, run_observers
+from ..observer import Observer, Seen
 from ..observer.sensor import Sensors, in_units
+from ..observer.simulate import run_observers
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -93,88 +94,51 @@ class TrainingSet:
         firsts = {key.unit: key for key in reversed(self.keys)}
         return replace(self, keys=tuple(key for key in self.keys if firsts[key.unit] == key))
 
-    def read(self) -> ValidationSet:
+    def read(self) -> EpisodeBatch:
         """Read the episodes, cut short."""
         return self._shown(self.keys, self.settings.samples)
 
-    def read_whole(self) -> ValidationSet:
+    def read_whole(self) -> EpisodeBatch:
         """Read the episodes."""
         return self._shown(self.keys)
 
     def read_one(self, key: EpisodeKey) -> EpisodeBatch:
         """Read an episode, whole, without the bias: its size is declared, and its sign cannot be learned."""
-        return self._unbiased._shown([key]).batch
-
-    def one_by_one(self) -> Iterator[ValidationSet]:
-        """Read every episode by itself, as `read_one` does."""
-        return (self._unbiased._shown([key]) for key in self.keys)
-
-    @property
-    def _unbiased(self) -> TrainingSet:
         sensor = {name: one.model_copy(update={"bias": 0}) for name, one in self.sensor.items()}
-        return replace(self, sensor=sensor)
+        return replace(self, sensor=sensor)._shown([key])
 
-    def _shown(self, keys: Sequence[EpisodeKey], limit: int | None = None) -> ValidationSet:
-        batch, states = EpisodeBatch.read(self.population, keys, limit, self.parameters), self.population.states
-        return ValidationSet(as_shown(batch, self.sensor, states), self.sensor, states)
+    def one_by_one(self) -> Iterator[EpisodeBatch]:
+        """Read every episode by itself, as `read_one` does."""
+        return map(self.read_one, self.keys)
+
+    def _shown(self, keys: Sequence[EpisodeKey], limit: int | None = None) -> EpisodeBatch:
+        """Read episodes as the sensor shows them."""
+        batch = EpisodeBatch.read(self.population, keys, limit, self.parameters)
+        return as_shown(batch, self.sensor, self.population.states)
 
 
-@dataclass(frozen=True, eq=False)
-class ValidationSet:
-    """Training episodes in memory, as the sensor that was declared shows them."""
+def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
+    """Return the errors of observers of one model of every recorded state, shape (observer, n), see `compare`."""
+    values, y = observers[0].own(batch.parameters), batch.measurements(observers[0].measured)
+    errors: list[Array] = []
+    for start in range(0, len(observers), SIDE_BY_SIDE):
+        some = observers[start : start + SIDE_BY_SIDE]
+        errors += list(compare(run_observers(some, y, batch.inputs, values), batch))
+    return np.array(errors)
 
-    batch: EpisodeBatch
-    sensor: Sensors = field(default_factory=dict)
-    states: tuple[str, ...] = ()
 
-    @property
-    def parameters(self) -> dict[str, Array]:
-        """Lifting parameters, shape (batch,) each."""
-        return self.batch.parameters
-
-    def first(self, n_samples: int) -> ValidationSet:
-        """Return the first samples of the same episodes."""
-        return replace(self, batch=self.batch.head(n_samples))
-
-    def part(self, rows: Sequence[int]) -> ValidationSet:
-        """Return some of the episodes."""
-        return replace(self, batch=self.batch.take(rows))
-
-    def measurements(self, measured: Sequence[int]) -> Array:
-        """Return what the sensor shows of measured states, shape (n_samples, batch, q); NaN where a sample is lost."""
-        return self.batch.measurements(measured)
-
-    def steps(self, measured: Sequence[int]) -> Array:
-        """Return the RMS change of measured states from sample to sample, shape (q,)."""
-        return np.asarray(np.sqrt(np.mean(np.diff(self.batch.states[..., list(measured)], axis=0) ** 2, axis=(0, 1))))
-
-    def percent(self, observer: Observer) -> Array:
-        """Return an observer's error of every recorded state, shape (n,), see `compare`."""
-        values = self.parameters if observer.lifting.parameters else None
-        estimate = run_observer(observer, self.measurements(observer.measured), self.batch.inputs, values)
-        return self.compare([estimate])[0]
-
-    def percent_of_all(self, observers: Sequence[Observer]) -> Array:
-        """Return the same for observers of one model with different corrections, shape (observer, n)."""
-        values = self.parameters if observers[0].lifting.parameters else None
-        y, errors = self.measurements(observers[0].measured), list[Array]()
-        for start in range(0, len(observers), SIDE_BY_SIDE):
-            some = observers[start : start + SIDE_BY_SIDE]
-            errors += list(self.compare(run_observers(some, y, self.batch.inputs, values)))
-        return np.array(errors)
-
-    def compare(self, estimates: Iterable[Array]) -> Array:
-        """Return mean errors in percent of a unit's largest value, shape (estimate, n); infinite where one diverges."""
-        x, lengths = self.batch.states, self.batch.lengths
-        inside = np.arange(len(x))[:, None, None] < lengths[:, None]
-        size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
-        groups = [(key.unit, key.condition) for key in self.batch.keys]  # an episode without motion has no size
-        largest = {group: size[[i for i, g in enumerate(groups) if g == group]].max(axis=0) for group in set(groups)}
-        size = np.array([largest[group] for group in groups])
-        x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
-        with np.errstate(divide="ignore", invalid="ignore"):
-            errors = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
-        return np.where(np.isfinite(errors), errors, np.inf)
+def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:
+    """Return mean errors in percent of a unit's largest value, shape (estimate, n); infinite where one diverges."""
+    x, lengths = batch.states, batch.lengths
+    inside = np.arange(len(x))[:, None, None] < lengths[:, None]
+    size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
+    groups = [(key.unit, key.condition) for key in batch.keys]  # an episode without motion has no size
+    largest = {group: size[[i for i, g in enumerate(groups) if g == group]].max(axis=0) for group in set(groups)}
+    size = np.array([largest[group] for group in groups])
+    x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
+    with np.errstate(divide="ignore", invalid="ignore"):
+        errors = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
+    return np.where(np.isfinite(errors), errors, np.inf)
 
 
 def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:

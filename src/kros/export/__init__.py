@@ -15,10 +15,12 @@ Examples
 True
 """
 
-from .c99.accuracy import HeldOut
+from ..core.removed import refusing
 from .c99.compiled import CompiledObserver
 from .c99.numbers import LoadOutput
 from .c99.write import export_c
 from .fmu.write import export_fmu
 
-__all__ = ["CompiledObserver", "HeldOut", "LoadOutput", "export_c", "export_fmu"]
+__all__ = ["CompiledObserver", "LoadOutput", "export_c", "export_fmu"]
+
+__getattr__ = refusing(__name__)

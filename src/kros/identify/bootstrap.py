@@ -1,18 +1,15 @@
 """Uncertainty of the estimate itself: models of resampled episodes, from what each episode was reduced to.
 
     per-episode factors --draw episodes--> weighted restacking --EDMD--> samples of (A, B)
-    per-episode normal equations of a finished refinement --draw episodes--> one Gauss-Newton step --> samples of (A, B)
 
 Whole episodes are drawn, since samples of one episode depend on each other. Of E episodes E - 1 are drawn with
 replacement and each counts E / (E - 1) times as often as it was drawn: drawing E of E would give (E - 1) / E of the
-variance (Rao and Wu, J. Am. Stat. Assoc. 83, 1988). The prior, its centre, `alpha` and the calibrated parameters stay
-as they are; a bias that all episodes share is not seen.
+variance (Rao and Wu, J. Am. Stat. Assoc. 83, 1988). `alpha` and the calibrated parameters stay as they are; a bias that
+all episodes share is not seen.
 
 Symbols
 -------
 w : weights of the episodes, (unit, draw, episode)
-N : ``[J r]^T [J r]`` of one episode, (P + 1, P + 1); H and g its blocks J^T J and J^T r
-V : parameters, [A B] = V T^T
 """
 
 from __future__ import annotations
@@ -35,9 +32,6 @@ Array = npt.NDArray[np.float64]
 class ModelSamples:
     """Models of resampled episodes around an estimate.
 
-    Samples that are `linear` are first-order steps: they have the right spread, but what follows from them nonlinearly,
-    such as a response or an eigenvalue, is to be taken to first order around the estimate as well (`responses` does).
-
     Examples
     --------
     >>> import numpy as np
@@ -51,20 +45,10 @@ class ModelSamples:
     unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
     samples: KoopmanMatrices  # A (unit, draw, n, n) and B (unit, draw, n, m)
-    linear: bool = False
 
     def responses(self, row: int, freqs_hz: Array, sample_period_s: float) -> npt.NDArray[Any]:
-        """Return frequency responses of one unit's samples, shape (draw, frequency, n, m).
-
-        First-order samples have first-order deviations, ``dG = (zI - A)^-1 dW [G; I]``.
-        """
-        drawn = KoopmanMatrices(self.samples.A[row], self.samples.B[row])
-        if not self.linear:
-            return drawn.responses(freqs_hz, sample_period_s)
-        A, B = self.estimate.A[row], self.estimate.B[row]
-        G = KoopmanMatrices(A, B).responses(freqs_hz, sample_period_s)
-        Phi = KoopmanMatrices(A, np.eye(len(A))).responses(freqs_hz, sample_period_s)
-        return np.asarray(G + Phi @ ((drawn.A - A)[:, None] @ G + (drawn.B - B)[:, None]))
+        """Return frequency responses of one unit's samples, shape (draw, frequency, n, m)."""
+        return KoopmanMatrices(self.samples.A[row], self.samples.B[row]).responses(freqs_hz, sample_period_s)
 
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
@@ -134,38 +118,3 @@ def bootstrap_edmd(
     drawn = KoopmanMatrices(*(np.stack([getattr(m, name) for m in models[1:]], axis=1) for name in ("A", "B")))
     ids = tuple(map(str, range(units) if unit_ids is None else unit_ids))
     return ModelSamples(ids, models[0], drawn)
-
-
-def one_step_deviations(normal: Array, information: Array, weights: Array) -> Array:
-    """Return where one Gauss-Newton step on resampled episodes leads from the estimate, shape (unit, draw, P)."""
-    size = np.sqrt(np.maximum(np.diagonal(information, axis1=1, axis2=2), np.finfo(float).tiny))
-    deviations = []
-    for draw in np.swapaxes(weights, 0, 1):
-        change = np.einsum("ue,ueij->uij", draw - 1, normal[:, :, :-1])  # (unit, P, P + 1)
-        H = (information + change[..., :-1]) / (size[:, :, None] * size[:, None])
-        deviations.append(_solve(H, change[..., -1] / size) / size)
-    return np.stack(deviations, axis=1)
-
-
-def bootstrap_refined(
-    units: KoopmanMatrices, whitening: Array, information: Array, normal: Array, weights: Array, unit_ids: Sequence[str]
-) -> ModelSamples:
-    """Return refined models of resampled episodes, one Gauss-Newton step from the finished ones, `linear`.
-
-    The prior keeps responses together along a curved set of (A, B), which a straight step leaves. Against full refits
-    of three simulated drives, first-order bands were right to about 20 percent, bands of the steps' own responses 2.6
-    to 12 times too wide.
-    """
-    n, p = units.A.shape[-1], len(whitening)
-    dW = one_step_deviations(normal, information, weights).reshape(len(units.A), -1, n, p) @ whitening.T
-    samples = KoopmanMatrices(units.A[:, None] + dW[..., :n], units.B[:, None] + dW[..., n:])
-    return ModelSamples(tuple(unit_ids), units, samples, linear=True)
-
-
-def _solve(H: Array, g: Array) -> Array:
-    """Solve scaled normal equations, batched; directions that rounding alone determines do not move."""
-    values, vectors = np.linalg.eigh((H + np.swapaxes(H, -1, -2)) / 2)
-    known = values > 450 * np.finfo(float).eps * np.maximum(values[..., -1:], np.finfo(float).tiny)
-    along = np.einsum("...ji,...j->...i", vectors, g)
-    along = np.divide(along, values, out=np.zeros_like(along), where=known)
-    return np.asarray(np.einsum("...ij,...j->...i", vectors, along))

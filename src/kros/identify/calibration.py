@@ -69,8 +69,6 @@ class Segment:
 
     speed: float
     phase: float
-    amplitude: float
-    n_samples: int
 
     @property
     def forward(self) -> bool:
@@ -155,8 +153,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
         speed = per_reference * float(np.mean(reference[start:stop])) if stop > start else 0.0
         period = 2 * np.pi / (spec.ratio * abs(speed) * dt) if speed else np.inf
         if stop - start >= spec.least_periods * period and period > spec.least_samples:
-            phase, amplitude = _error_phase(spec.ratio * angle[start:stop], -measured[start:stop])
-            segments.append(Segment(speed, phase, amplitude, int(stop - start)))
+            segments.append(Segment(speed, _error_phase(spec.ratio * angle[start:stop], -measured[start:stop])))
     return segments
 
 
@@ -169,12 +166,12 @@ def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.
     return float(speed @ np.diff(angle)[moving]) / (power * dt * top) if power else 0.0
 
 
-def _error_phase(turn: Array, error: Array) -> tuple[float, float]:
-    """Phase and amplitude of the error at the disturbance's frequency, fitted with drift and second harmonic."""
+def _error_phase(turn: Array, error: Array) -> float:
+    """Phase of the error at the disturbance's frequency, fitted with drift and second harmonic."""
     ramp = np.linspace(-1, 1, turn.size)
     columns = [np.sin(turn), np.cos(turn), np.sin(2 * turn), np.cos(2 * turn), np.ones_like(ramp), ramp, ramp**2]
     along_sin, along_cos = np.linalg.lstsq(np.stack(columns, axis=1), error, rcond=None)[0][:2]
-    return float(np.arctan2(along_cos, along_sin)), float(np.hypot(along_cos, along_sin))
+    return float(np.arctan2(along_cos, along_sin))
 
 
 def unit_phase(segments: Sequence[Segment], unit: str, spec: PhaseSpec) -> UnitPhase:
@@ -228,7 +225,6 @@ def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec
     return PhaseCalibration(spec, lag, {name: unit.on_branch_of(lag) for name, unit in units.items()})
 
 
-log = logging.getLogger(__name__)
 Task = tuple[Population, tuple[EpisodeKey, ...], PhaseSpec]
 
 

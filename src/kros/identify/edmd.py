@@ -123,17 +123,7 @@ def relative_pivots(R: Array) -> Array:
     return np.asarray(np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size)
 
 
-def residual_covariance(R: Array, n_lifted: int, matrices: KoopmanMatrices, n_samples: npt.ArrayLike) -> Array:
-    """Return the covariance of the one-step residual of given models, shape (..., n_lifted, n_lifted)."""
-    p = R.shape[-1] - n_lifted
-    U = np.concatenate([matrices.A, matrices.B], axis=-1)
-    rest = R[..., :, p:] - R[..., :, :p] @ np.swapaxes(U, -1, -2)
-    return np.swapaxes(rest, -1, -2) @ rest / np.asarray(n_samples, dtype=float)[..., None, None]
-
-
-def smallest_stabilising_alpha(
-    factors: list[tuple[Array, int]], margin: float = 0.0, search: AlphaSearch | None = None
-) -> float:
+def smallest_stabilising_alpha(factors: list[tuple[Array, int]], margin: float = 0.0) -> float:
     """Return the infimum of the interval ``[alpha, inf)`` on which every model of every unit is stable.
 
     The stabilising set need not be an interval: the search goes down until a model is unstable, then bisects.
@@ -144,7 +134,6 @@ def smallest_stabilising_alpha(
         One batch of factors over units for every kind of model that has to share `alpha`.
     margin : float
         Stable means a spectral radius below ``1 - margin``.
-    search : AlphaSearch, optional
 
     Returns
     -------
@@ -160,7 +149,7 @@ def smallest_stabilising_alpha(
     >>> round(alpha, 3)
     0.02
     """
-    search = search or AlphaSearch()
+    search = AlphaSearch()
     largest = max(float(np.linalg.norm(R[..., : -n or None, : -n or None], axis=(-2, -1)).max()) for R, n in factors)
     top = 2 + np.ceil(np.log10(largest**2))
     grid = 10.0 ** np.arange(top, top - 2 - search.decades, -1 / search.per_decade)

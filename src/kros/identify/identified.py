@@ -20,7 +20,6 @@ from ..lifting import Lifting
 from .calibration import PhaseCalibration
 from .factors import Factor
 from .model_set import KINDS, ModelSet, kinds_for
-from .refine.model import Refinement
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
@@ -106,7 +105,6 @@ class IdentifiedModels:
     kinds: tuple[str, ...] = ()  # of models; the one that others follow comes first
     sets: Mapping[str, ModelSet] = field(default_factory=dict)  # by `place`
     factors: Mapping[str, EpisodeFactors] = field(default_factory=dict)  # by condition
-    refined: Mapping[str, Refinement] = field(default_factory=dict)  # by kind
 
     def __repr__(self) -> str:
         kinds, facts = ", ".join(self.kinds), self.facts
@@ -168,10 +166,8 @@ class IdentifiedModels:
             models.save(folder / "models" / place)
         for condition, factors in self.factors.items():
             factors.save(folder / "factors" / quote(condition, safe=""), self.lifting, self.population.inputs)
-        for kind, refined in self.refined.items():
-            refined.save(folder / "refinement" / kind)
         content = {"kinds": self.kinds, "sets": list(self.sets), "conditions": list(self.factors)}
-        save_artifact(folder / "models", _KIND, content | {"refined": list(self.refined)})
+        save_artifact(folder / "models", _KIND, content)
 
     @classmethod
     @loader
@@ -188,10 +184,9 @@ class IdentifiedModels:
         sets = Stored(ModelSet.load, {place: folder / "models" / place for place in content["sets"]})
         places = {c: folder / "factors" / quote(c, safe="") for c in content["conditions"]}
         factors = Stored(EpisodeFactors.load, places)
-        refined = Stored(Refinement.load, {kind: folder / "refinement" / kind for kind in content["refined"]})
         lifting = next(sets[kind.name].lifting for kind in KINDS if kind.name in sets)
         calibration = PhaseCalibration.load(folder / "calibration") if lifting.parameters else None
-        return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors, refined)
+        return cls(population, facts, lifting, calibration, tuple(content["kinds"]), sets, factors)
 
 
 def recordings_of(folder: Path) -> Population:

@@ -25,19 +25,18 @@ from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
-from .edmd import AlphaSearch, KoopmanMatrices, edmd, residual_covariance, smallest_stabilising_alpha
+from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
 from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation, require_independent
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
-from .refine import Refinement, RefineOptions, refine_population
-from .refine.metric import peak_residual_db
+from .refine import RefineOptions, refine_population
+from .refine.metric import peak_residual
 from .settings import CalibrationSettings, IdentifySettings, LiftingSettings
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Task = tuple[Population, tuple[EpisodeKey, ...], Lifting]
-Result = tuple[list[ModelSet], dict[str, Refinement]]
 
 
 def identify(
@@ -109,14 +108,12 @@ def with_models(base: IdentifiedModels, settings: IdentifySettings, work: Work) 
     """Return surveyed recordings, with a known lifting and its calibration, with their models."""
     _check_conditions(base)
     begun = {c: _begin(base, c, settings, work) for c in base.conditions}  # refined while others are identified
-    sets, factors, refined = dict[str, ModelSet](), dict[str, EpisodeFactors](), dict[str, Refinement]()
+    sets, factors = dict[str, ModelSet](), dict[str, EpisodeFactors]()
     for condition, (recorded, models, refining) in begun.items():
-        better, refinements = refining()
         factors[condition] = recorded
-        sets |= {base.place(m.name, condition): m for m in (*models, *better)}
-        refined |= refinements
+        sets |= {base.place(m.name, condition): m for m in (*models, *refining())}
     refined_kinds = tuple(kind.name for kind in kinds_for(base.lifting, refined=True)) if settings.refine else ()
-    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors, refined=refined)
+    return replace(base, kinds=refined_kinds + base.edmd_kinds, sets=sets, factors=factors)
 
 
 def _check_conditions(base: IdentifiedModels) -> None:
@@ -135,7 +132,7 @@ def _check_conditions(base: IdentifiedModels) -> None:
 
 def _begin(
     base: IdentifiedModels, condition: str, settings: IdentifySettings, work: Work
-) -> tuple[EpisodeFactors, list[ModelSet], Callable[[], Result]]:
+) -> tuple[EpisodeFactors, list[ModelSet], Callable[[], list[ModelSet]]]:
     """Reduce and identify the training episodes of one condition, and begin to refine models that feed synthesis."""
     population, facts, values = base.population, base.facts, base.parameters
     units = [u for u in facts.groups if u in values and facts.keys("train", u, condition)]
@@ -148,12 +145,8 @@ def _begin(
     models = [replace(m, longest_s=longest_s) for m in reduced.identify(settings)]
     rows = tuple((k.unit, k.episode) for u in units for k in facts.keys("train", u, condition))
     together = Factor(*(np.concatenate([getattr(f, name) for f in episodes]) for name in ("R", "peak", "n_samples")))
-    refining = reduced.begin_refinement(models, work) if settings.refine and reduced.feeds_synthesis else _nothing
+    refining = reduced.begin_refinement(models, work) if settings.refine and reduced.feeds_synthesis else list
     return EpisodeFactors(condition, rows, together), models, refining
-
-
-def _nothing() -> Result:
-    return [], {}
 
 
 def _mark(facts: RecordingFacts, task: Task) -> str | None:
@@ -227,7 +220,6 @@ class _Reduced:
             A=nothing,
             B=nothing,
             parameters=self.parameters if lifting.parameters else {},
-            residual_covariance=nothing,
             output_scale=ranges.outputs,
             input_scale=ranges.inputs,
         )
@@ -245,23 +237,22 @@ class _Reduced:
         log.info(note, self.condition, times * edge, times)
         return times * edge
 
-    def begin_refinement(self, starts: list[ModelSet], work: Work) -> Callable[[], Result]:
+    def begin_refinement(self, starts: list[ModelSet], work: Work) -> Callable[[], list[ModelSet]]:
         """Begin to refine every kind of model on free-run error."""
         base, facts = self.base, self.base.facts
         keys = {u: facts.keys("train", u, facts.identify_on) for u in self.units}
-        starts = [replace(start, alpha=None, alpha_in_ranges=False) for start in starts]
-        factors = [self.lifted(start.lifting) for start in starts]
         tasks = [
-            partial(refine_population, base.population, keys, start.lifting, start.parameters, factor, self.pooled)
-            for start, factor in zip(starts, factors, strict=True)
+            partial(
+                refine_population, base.population, keys, m.lifting, m.parameters, self.lifted(m.lifting), self.pooled
+            )
+            for m in starts
         ]
-        results = work.begin("identify (refine)", tasks)
+        results, fine = work.begin("identify (refine)", tasks), ("ok",) * len(self.units)
+        starts = [replace(start, alpha=None, alpha_in_ranges=False, status=fine) for start in starts]
 
-        def refining() -> Result:
-            kinds, refined = kinds_for(base.lifting, refined=True), results()
-            of = zip(kinds, starts, refined, factors, strict=True)
-            models = [_with_matrices(start, kind.name, matrices, factor) for kind, start, (matrices, _), factor in of]
-            return models, {kind.name: facts for kind, (_, facts) in zip(kinds, refined, strict=True)}
+        def refining() -> list[ModelSet]:
+            of = zip(kinds_for(base.lifting, refined=True), starts, results(), strict=True)
+            return [replace(start, name=kind.name, A=m.A, B=m.B) for kind, start, m in of]
 
         return refining
 
@@ -271,23 +262,16 @@ def fitted(models: ModelSet, factor: Factor) -> ModelSet:
     matrices = models.fit(factor.R)
     radius = models.ranges.normalise(matrices).spectral_radius()
     status = tuple("ok" if r < 1 else f"unstable, spectral radius {radius_text(r)}" for r in radius)
-    return replace(_with_matrices(models, models.name, matrices, factor), status=status)
+    return replace(models, A=matrices.A, B=matrices.B, status=status)
 
 
-def _with_matrices(start: ModelSet, name: str, matrices: KoopmanMatrices, factor: Factor) -> ModelSet:
-    """Return a model set with the scales, phases and regularisation of the one that it starts from."""
-    covariance = residual_covariance(factor.R, start.lifting.n_lifted, matrices, factor.n_samples)
-    status = ("ok",) * len(start.unit_ids)
-    return replace(start, name=name, A=matrices.A, B=matrices.B, residual_covariance=covariance, status=status)
-
-
-def alpha_factor(shared: list[tuple[Array, int]], edge: float, search: AlphaSearch | None = None) -> float:
+def alpha_factor(shared: list[tuple[Array, int]], edge: float) -> float:
     """Return how many times the smallest stabilising alpha is taken: doubled until models are alike."""
-    search, limit = search or AlphaSearch(), 20 * np.log10(RefineOptions().largest_residual)
+    search, limit = AlphaSearch(), RefineOptions().largest_residual
     for doubled in range(search.doublings if edge > 0 else 0):
         factor = search.factor * 2.0**doubled
         models = [edmd(R, n, factor * edge) for R, n in shared]
-        if not any(peak_residual_db(m.A, m.B, search.points) > limit for m in models):
+        if not any(peak_residual(m.A, m.B, search.points) > limit for m in models):
             return factor
     return search.factor
 

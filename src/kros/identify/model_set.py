@@ -45,7 +45,6 @@ class ModelSet:
     A: Array  # (unit, n, n)
     B: Array  # (unit, n, m)
     parameters: Mapping[str, Array]  # of the lifting, (unit,)
-    residual_covariance: Array  # (unit, n, n), of the one-step residual on the training episodes
     output_scale: Array  # (n,), range of every lifted state over the pooled training episodes
     input_scale: Array  # (m,)
     alpha: float | None = None  # Tikhonov coefficient, where there is one
@@ -94,7 +93,6 @@ class ModelSet:
             channels=tuple(replace(c, unit="") for c in self.channels),
             A=matrices.A,
             B=matrices.B,
-            residual_covariance=self.residual_covariance / x / x[:, None],
             output_scale=np.ones_like(x),
             input_scale=np.ones_like(u),
         )
@@ -159,8 +157,8 @@ class ModelSet:
         return cls(lifting=lifting, parameters=parameters, **given)
 
 
-_AXES = {"A": "unn", "B": "unm", "residual_covariance": "unn", "output_scale": "n", "input_scale": "m"}
-_CONTENT = (
+_AXES = {"A": "unn", "B": "unm", "output_scale": "n", "input_scale": "m"}
+_CONTENT = [
     "name",
     "condition",
     "unit_ids",
@@ -170,7 +168,7 @@ _CONTENT = (
     "alpha_in_ranges",
     "status",
     "longest_s",
-)
+]
 
 
 @dataclass(frozen=True)

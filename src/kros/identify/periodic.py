@@ -39,8 +39,6 @@ class PeriodicTest:
 
     largest_ratio: float = 500.0  # beyond that of any gear
     lags: int = 3  # steps whose states and inputs the residual is regressed on
-    units: int = 6  # that are looked at
-    episodes: int = 3  # of each
     samples: int = 40_000  # of a unit
     above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8
     above_in_every_unit: float = 3.0  # of the peak of each unit over its surroundings
@@ -102,17 +100,9 @@ class _Unit:
         return power
 
 
-def periodic_term(
-    population: Population,
-    angles: Sequence[str],
-    keys: Sequence[EpisodeKey] | None = None,
-    test: PeriodicTest | None = None,
-) -> PeriodicTerm | None:
-    """Return the periodic term that shows most, or None where none does."""
-    test = test or PeriodicTest()
-    if keys is None:
-        condition = "noload" if "noload" in population.conditions else population.conditions[0]
-        keys = [k for u in population.unit_ids[: test.units] for k in population.keys(u, condition)[: test.episodes]]
+def periodic_term(population: Population, angles: Sequence[str], keys: Sequence[EpisodeKey]) -> PeriodicTerm | None:
+    """Return the periodic term that shows most in some episodes, or None where none does."""
+    test = PeriodicTest()
     recordings = [[population.read(k) for k in keys if k.unit == unit] for unit in dict.fromkeys(k.unit for k in keys)]
     names, n = population.states + population.inputs, len(population.states)
     terms = []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from functools import wraps
 from inspect import signature
 from itertools import combinations_with_replacement
@@ -161,19 +162,15 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
     distinct = len(np.unique(data, axis=0))
     if distinct < n:
         raise ConfigError(f"kmeans_centres: {n} clusters need as many different samples, found {distinct}.")
-    spread = data.std(axis=0)
-    spread[spread == 0] = 1.0
-    rng, scaled = np.random.default_rng(seed), data / spread
-    ends: list[tuple[float, Array]] = []
+    spread = np.where(np.ptp(data, axis=0) > 0, data.std(axis=0), 1.0)
+    rng, scaled, best = np.random.default_rng(seed), data / spread, (np.inf, data[:0])
     for _ in range(starts):
-        try:
+        with suppress(ClusterError):  # this start has an empty cluster
             means, label = kmeans2(scaled, n, iter=100, minit="++", missing="raise", rng=rng)
-        except ClusterError:  # this start has an empty cluster
-            continue
-        ends.append((float(np.sum((scaled - means[label]) ** 2)), np.asarray(means * spread)))
-    if not ends:
+            best = min(best, (float(np.sum((scaled - means[label]) ** 2)), means * spread), key=lambda end: end[0])
+    if not len(best[1]):
         raise ConfigError(f"kmeans_centres: in {starts} starts one of {n} clusters was empty; ask for fewer.")
-    return min(ends, key=lambda end: end[0])[1]
+    return np.asarray(best[1])
 
 
 KINDS: dict[str, Callable[..., Any]] = {

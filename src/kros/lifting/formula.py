@@ -77,17 +77,10 @@ class Formula:
         """Names that the formula depends on, those of earlier values among them."""
         return frozenset(symbol.name for symbol in self.expression.free_symbols)
 
-    @cached_property
-    def _program(self) -> Program:
-        return Program.of([self.expression])
-
-    def __call__(self, **values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-        """Evaluate at arrays that broadcast against each other."""
-        return self.evaluate({name: np.asarray(value, dtype=float) for name, value in values.items()})
-
-    def evaluate(self, values: Mapping[str, npt.NDArray[np.float64]]) -> npt.NDArray[np.float64]:
-        """Evaluate at arrays by name."""
-        return np.asarray(self._program.run(values)[0])
+    def evaluate(self, values: Mapping[str, npt.ArrayLike]) -> npt.NDArray[np.float64]:
+        """Evaluate at arrays by name that broadcast against each other."""
+        arrays = {name: np.asarray(value, dtype=float) for name, value in values.items()}
+        return np.asarray(Program.of([self.expression]).run(arrays)[0])
 
     def derivative(self, name: str) -> Any:
         """Return the SymPy tree of the partial derivative with respect to one name."""
@@ -198,10 +191,8 @@ class _Reader:
             raise self._error(f"there is no {written}; only {known} have earlier values.")
         negative = isinstance(index, ast.UnaryOp) and isinstance(index.op, ast.USub)
         amount = index.operand if isinstance(index, ast.UnaryOp) else index
-        if not isinstance(amount, ast.Constant) or type(amount.value) is not int:
-            raise self._error(f"the delay in {written} should be a whole number of samples, such as {name}[-1].")
-        if not negative or amount.value == 0:
-            raise self._error(f"{written} is not an earlier value; write {name}[-1] for one sample before.")
+        if not negative or not isinstance(amount, ast.Constant) or type(amount.value) is not int or not amount.value:
+            raise self._error(f"{written} is no earlier value; give a whole number of samples, such as {name}[-1].")
         if amount.value > MAX_DELAY:
             raise self._error(f"the delay in {written} is too deep; at most {MAX_DELAY} samples are kept.")
         return sp.Symbol(delayed_name(name, amount.value), real=True)

@@ -33,7 +33,6 @@ _REALS = (-np.inf, np.inf)
 
 def bounds_of(expressions: Sequence[Any], box: Box) -> tuple[Array, Array]:
     """Return lower and upper bounds of expressions over a box, each of shape (len(expressions),)."""
-    box = {name: _range(name, value) for name, value in box.items()}
     with np.errstate(all="ignore"):
         pieces = [pieces_of(expression, box) for expression in expressions]
     return np.array([np.min(low) for low, _ in pieces]), np.array([np.max(high) for _, high in pieces])

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
-from .program import Columns
+from .program import Program
 from .separation import FormulaSeparation
 from .window import Window
 
@@ -170,7 +170,7 @@ class Lifting:
 
         Earlier values, shape (..., n_earlier), are needed where the lifting has delays.
         """
-        self._columns[0].fill(lifted, self._values(parameters, lifted, earlier))
+        self._programs[0].fill(lifted, self._values(parameters, lifted, earlier), self.n_states)
 
     def lift_inputs(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
         """Return the inputs (..., m) with the input functions behind them, (..., m + r), on windows (..., n_window)."""
@@ -180,8 +180,7 @@ class Lifting:
             return u
         window = self._windows(window)
         out = np.concatenate([u, np.empty((*u.shape[:-1], len(self.input_functions)))], axis=-1)
-        values = self._values(parameters, window, window[..., self.n_states :], u)
-        self._columns[1].fill(out, values)
+        self._programs[1].fill(out, self._values(parameters, window, window[..., self.n_states :], u), u.shape[-1])
         return out
 
     def windows(self, x: Array, u: Array) -> Array:
@@ -220,22 +219,21 @@ class Lifting:
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
         if (names, u is None) not in self._derivatives:
             trees = [formula.derivative(name) for formula in formulas for name in names]
-            self._derivatives[names, u is None] = Columns.of(trees)
+            self._derivatives[names, u is None] = Program.of(trees)
         values = self._values(parameters, x, x[..., self.n_states :], u)
         self._derivatives[names, u is None].fill(slopes, values)
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
-    def slope_bounds(self, box: Box | None = None, parameters: Box | None = None) -> tuple[Array, Array]:
+    def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:
         """Return bounds of the slopes of every lifted function by every entry of the window over an operating box.
 
-        Interval arithmetic on the derivatives, rounded outwards: the bounds (p, n_window) hold between any two points
-        of the box, and are infinite where a slope is, or where a function jumps or is not defined. Ranges are numbers
-        or pairs (lower, upper) by name; what is not named may be anything.
+        The bounds (p, n_window) hold between any two points of the box, and are infinite where a slope is, or where a
+        function jumps. Ranges are numbers or pairs (lower, upper) by name; what is not named may be anything.
 
         >>> Lifting(("position",), ("sin(100*position + phase)",), ("phase",)).slope_bounds()[1].round(6)
         array([[100.]])
         """
-        return slope_bounds_of(self.formulas, self.window.names, {**(box or {}), **(parameters or {})})
+        return slope_bounds_of(self.formulas, self.window.names, box or {})
 
     @cached_property
     def separation(self) -> FormulaSeparation:
@@ -248,13 +246,13 @@ class Lifting:
         return FormulaSeparation.of(self.input_formulas, self.window, self.parameters)
 
     @cached_property
-    def _columns(self) -> tuple[Columns, Columns]:
-        """Columns of the lifted functions and of the input functions."""
+    def _programs(self) -> tuple[Program, Program]:
+        """Programs of the lifted functions and of the input functions."""
         functions, gamma = ([formula.expression for formula in f] for f in (self.formulas, self.input_formulas))
-        return Columns.of(functions, self.n_states), Columns.of(gamma, len(self.inputs))
+        return Program.of(functions), Program.of(gamma)
 
     @cached_property
-    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Columns]:
+    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Program]:
         return {}
 
     @cached_property

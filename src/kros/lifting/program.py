@@ -6,7 +6,7 @@ operations is the same everywhere, so that results agree to rounding.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -37,13 +37,8 @@ class Program:
     def of(cls, expressions: Sequence[Any], names: Sequence[str] | None = None) -> Program:
         """Write SymPy trees of quantities, by default those that the trees name."""
         used = sorted({symbol.name for tree in expressions for symbol in tree.free_symbols})
-        return cls.of_trees([tree_of(expression) for expression in expressions], used if names is None else names)
-
-    @classmethod
-    def of_trees(cls, trees: Sequence[Tree], names: Sequence[str]) -> Program:
-        """Write trees as `tree_of` returns them."""
-        writer = Writer(list(names))
-        return writer.finished([writer.write(tree) for tree in trees])
+        writer = Writer(used if names is None else list(names))
+        return writer.finished([writer.write(tree_of(expression)) for expression in expressions])
 
     def run(self, values: Mapping[str, Any]) -> list[Any]:
         """Return the values of the expressions for arrays by name, which broadcast against each other."""
@@ -53,47 +48,16 @@ class Program:
             registers[into] = function(*(registers[i] for i in operands))
         return [registers[i] for i in self.outputs]
 
+    def fill(self, out: npt.NDArray[np.float64], values: Mapping[str, Any], first: int = 0) -> None:
+        """Write the values of the expressions along the last axis, from one column on."""
+        for column, value in enumerate(self.run(values), first):
+            out[..., column] = value
+
     @cached_property
     def _steps(self) -> list[tuple[Callable[..., Any], int, tuple[int, ...]]]:
         rows = [(_KINDS[kind], into, operands) for kind, into, *operands in self.code.tolist()]
         steps = ((k, into, tuple(i[:1] if k in FUNCTIONS else i)) for k, into, i in rows)
         return [(getattr(np, _NUMPY.get(k, k)), into, i) for k, into, i in steps]
-
-
-@dataclass(frozen=True, eq=False)
-class Columns:
-    """Expressions evaluated together, one column each: those that differ in their numbers alone in one pass."""
-
-    single: tuple[list[int], Program]  # columns whose shape no other has
-    groups: tuple[tuple[Any, Program, dict[str, Any]], ...]  # columns, program of one of them, numbers of all
-
-    @classmethod
-    def of(cls, expressions: Sequence[Any], first: int = 0) -> Columns:
-        """Group expressions by shape; they go to the columns from `first` on."""
-        members: dict[Tree, list[int]] = {}
-        trees = [tree_of(expression) for expression in expressions]
-        for column, tree in enumerate(trees):
-            members.setdefault(_shape(tree), []).append(column)
-        names = sorted({symbol.name for expression in expressions for symbol in expression.free_symbols})
-        single = [columns[0] for columns in members.values() if len(columns) == 1]
-        program, groups = Program.of_trees([trees[i] for i in single], names), []
-        for columns in (columns for columns in members.values() if len(columns) > 1):
-            numbers = np.array([_numbers(trees[i]) for i in columns]).T
-            places = [f"number {i}" for i in range(len(numbers))]
-            tree = _named(trees[columns[0]], iter(places))
-            given = dict(zip(places, numbers, strict=True))
-            whole = len(columns) == columns[-1] + 1 - columns[0]  # written without a gather
-            at = slice(first + columns[0], first + columns[-1] + 1) if whole else [first + i for i in columns]
-            groups.append((at, Program.of_trees([tree], (*names, *places)), given))
-        return cls(([first + i for i in single], program), tuple(groups))
-
-    def fill(self, out: npt.NDArray[np.float64], values: Mapping[str, Any]) -> None:
-        """Write the values of the expressions into their columns, along the last axis."""
-        for column, value in zip(self.single[0], self.single[1].run(values), strict=True):
-            out[..., column] = value
-        wide = {name: np.asarray(value)[..., None] for name, value in values.items()} if self.groups else {}
-        for columns, program, numbers in self.groups:
-            out[..., columns] = program.run(wide | numbers)[0]
 
 
 @dataclass
@@ -193,20 +157,6 @@ def _shape(tree: Tree) -> Tree:
     if kind in ("symbol", "number"):
         return tree if kind == "symbol" else ("number",)
     return (kind, *(_shape(part) if isinstance(part, tuple) else part for part in rest))
-
-
-def _numbers(tree: Tree) -> list[float]:
-    """Return the numbers of a tree, exponents apart."""
-    if tree[0] == "number":
-        return [tree[1]]
-    return [number for part in tree[1:] if isinstance(part, tuple) for number in _numbers(part)]
-
-
-def _named(tree: Tree, names: Iterator[str]) -> Tree:
-    """Return the tree with names in place of its numbers."""
-    if tree[0] == "number":
-        return "symbol", next(names)
-    return (tree[0], *(_named(part, names) if isinstance(part, tuple) else part for part in tree[1:]))
 
 
 def _real(number: Any) -> float:

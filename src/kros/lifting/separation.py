@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .formula import MAX_TERMS, Formula, count_terms
-from .program import Columns, Program
+from .program import Program
 from .window import Window
 
 Array = npt.NDArray[np.float64]
@@ -39,13 +39,13 @@ class FormulaSeparation:
         return cls(window, parameters, tuple(basis), rows)
 
     @cached_property
-    def _columns(self) -> Columns:
-        return Columns.of(self.basis)
+    def _program(self) -> Program:
+        return Program.of(self.basis)
 
     def evaluate(self, window: Array, u: Array | None = None) -> Array:
         """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
         out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
-        self._columns.fill(out, self.window.values(window, u))
+        self._program.fill(out, self.window.values(window, u))
         return out
 
     def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:

@@ -24,7 +24,7 @@ class Tape:
 
 
 @lru_cache(maxsize=64)
-def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: bool = True) -> Tape:
+def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = ()) -> Tape:
     """Return the tape of a lifting with m recorded inputs."""
     window, n, n_lifted = lifting.window.names, lifting.n_states, lifting.n_lifted
     inputs = lifting.inputs or tuple(f"input {i}" for i in range(m))  # which no formula can read
@@ -32,7 +32,7 @@ def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = (), of_inputs: 
     of = [(n_lifted + m + i, formula) for i, formula in enumerate(lifting.input_formulas)]
     slopes = [
         (column, place, formula.derivative(window[entry]))
-        for column, formula in (formulas + of if of_inputs else formulas)
+        for column, formula in formulas + of
         for place, entry in enumerate(entries)
     ]
     slopes = [row for row in slopes if row[2] != 0]

@@ -30,21 +30,14 @@ LOAD = "load"
 
 @dataclass(frozen=True)
 class LoadSettings:
-    """How a known load is read.
-
-    Examples
-    --------
-    >>> from kros.motor_drive import LoadSettings
-    >>> LoadSettings(current=2, limit=1.0).level_s
-    10.0
-    """
+    """How a known load is read."""
 
     current: int | None = None  # state that carries the load, in the load's unit; None where none does
     level_s: float = 10.0  # s; time after which a constant load is forgotten
     corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
     limit: float | None = None  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
-    start_trust: float = 1e-6  # of the estimator; the load of the first sample is in its tracking error
+    start_trust: float = 1e-4  # of the estimator; the load of the first sample is in its tracking error
 
 
 def load_observer(
@@ -56,45 +49,10 @@ def load_observer(
     load: Array,
     settings: LoadSettings | None = None,
 ) -> tuple[Observer, tuple[int, ...]]:
-    """Return the estimator of the recorded states and ``load``, which needs neither current nor load at run time.
+    """Return the estimator of the recorded states and ``load``, and the episodes whose current reaches its limit.
 
-    Parameters
-    ----------
-    name : str
-    lifting : Lifting
-        Of the recorded states; its functions read measured ones alone.
-    measured : sequence of int
-    inputs : sequence of str
-    batch : EpisodeBatch
-        Recordings of equal length that start at rest, with and without load.
-    load : ndarray, shape (n_samples, batch)
-        Torque of the known load in any unit, zero in recordings without load.
-    settings : LoadSettings, optional
-
-    Returns
-    -------
-    observer : Observer
-        `load`, and under load the current, lack their level (`AngleLoad`).
-    left_out : tuple of int
-        Episodes in which the current reaches its limit.
-
-    Raises
-    ------
-    DimensionError, DataError
-        When shapes do not fit, recordings of a kind are missing, or all reach the limit.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.data import EpisodeBatch
-    >>> from kros.lifting import Lifting
-    >>> from kros.motor_drive import load_observer
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=1, seconds=2.0, seed=3).simulate().population
-    >>> batch = EpisodeBatch.read(motors, motors.keys())
-    >>> load = 0.01 * abs(batch.states[..., 0]) * [0, 1]  # the second episode carries a load
-    >>> observer, left_out = load_observer("motor/load", Lifting(motors.states), (0,), motors.inputs, batch, load)
-    >>> observer.recorded, left_out
-    (('position', 'velocity', 'current', 'load'), ())
+    The functions of the lifting read measured states alone, and so does it at run time. `load`, (n_samples, batch), is
+    zero in recordings without load; the estimated one and, under load, the current lack their level (`AngleLoad`).
     """
     settings = settings or LoadSettings()
     if batch.states.shape[:2] != load.shape or LOAD in lifting.states:

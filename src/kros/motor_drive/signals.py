@@ -51,28 +51,7 @@ def known_load(
     angle_rad: float = 0.0,
     corner_hz: float = 20.0,
 ) -> Array:
-    """Return the torque that a mounted mass of known size takes, ``moment sin(position - angle) + inertia position''``.
-
-    Parameters
-    ----------
-    position : array_like, shape (n_samples, ...), rad
-    sample_period_s : float
-    moment : float
-        Mass times gravity times lever arm, in any unit of torque, or over the torque constant, in units of current.
-    inertia : float
-        Of the load, the same unit times s^2/rad.
-    angle_rad : float
-        Position at which the mass hangs at rest.
-    corner_hz : float
-        Up to which the second difference of the position counts, low-passed without delay.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.motor_drive import known_load
-    >>> known_load([0.0, np.pi / 2], 0.001, moment=0.2).round(9).tolist()  # a mass that hangs, and one held out
-    [0.0, 0.2]
-    """
+    """Return the torque of a mounted mass, ``moment sin(position - angle) + inertia position''``, position in rad."""
     position = np.asarray(position, dtype=float)
     load = moment * np.sin(position - angle_rad)
     if inertia:
@@ -118,17 +97,7 @@ def load_accuracy(
 
 @dataclass(frozen=True)
 class TorqueScale:
-    """Torque of a current's error.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.motor_drive import TorqueScale
-    >>> known = np.sin(2 * np.pi * 0.5 * 0.001 * np.arange(8000))  # N m
-    >>> scale = TorqueScale.calibrated(0.1 + known / 50, known, 0.001)
-    >>> round(scale.torque_constant), round(scale.bias, 3), round(float(scale.load(0.3)), 6)
-    (50, 0.1, 10.0)
-    """
+    """Torque of a current's error."""
 
     torque_constant: float  # torque per unit of current
     bias: float  # error of the current without load, in units of current

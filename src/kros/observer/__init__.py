@@ -12,32 +12,23 @@ Examples
 """
 
 from ..core.removed import refusing
-from .baselines.difference import FilteredDifference
-from .baselines.extended_kalman import ExtendedKalman
 from .certificate.certificate import ReliftCertificate, ReliftStatus, relift_certificate
 from .certificate.error import ReliftScales
-from .certificate.signals import SignalBound, signal_bound
 from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
 from .filter_bank import FilterBank
-from .monitor import Monitor
 from .observer import Observer
 from .running import Estimate, RunningObserver
-from .runtime import Guard, Runtime, Seen
-from .screen import SampleStatus, sample_status
+from .runtime import Runtime, Seen
+from .screen import SampleStatus
 from .sensor import Sensor
-from .simulate import run_observer, run_observers, run_with_status
-from .tracking import Tracked, track_parameter
+from .simulate import run_observer
 
 __all__ = [
     "Estimate",
     "EstimatorSettings",
-    "ExtendedKalman",
     "FilterBank",
-    "FilteredDifference",
-    "Guard",
-    "Monitor",
     "Observer",
     "Recordings",
     "ReliftCertificate",
@@ -48,16 +39,9 @@ __all__ = [
     "SampleStatus",
     "Seen",
     "Sensor",
-    "SignalBound",
-    "Tracked",
     "identify_estimator",
     "relift_certificate",
     "run_observer",
-    "run_observers",
-    "run_with_status",
-    "sample_status",
-    "signal_bound",
-    "track_parameter",
 ]
 
 __getattr__ = refusing(__name__)

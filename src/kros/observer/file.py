@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, create_model
 
 from ..core.artifacts import CHECKSUM, as_written, check_checksum, plain, read_json, with_checksum, write_json
 from ..core.errors import DataError, KrosError
@@ -64,40 +65,17 @@ class _Runtime(_Part):
     upper: Limits | None = None
 
 
-class _Seen(_Part):
-    measured: Row
-    inputs: Row
+def _part(kind: Any) -> Any:
+    """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
+    types: dict[str, Any] = {"Array": Row | Matrix, "float": float, "int": int, "Mapping[str, float]": dict[str, float]}
+    held: dict[str, Any] = {}
+    for f in fields(kind):
+        needed = f.default is MISSING and f.default_factory is MISSING
+        held[f.name] = (types[str(f.type)], ...) if needed else (types[str(f.type)] | None, None)
+    return create_model(f"_{kind.__name__}", __base__=_Part, **held)
 
 
-class _Guard(_Part):
-    lower: Row
-    upper: Row
-    correction: Row
-    settle: int
-
-
-class _Bank(_Part):
-    filters: int
-    start: Matrix
-    forget: Row
-    half: Row
-    recovery: Row
-    reach: Row
-
-
-class _Monitor(_Part):
-    filters: Matrix
-    forget: float
-    settle: int
-    size: Row
-    limits: Matrix
-    weights: Matrix
-    false_alarm_rate: float
-    bounds: dict[str, float] = Field(default_factory=dict)
-    units: int = 0
-    hours: float = 0.0
-    alarms: int = 0
-    first: float = 0.0
+_PARTS: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
 
 
 class _File(_Part):
@@ -115,12 +93,12 @@ class _File(_Part):
     model: _Model
     controller: _Controller
     runtime: _Runtime | None = None
-    seen: _Seen | None = None
-    filter_bank: _Bank | None = None
-    guard: _Guard | None = None
     sensor: dict[str, Any] = Field(default_factory=dict)
     about: dict[str, Any] = Field(default_factory=dict)
-    monitor: _Monitor | None = None
+
+
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 
 def observer_content(observer: ObserverData) -> dict[str, Any]:
@@ -175,7 +153,7 @@ def _checked(content: Mapping[str, Any], where: str) -> ObserverData:
     """Return the observer of a file's content."""
     try:
         rest = {key: value for key, value in content.items() if key not in ("schema", "kind", CHECKSUM)}
-        return _observer(_File.of(rest, "its content").model_dump())
+        return _observer(_Whole.of(rest, "its content").model_dump())
     except KrosError as error:
         raise DataError(f"{where}: {error} Correct the file.") from error
 
@@ -195,8 +173,8 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     order, width = len(content["controller"]["A"]), m if content["injection"] == Injection.INPUT.value else n
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
     A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
-    kinds: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
-    parts = {key: None if content[key] is None else kind(**content[key]) for key, kind in kinds.items()}
+    given = {key: content[key] for key in _PARTS if content[key] is not None}
+    parts = {key: _PARTS[key](**{k: v for k, v in part.items() if v is not None}) for key, part in given.items()}
     return ObserverData(
         content["name"],
         lifting,
@@ -209,12 +187,10 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         content["sample_period_s"],
         {name: value for name, value in content["parameters"].items() if value is not None},
         Runtime.from_content(content["runtime"] or {}),
-        parts["seen"],
-        {name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
-        parts["monitor"],
-        parts["filter_bank"],
-        parts["guard"],
-        content["about"],
+        sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
+        about=content["about"],
+        bank=parts.pop("filter_bank", None),
+        **parts,
     )
 
 

@@ -45,8 +45,8 @@ class FilterBank:
         First estimate ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, with zero for states that are not measured.
     forget : ndarray, shape (n,)
         rho of every recorded state, between zero and one.
-    half : ndarray, shape (n,)
-        T of every recorded state, the age of a gap at which its level is one half, in samples.
+    half : ndarray, shape (n,) or (batch, n)
+        T of every recorded state, the age of a gap at which its level is one half, in samples; by machine in trials.
     recovery : ndarray, shape (n,)
         mu of every recorded state, between zero and one.
     reach : ndarray, shape (q,)
@@ -88,7 +88,8 @@ class FilterBank:
 
     def require_fit(self, name: str, recorded: int, n: int, columns: int, measured: int) -> None:
         """Refuse arrays of another size than the observer's."""
-        sizes = tuple(getattr(self, name).shape for name in _ARRAYS)
+        sizes = tuple(getattr(self, name).shape for name in _ARRAYS if name != "half")
+        sizes = (*sizes[:2], self.half.shape[-1:], *sizes[2:])
         if sizes != ((n, columns), *[(recorded,)] * 3, (measured,)) or not 0 <= self.filters <= n - 2 * recorded:
             raise DimensionError(
                 f"Observer {name}: its filter bank should have a start {(n, columns)}, {recorded} values of forget, "

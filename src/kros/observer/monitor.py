@@ -18,14 +18,14 @@ its start: while they go by, all that the monitor remembers is held.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, DataError
+from ..core.errors import DataError
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -37,63 +37,17 @@ QUIET = 0.01  # of its limit: a band that is more quiet says no more
 
 @dataclass(frozen=True, eq=False)
 class Monitor:
-    """What a monitor computes with, and how often it is wrong about good machines.
+    """What a monitor computes with, and how often it is wrong about good machines."""
 
-    Parameters
-    ----------
-    filters : ndarray, shape (bands, 3)
-        ``b, a1, a2`` of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``.
-    forget : float
-        Share of a mean square that a sample replaces in the long run.
-    settle : int
-        Samples after a start that are not judged.
-    size : ndarray, shape (q,)
-        What innovations are divided by: their RMS in training.
-    limits : ndarray, shape (q, bands)
-        Mean squares at the bound.
-    weights : ndarray, shape (q, bands)
-        Whole numbers, how often a band counts.
-    false_alarm_rate : float
-        Probability that one more good machine exceeds the bound while it is moved as much as those in training.
-    bounds : mapping of str to float
-        What the level of a machine in each recorded condition is held against, dB over the bound of all conditions: it
-        may be told in which it is.
-    units : int
-        Machines that the bound was found on.
-    hours : float
-        Motion of these machines that was judged.
-    alarms : int
-        How often the bound was exceeded in it.
-    first : float
-        Share that the first sample replaces, later ones less; `forget` from the beginning where it is not larger.
-
-    Raises
-    ------
-    DataError
-        When a number is out of its range, or sizes do not fit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import Monitor
-    >>> filters = np.array([[0.1, -1.6, 0.8]])  # one band
-    >>> monitor = Monitor(filters, 0.01, 100, np.ones(1), np.ones((1, 1)), np.array([[16]]), false_alarm_rate=0.01)
-    >>> monitor.settle, monitor.centres_hz(0.001).shape
-    (100, (1,))
-    """
-
-    filters: Array
-    forget: float
-    settle: int
-    size: Array
-    limits: Array
-    weights: Array
-    false_alarm_rate: float
-    bounds: Mapping[str, float] = field(default_factory=dict)
-    units: int = 0
-    hours: float = 0.0
-    alarms: int = 0
-    first: float = 0.0
+    filters: Array  # (bands, 3): b, a1, a2 of ``b (1 - z^-2) / (1 + a1 z^-1 + a2 z^-2)``
+    forget: float  # share of a mean square that a sample replaces in the long run
+    settle: int  # samples after a start that are not judged
+    size: Array  # (q,), what innovations are divided by: their RMS in training
+    limits: Array  # (q, bands), mean squares at the bound
+    weights: Array  # (q, bands), whole numbers, how often a band counts
+    false_alarm_rate: float  # probability that one more good machine exceeds the bound, moved as those in training
+    units: int = 0  # machines that the bound was found on
+    first: float = 0.0  # share that the first sample replaces, later ones less, down to `forget`
 
     def __post_init__(self) -> None:
         for name in ("filters", "size", "limits", "weights"):
@@ -129,26 +83,13 @@ class Monitor:
                 f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found "
                 f"{self.weights}."
             )
-        if not np.isfinite(list(self.bounds.values())).all():
-            raise DataError("Monitor of an observer: the bounds of conditions should be finite numbers of dB.")
 
     def times(self, y: Array) -> Self:
         """Return the monitor for measurements in other units, multiplied by `y`, shape (q,)."""
         return replace(self, size=self.size * y)
 
     def mean_squares(self, innovation: Array, judged: Flags) -> Array:
-        """Return the mean squares of all bands after every sample, for many machines that start together.
-
-        Parameters
-        ----------
-        innovation : ndarray, shape (n_samples, batch, q)
-        judged : ndarray of bool, shape (n_samples, batch)
-            The other samples hold what was.
-
-        Returns
-        -------
-        ndarray, shape (n_samples, batch, q, bands)
-        """
+        """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""
         from scipy.signal import lfilter
 
         scaled = innovation / self.size
@@ -164,17 +105,7 @@ class Monitor:
         return squares
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
-        """Return the mean squares of every episode, of a machine that has them one after the other.
-
-        Parameters
-        ----------
-        episodes : sequence of (ndarray, shape (n_samples, q); ndarray of bool, shape (n_samples,))
-            Innovations, and which samples are judged.
-
-        Returns
-        -------
-        list of ndarray, shape (n_samples, q, bands)
-        """
+        """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
         innovation, judged = (np.concatenate(parts)[:, None] for parts in zip(*episodes, strict=True))
         return np.split(self.mean_squares(innovation, judged)[:, 0], np.cumsum([len(own) for _, own in episodes])[:-1])
 
@@ -191,38 +122,13 @@ class Monitor:
         rest, _ = lfilter([self.forget], [1, -keep], squares[falling:], axis=0, zi=last)
         return np.concatenate([begun, rest])
 
-    def level(self, mean_squares: Array, condition: str | None = None) -> Array:
-        """Return the level over the bound in dB, (...), of mean squares (..., q, bands), in a condition or any."""
-        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT) - self.bound(
-            condition
-        )
+    def level(self, mean_squares: Array) -> Array:
+        """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
+        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT)
 
     def band_levels(self, mean_squares: Array) -> Array:
         """Return the level of every band over its limit in dB, shape (..., q, bands)."""
         return np.asarray(10 * np.log10(np.maximum(mean_squares / self.limits, QUIET)))
-
-    def centres_hz(self, sample_period_s: float) -> Array:
-        """Return the centre frequencies of the bands, shape (bands,)."""
-        _, a1, a2 = self.filters.T
-        return np.asarray(np.arccos(-a1 / (1 + a2)) / (2 * np.pi * sample_period_s))
-
-    def bound(self, condition: str | None) -> float:
-        """Return the bound of a condition, dB over that of all; None is any.
-
-        Raises
-        ------
-        ConfigError
-        """
-        if condition is not None and condition not in self.bounds:
-            raise ConfigError(
-                f"Monitor of an observer: the condition {condition!r} is unknown; known are "
-                f"{', '.join(self.bounds) or 'none'}."
-            )
-        return 0.0 if condition is None else float(self.bounds[condition])
-
-    def product(self, condition: str | None) -> float:
-        """Return the product that a machine in a condition may have."""
-        return float(10 ** (self.bound(condition) * WEIGHT / 10))
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -230,14 +136,6 @@ def octaves(count: int = 6, quality: float = 1.4) -> Array:
     w = 2 * np.pi * 0.256 / 2.0 ** np.arange(count)
     alpha = np.sin(w) / (2 * quality)
     return np.stack([alpha / (1 + alpha), -2 * np.cos(w) / (1 + alpha), (1 - alpha) / (1 + alpha)], axis=-1)
-
-
-def poisson_interval(count: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact (Garwood) interval of the mean of a Poisson count."""
-    from scipy.special import gammaincinv  # halves of quantiles of chi-squared: its own module takes a second to load
-
-    tail = (1 - level) / 2
-    return (float(gammaincinv(count, tail)) if count else 0.0), float(gammaincinv(count + 1, 1 - tail))
 
 
 def judged_samples(settle: int, status: npt.NDArray[Any], starts: Flags, moving: Flags) -> Flags:
@@ -261,18 +159,7 @@ class Watch:
         self._limits = (1 / monitor.limits).tolist()
         self._weights: list[list[int]] = monitor.weights.astype(int).tolist()
         self._monitor = monitor
-        self.condition = None
         self.reset()
-
-    @property
-    def condition(self) -> str | None:
-        """Condition that the machine is in; None where that is not known."""
-        return self._condition
-
-    @condition.setter
-    def condition(self, name: str | None) -> None:
-        """Change the bound from the next sample that is judged on."""
-        self._condition, self._bound = name, self._monitor.product(name)
 
     def reset(self) -> None:
         """Forget everything."""
@@ -314,11 +201,9 @@ class Watch:
                     product *= share
         gain /= 1.0 + gain
         self._gain = gain if gain > self._forget else self._forget
-        self.outside = product > self._bound
+        self.outside = product > 1.0
 
     @property
     def level_db(self) -> float:
         """Level of the innovation over its bound, dB; far below zero before anything was judged."""
-        return float(
-            self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory]), self._condition)
-        )
+        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory])))

@@ -126,27 +126,6 @@ class RunningObserver:
         """Level of the innovation over its bound in dB, above zero outside; None without a monitor."""
         return None if self._watch is None else self._watch.level_db
 
-    @property
-    def condition(self) -> str | None:
-        """Recorded condition that the machine is in, by whose bound it is judged; None for any.
-
-        Raises
-        ------
-        ConfigError
-            When one is set that the monitor does not know.
-        """
-        return None if self._watch is None else self._watch.condition
-
-    @condition.setter
-    def condition(self, name: str | None) -> None:
-        """Change it."""
-        if self._watch is not None:
-            self._watch.condition = name
-        elif name is not None:
-            raise ConfigError(
-                f"Running observer {self.observer.name}: it has no monitor that would know the condition {name!r}."
-            )
-
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(self.observer.inputs))))

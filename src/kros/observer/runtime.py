@@ -111,12 +111,6 @@ class Runtime:
         low = self.lower is not None and bool(np.any(x <= self.lower))
         return low or (self.upper is not None and bool(np.any(x >= self.upper)))
 
-    def clips_alike(self, other: Runtime) -> bool:
-        """Whether two observers have the same delay, and their estimates the same limits."""
-        ours, theirs = self.limits(), other.limits()
-        same = ours.keys() == theirs.keys() and all(np.array_equal(ours[name], theirs[name]) for name in ours)
-        return same and self.delay == other.delay
-
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
         low, high = (side if side is None else side[: x.shape[-1]] for side in (self.lower, self.upper))
@@ -155,33 +149,12 @@ class Guard:
     predictions, which may grow. The step that would leave the bounds is not taken, the estimate stands still, and at
     the next sample with a measurement and all inputs the observer starts as it did at first. `SampleStatus.RESTARTED`
     is set from there on until the start has settled.
-
-    Parameters
-    ----------
-    lower, upper : ndarray, shape (n,)
-        Of the estimate, internal states included.
-    correction : ndarray, shape (n_c,)
-        Largest size of every state of the correction.
-    settle : int
-        Samples after a start until the estimate is as good as before.
-
-    Raises
-    ------
-    DataError
-        When a bound is not a number, a lower one is not below its partner, or `settle` is negative.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import Guard
-    >>> Guard(np.array([-2.0]), np.array([2.0]), np.zeros(0), settle=50).upper.tolist()
-    [2.0]
     """
 
-    lower: Array
+    lower: Array  # (n,), of the estimate, internal states included
     upper: Array
-    correction: Array
-    settle: int
+    correction: Array  # (n_c,), largest size of every state of the correction
+    settle: int  # samples after a start until the estimate is as good as before
 
     def __post_init__(self) -> None:
         for name in ("lower", "upper", "correction"):

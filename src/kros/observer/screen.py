@@ -22,7 +22,7 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from enum import IntFlag
 
 import numpy as np
@@ -30,14 +30,13 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from .data import ObserverData
-from .runtime import Runtime, Seen
+from .runtime import Seen
 
 Array = npt.NDArray[np.float64]
 Bits = npt.NDArray[np.uint8]
 Whole = npt.NDArray[np.intp]
 Flags = npt.NDArray[np.bool_]
 BEYOND = 1.5  # times the range: what is further away is implausible
-_ANY = np.finfo(float).max
 _SIGNALS = ("y", "u", "status", "starts", "complete")
 LONGEST = 5  # samples for which an input may be held without a new start
 
@@ -138,88 +137,52 @@ def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, 
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
-    """Limits of some channels, and between which values a sample is plausible; all of shape (channels,)."""
+class Screen:
+    """Judges samples one by one; limits, and between which values a sample is plausible, of [y; u], (q + m,) each."""
 
     lower: Array
     upper: Array
     least: Array
     most: Array
-
-    @classmethod
-    def of(cls, count: int, seen: Array | None, lower: Array | None = None, upper: Array | None = None) -> Bounds:
-        """Return the bounds from sizes seen in training and declared limits, where there are any."""
-        low = np.full(count, -np.inf) if lower is None else lower
-        high = np.full(count, np.inf) if upper is None else upper
-        size = np.full(count, np.inf) if seen is None else np.where(seen > 0, seen, np.inf)
-        sides = [np.where(np.isfinite(side), np.abs(side), size) for side in (low, high)]
-        far = np.minimum(BEYOND * np.maximum(*sides), _ANY)
-        return cls(low, high, -far, far)
-
-    def judge(self, values: Array) -> tuple[Array, Flags, Flags]:
-        """Return samples within limits, which are plausible, and which were beyond a limit or their range."""
-        plausible = (values >= self.least) & (values <= self.most)
-        within = np.clip(values, self.lower, self.upper)
-        return within, plausible, np.isfinite(values) & (~plausible | (within != values))
-
-
-@dataclass(frozen=True, eq=False)
-class Screen:
-    """Judges samples one by one."""
-
-    measured: Bounds
-    inputs: Bounds
-
-    def same_as(self, other: Screen) -> bool:
-        """Whether two screens judge alike."""
-        pairs = ((self.measured, other.measured), (self.inputs, other.inputs))
-        return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for a, b in pairs for f in fields(Bounds))
+    q: int
 
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
-        at, limits = list(observer.measured), observer.runtime
-        return cls.sized(observer.seen, len(at), len(observer.inputs), limits, at)
+        at, limits = list(observer.measured), observer.runtime.limits()
+        lower, upper = (limits[name][at] if name in limits else None for name in ("lower", "upper"))
+        return cls.sized(observer.seen, len(at), len(observer.inputs), lower, upper)
 
     @classmethod
-    def sized(cls, seen: Seen | None, q: int, m: int, limits: Runtime | None = None, at: Sequence[int] = ()) -> Screen:
-        """Return the screen for sizes seen in training, and limits where these are declared."""
-        limits, sizes = limits or Runtime(), (None, None) if seen is None else (seen.measured, seen.inputs)
-        lower, upper = (None if side is None else side[list(at)] for side in (limits.lower, limits.upper))
-        return cls(Bounds.of(q, sizes[0], lower, upper), Bounds.of(m, sizes[1]))
+    def sized(cls, seen: Seen | None, q: int, m: int, lower: Array | None = None, upper: Array | None = None) -> Screen:
+        """Return the screen for sizes seen in training, and limits of measurements where these are declared."""
+        size, low, high = (np.full(q + m, end) for end in (np.inf, -np.inf, np.inf))
+        low[:q], high[:q] = low[:q] if lower is None else lower, high[:q] if upper is None else upper
+        if seen is not None:
+            size = np.concatenate([seen.measured, seen.inputs])
+            size[size == 0] = np.inf
+        sides = [np.where(np.isfinite(side), np.abs(side), size) for side in (low, high)]
+        far = np.minimum(BEYOND * np.maximum(*sides), np.finfo(float).max)
+        return cls(low, high, -far, far, q)
 
     def take(self, y: Array, u: Array, held: Held | None = None) -> Screened:
         """Judge samples y (n_samples, batch, q) and u (n_samples, batch, m); `held` is known before the first."""
-        before = Held.nothing(*u.shape[1:]) if held is None else held
-        measured, plausible, beyond = self.measured.judge(y)
-        limited, good, far = self.inputs.judge(u)
-        status = _bit(~np.isfinite(y), SampleStatus.MISSING) | _bit(~np.isfinite(u), SampleStatus.INVALID_INPUT)
-        status |= _bit(beyond, SampleStatus.LIMIT) | _bit(far, SampleStatus.LIMIT)
-        count = np.arange(1, len(u) + 1)[:, None, None]
+        before, z, q = Held.nothing(*u.shape[1:]) if held is None else held, np.concatenate([y, u], axis=-1), self.q
+        plausible, finite = (z >= self.least) & (z <= self.most), np.isfinite(z)
+        within = np.minimum(np.maximum(z, self.lower), self.upper)
+        beyond = (finite & (~plausible | (within != z))).any(axis=-1)
+        status = np.where(finite[..., :q].all(axis=-1), 0, np.uint8(SampleStatus.MISSING))
+        status |= np.where(finite[..., q:].all(axis=-1), 0, np.uint8(SampleStatus.INVALID_INPUT))
+        status |= np.where(beyond, np.uint8(SampleStatus.LIMIT), 0)
+        good, count = plausible[..., q:], np.arange(1, len(u) + 1)[:, None, None]
         latest = np.maximum.accumulate(np.where(good, count, 0), axis=0)
         since = np.where(latest > 0, count - latest, count + before.since)
-        inputs = np.take_along_axis(np.concatenate([before.inputs[None], limited]), latest, axis=0)
+        inputs = np.take_along_axis(np.concatenate([before.inputs[None], within[..., q:]]), latest, axis=0)
         lost = np.asarray((since > LONGEST).any(axis=-1))
-        complete = np.asarray(good.all(axis=-1) & plausible.any(axis=-1))
+        complete = np.asarray(good.all(axis=-1) & plausible[..., :q].any(axis=-1))
         starts, stale = _starts(lost, complete, before.stale)
-        y = np.where(plausible, measured, np.nan)
+        y = np.where(plausible, within, np.nan)[..., :q]
         return Screened(y, inputs, status, starts, complete, Held(inputs[-1], since[-1], stale))
-
-
-def sample_status(observer: ObserverData, y: Array, u: Array) -> Bits:
-    """Return the bits of `SampleStatus` that samples have by themselves, shape (n_samples, batch).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, SampleStatus, sample_status
-    >>> observer = Observer.open_loop("lag", Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",), 0.01)
-    >>> y = np.array([1.0, np.nan, 0.5]).reshape(3, 1, 1)
-    >>> [SampleStatus(int(bits)).name for bits in sample_status(observer, y, np.zeros((3, 1, 1))).ravel()]
-    ['GOOD', 'MISSING', 'GOOD']
-    """
-    return screened(observer, y, u).status
 
 
 def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: Held | None = None) -> Screened:
@@ -227,10 +190,6 @@ def screened(observer: ObserverData, y: npt.ArrayLike, u: npt.ArrayLike, held: H
     y, u = np.asarray(y, dtype=float), np.asarray(u, dtype=float)
     require_samples(f"observer {observer.name}", len(observer.measured), observer.inputs, y, u)
     return Screen.of(observer).take(y, u, held)
-
-
-def _bit(wrong: Flags, bit: SampleStatus) -> Bits:
-    return np.where(wrong.any(axis=-1), np.uint8(bit), np.uint8(0))
 
 
 def _starts(lost: Flags, complete: Flags, stale: Flags) -> tuple[Flags, Flags]:

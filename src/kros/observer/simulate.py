@@ -14,7 +14,7 @@ from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import Guard, bounds
-from .screen import Bits, Flags, SampleStatus, Screen, Screened, Whole, screened
+from .screen import Bits, Flags, SampleStatus, Screened, Whole, screened
 from .step import Parameters, Steps, forward
 
 Array = npt.NDArray[np.float64]
@@ -65,79 +65,36 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run([observer], screened(observer, y, u), parameters).estimates[0]
-
-
-def run_with_status(
-    observer: ObserverData, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
-) -> tuple[Array, Bits]:
-    """Run an observer, and return the bits of `SampleStatus` of every sample too, shape (n_samples, batch).
-
-    Bits that samples have by themselves, and `RESTARTED`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import gain
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Guard, Observer, run_with_status
-    >>> from kros.synthesis import Injection
-    >>> guard = Guard(np.array([-9.0]), np.array([9.0]), np.zeros(0), settle=1)
-    >>> unstable = np.array([[2.0]]), np.zeros((1, 0)), (0,), (), gain([[2.0]], 0.01), Injection.STATE, 0.01
-    >>> observer = Observer("x", Lifting(("x",)), *unstable, guard=guard)
-    >>> y = np.array([1.0, np.nan, np.nan, np.nan, 1.0, 1.0]).reshape(6, 1, 1)
-    >>> estimate, status = run_with_status(observer, y, np.zeros((6, 1, 0)))
-    >>> estimate.ravel().tolist(), status.ravel().tolist()  # 16 would be too large: it waits for the next measurement
-    ([1.0, 2.0, 4.0, 8.0, 8.0, 2.0], [0, 1, 1, 17, 16, 0])
-    """
-    samples = screened(observer, y, u)
-    run = _run([observer], samples, parameters)
-    return run.estimates[0], samples.status | run.status
+    return _run([observer], screened(observer, y, u), parameters)[0].estimates
 
 
 def run_observers(
     observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
 ) -> Array:
-    """Run observers of one and the same model, which differ in their corrections, side by side.
-
-    Parameters
-    ----------
-    observers : sequence of ObserverData
-        Of the same lifting, measured states and inputs; corrections may have different orders.
-    y, u, parameters
-        As in `run_observer`.
-
-    Returns
-    -------
-    ndarray, shape (observer, n_samples, batch, n)
-        A view with the samples outermost in memory.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import gain
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, run_observers
-    >>> from kros.synthesis import Injection
-    >>> plant = Lifting(("x",)), np.array([[0.5]]), np.ones((1, 1)), (0,), ("u",)
-    >>> observers = [Observer(f"gain {L}", *plant, gain([[L]], 0.01), Injection.STATE, 0.01) for L in (0.0, 0.5)]
-    >>> y = np.array([4.0, 8.0, 0.0]).reshape(3, 1, 1)
-    >>> run_observers(observers, y, np.zeros((3, 1, 1))).reshape(2, 3).tolist()
-    [[4.0, 2.0, 1.0], [4.0, 2.0, 4.0]]
-    """
+    """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     first = observers[0]
-    if any((o.lifting, o.measured, o.inputs) != (first.lifting, first.measured, first.inputs) for o in observers[1:]):
+    if any(_kind(o) != _kind(first) for o in observers[1:]):
         raise DimensionError(
-            f"Running {len(observers)} observers side by side: they differ in lifting, measured states or inputs; run "
-            "them one by one."
+            f"Running {len(observers)} observers side by side: they differ in lifting, measured states, inputs, delay, "
+            "limits or ranges; run them one by one."
         )
-    screen, late = Screen.of(first), first.runtime.delay and first.lifting.history
-    alike = (
-        o.bank is None and o.runtime.clips_alike(first.runtime) and Screen.of(o).same_as(screen) for o in observers
-    )
-    if len(observers) > 1 and (late or not all(alike)):
+    if len(observers) > 1 and (first.bank is not None or (first.runtime.delay and first.lifting.history)):
         return np.stack([run_observer(o, y, u, parameters) for o in observers])
-    return _run(observers, screened(first, y, u), parameters).estimates
+    (n_samples, batch), n = np.shape(y)[:2], first.lifting.n_states
+    states = np.empty((n_samples, len(observers), n, batch))
+    runs = _run(observers, screened(first, y, u), parameters, states=states)
+    for i, run in enumerate(runs):
+        if not np.may_share_memory(run.estimates, states):
+            states[:, i] = run.estimates.swapaxes(1, 2)
+    return states.transpose(1, 0, 3, 2)
+
+
+def _kind(observer: ObserverData) -> tuple[Any, ...]:
+    """Return what is alike where observers run side by side."""
+    run, seen = observer.runtime, observer.seen
+    limits = [side.tolist() for side in run.limits().values()]
+    sizes = None if seen is None else (seen.measured.tolist(), seen.inputs.tolist())
+    return observer.lifting, observer.measured, observer.inputs, run.delay, limits, sizes
 
 
 def run_innovations(
@@ -145,59 +102,34 @@ def run_innovations(
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
-    run = _run([observer], samples, parameters, innovations=True)
-    run.starts[0] = True
-    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
-
-
-@dataclass(frozen=True, eq=False)
-class _Run:
-    """What observers did; all but the estimates of the first one."""
-
-    estimates: Array  # (observer, n_samples, batch, n)
-    innovation: Array  # (n_samples, batch, q); zero where none was wanted
-    status: Bits  # (n_samples, batch): RESTARTED, or nothing
-    starts: Flags  # (n_samples, batch)
-    moving: Flags  # (n_samples, batch)
-
-    def take(self, number: int, machines: Whole, run: Stepped) -> None:
-        """Take what an observer did on some machines."""
-        self.estimates[number][:, machines] = run.estimates
-        for name in ("innovation", "status", "starts", "moving"):
-            getattr(self, name)[:, machines] = getattr(run, name)
+    run = _run([observer], samples, parameters, innovations=True)[0]
+    starts = run.starts.copy()
+    starts[0] = True
+    return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
 
 
 def _run(
-    observers: Sequence[ObserverData], samples: Screened, parameters: Parameters | None, innovations: bool = False
-) -> _Run:
-    """Run observers on screened samples, compiled where that is possible."""
-    (n_samples, batch), observer, loops = samples.starts.shape, observers[0], library()
-    n, delay = observer.lifting.n_states, observer.runtime.delay
-    values, left = observer.values(parameters, (batch,)), _one_by_one(observer, samples)
-    restarted, machines = np.tile(left, (len(observers), 1)), np.flatnonzero(~left)
-    estimates: Array = np.empty(0)
-    innovation = np.zeros(samples.y.shape)
-    if loops is not None and len(machines):
-        some = samples if len(machines) == batch else samples.of(machines)
-        courses = [Course(o, len(machines), _of_machines(values, machines)) for o in observers]
-        run = _compiled(loops, courses, some, innovations)
-        estimates, restarted[:, machines] = run.estimates, run.restarted
-        if run.innovation is not None:
-            innovation[:, machines] = run.innovation
-    if len(machines) < batch:
-        estimates, part = np.empty((n_samples, len(observers), n, batch)).transpose(1, 0, 3, 2), estimates
-        if len(machines):
-            estimates[:, :, machines] = part
-    moving = (_pending(samples.starts, delay) == delay) & (~samples.starts | (delay == 0))
-    status, starts = np.zeros((n_samples, batch), np.uint8), samples.starts.copy()
-    result = _Run(estimates, innovation, status, starts, moving)
-    for i, each in enumerate(observers):
-        machines = np.flatnonzero(restarted[i])
-        if len(machines):
-            course = Course(each, len(machines), _of_machines(values, machines))
-            result.take(i, machines, stepped(course, samples.of(machines)))
-    _limit(observer, estimates)
-    return result
+    observers: Sequence[ObserverData],
+    samples: Screened,
+    parameters: Parameters | None,
+    innovations: bool = False,
+    states: Array | None = None,
+) -> list[Stepped]:
+    """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
+    loops, batch = library(), samples.starts.shape[1]
+    courses = [Course(o, batch, parameters) for o in observers]
+    if loops is None:
+        runs = [stepped(course, samples) for course in courses]
+    else:
+        runs, again = _compiled(loops, courses, samples, innovations, states)
+        if observers[0].bank is not None:
+            again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
+        for run, course, some in zip(runs, courses, again, strict=True):
+            if some.any():
+                run.replace(np.flatnonzero(some), course, samples)
+    for run, observer in zip(runs, observers, strict=True):
+        _limit(observer, run.estimates)
+    return runs
 
 
 def _limit(observer: ObserverData, estimates: Array) -> None:
@@ -205,18 +137,6 @@ def _limit(observer: ObserverData, estimates: Array) -> None:
     for i in observer.runtime.limited_states(observer.lifting.n_states):
         low, high = (side if side is None else side[i] for side in (observer.runtime.lower, observer.runtime.upper))
         np.clip(estimates[..., i], low, high, out=estimates[..., i])
-
-
-def _one_by_one(observer: ObserverData, samples: Screened) -> Flags:
-    """Return which machines NumPy steps, (batch,): without a compiler all, else banks with gaps."""
-    if library() is None:
-        return np.ones(samples.starts.shape[1], dtype=bool)
-    return np.asarray((observer.bank is not None) & ~np.isfinite(samples.y).all(axis=(0, 2)))
-
-
-def _of_machines(values: Parameters, machines: Whole) -> dict[str, npt.ArrayLike]:
-    """Return the parameters of some machines."""
-    return {name: value if np.size(value) == 1 else np.asarray(value)[machines] for name, value in values.items()}
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +149,14 @@ class Stepped:
     starts: Flags  # (n_samples, batch)
     moving: Flags  # (n_samples, batch)
     followed: Array  # (n_samples, batch): the parameter that a loop follows
+
+    def replace(self, machines: Whole, course: Course, samples: Screened) -> None:
+        """Put what some machines do in NumPy in the place of what they did, from the first sample of all."""
+        values, batch = course.values, samples.starts.shape[1]
+        own = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[machines] for name, v in values.items()}
+        part = stepped(Course(course.observer, len(machines), own), samples.of(machines))
+        for name in ("estimates", "status", "starts", "moving", *(("innovation",) if len(self.innovation) else ())):
+            getattr(self, name)[:, machines] = getattr(part, name)
 
 
 class Loop(Protocol):
@@ -272,23 +200,21 @@ class Course:
 
     def take(self, y: Array, u: Array) -> Stepped:
         """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
-        samples, loops = screened(self.observer, y, u, None if self._before is None else self._before.held), library()
-        run: Stepped | None = None
-        if loops is not None and self._even(samples):
-            result = _compiled(loops, [self], samples)
-            if not result.restarted.any():
-                rest = np.zeros(samples.status.shape, dtype=np.uint8), samples.starts, samples.starts
-                run = Stepped(result.estimates[0], np.empty(0), *rest, np.empty(0))
+        samples = screened(self.observer, y, u, None if self._before is None else self._before.held)
+        loops, run = library(), None
+        if loops is not None and self.even(samples):
+            runs, restarted = _compiled(loops, [self], samples)
+            run = None if restarted.any() else runs[0]
         run = stepped(self, samples) if run is None else run
         _limit(self.observer, run.estimates)
         return replace(run, status=run.status | samples.status)
 
-    def _even(self, samples: Screened) -> bool:
+    def even(self, samples: Screened) -> bool:
         """Whether the compiled loop can run on: nothing waits, settles, fills a gap or follows."""
         gaps = self.steps.gaps
+        lost = gaps is not None and not np.isfinite(samples.y).all()
         filled = gaps is not None and bool(gaps.age.any() or samples.starts[-1].any())
-        waits = bool(self.steps.waiting.any() or self.restarts.left.any() or _one_by_one(self.observer, samples).any())
-        return self.loop is None and not filled and not waits
+        return self.loop is None and not (lost or filled or self.steps.waiting.any() or self.restarts.left.any())
 
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
@@ -364,40 +290,44 @@ def _predict(
         x[rows] = forward(observer, each, count.ravel(), *signals).reshape(len(rows), batch, -1)
 
 
-@dataclass(frozen=True, eq=False)
-class Compiled:
-    """What the compiled loop leaves."""
-
-    estimates: Array  # (observer, n_samples, batch, n)
-    innovation: Array | None  # (n_samples, batch, q) of the first observer
-    restarted: Flags  # (observer, batch): whether a machine left its bounds, from where on it stands still
-
-
-def _compiled(loops: Library, courses: Sequence[Course], samples: Screened, innovations: bool = False) -> Compiled:
-    """Run observers of one model on in the compiled loop; those that leave their bounds stay where they were."""
+def _compiled(
+    loops: Library,
+    courses: Sequence[Course],
+    samples: Screened,
+    innovations: bool = False,
+    states: Array | None = None,
+) -> tuple[list[Stepped], Flags]:
+    """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
     late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
-    pending, states = np.concatenate(late), np.empty((n_samples, len(observers), n, batch))
+    pending, states = np.concatenate(late), _empty(n_samples, len(observers), n, batch) if states is None else states
     job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
-    innovation = np.empty(samples.y.shape) if innovations else None
-    before = np.empty((n_samples, batch, job["past"].shape[-1]))
-    job |= {} if innovation is None else {"innovation": innovation}
+    innovation = _empty(*samples.y.shape) if innovations else _empty(0, *samples.y.shape[1:])
+    before = _empty(n_samples, batch, job["past"].shape[-1])
+    moving = (pending == delay) & (~samples.starts | (delay == 0))
+    job |= {"innovation": innovation} if innovations else {}
     if delay:
-        job |= {"moving": (pending == delay) & ~samples.starts, "before": before, "pending": pending}
+        job |= {"moving": moving, "before": before, "pending": pending}
     tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
     loops.call("kros_relift", tape, ("relift_job", job))
-    estimates, restarted = states.transpose(1, 0, 3, 2), job["restart"].view(bool)
+    runs, restarted = [], job["restart"].view(bool)
     for i, course in enumerate(courses):
+        x = states[:, i].swapaxes(1, 2)
         if not restarted[i].any():
             course.since = np.where(samples.starts[-1], 0, pending[-1])
-            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], estimates[i, -1], samples)
-    if delay:
-        with np.errstate(over="ignore", invalid="ignore"):
-            for o, x in zip(observers, estimates, strict=True):
-                _predict(o, x, before, pending, samples, values)
-    return Compiled(estimates[:, lead:], innovation, restarted)
+            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], x[-1], samples)
+        if delay:
+            with np.errstate(over="ignore", invalid="ignore"):
+                _predict(course.observer, x, before, pending, samples, values)
+        status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
+        runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
+    return runs, restarted
+
+
+def _empty(*shape: int) -> Array:
+    return np.empty(shape)
 
 
 def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:

@@ -22,54 +22,24 @@ L. Ljung and T. Soderstrom, Theory and Practice of Recursive Identification, MIT
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from .data import ObserverData
-from .screen import screened
-from .simulate import Course, run_observer, stepped
+from .simulate import run_observer
 from .step import Flags, Steps
 
 Array = npt.NDArray[np.float64]
 MOST = 1.0  # largest error of the parameter that is corrected at once: transients at the start show more
-SETTLE_SAMPLES = 2_000
-
-
-@dataclass(frozen=True, eq=False)
-class Tracked:
-    """What a run with a phase-locked loop leaves.
-
-    Parameters
-    ----------
-    estimates : ndarray, shape (n_samples, batch, n)
-        Row k from what arrived up to k - 1.
-    values : ndarray, shape (n_samples, batch)
-        The parameter, row k from what arrived up to k - 1.
-    restarted : ndarray of bool, shape (n_samples, batch)
-        Where the guard makes the observer start again (`SampleStatus.RESTARTED`).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import Tracked
-    >>> run = Tracked(np.zeros((100, 2, 3)), np.zeros((100, 2)), np.zeros((100, 2), dtype=bool))
-    >>> run.values[-1].tolist()
-    [0.0, 0.0]
-    """
-
-    estimates: Array
-    values: Array
-    restarted: Flags
 
 
 class PhaseLockedLoop:
     """The loop beside an observer's `Steps`, for a batch of machines."""
 
     def __init__(self, observer: ObserverData, name: str, batch: int, settle_s: float | None = None) -> None:
-        settle_s = SETTLE_SAMPLES * observer.sample_period_s if settle_s is None else settle_s
+        settle_s = 2_000 * observer.sample_period_s if settle_s is None else settle_s
         lifting = observer.lifting
         of_inputs = any(name in formula.used for formula in lifting.input_formulas)
         if name not in lifting.parameters or lifting.history or of_inputs or observer.runtime.delay:
@@ -128,62 +98,6 @@ def measurement_sizes(observer: ObserverData) -> Array:
             "their sizes, which it does not know; give it Observer(..., seen=Seen(measured, inputs))."
         )
     return np.where(observer.seen.measured > 0, observer.seen.measured, 1.0)
-
-
-def track_parameter(
-    observer: ObserverData,
-    y: Array,
-    u: Array,
-    parameters: Mapping[str, npt.ArrayLike] | None = None,
-    name: str = "phase",
-    settle_s: float | None = None,
-) -> Tracked:
-    """Run an observer that follows one of its lifting's parameters.
-
-    Parameters
-    ----------
-    observer : ObserverData
-    y : ndarray, shape (n_samples, batch, q)
-        NaN where a measurement is missing: neither the estimate nor the parameter is corrected then.
-    u : ndarray, shape (n_samples, batch, m)
-    parameters : mapping of str to array_like, shape (batch,)
-        Where every parameter starts; the observer's own values where absent.
-    name : str
-        The parameter that is followed.
-    settle_s : float, s, optional
-        Time constant of the loop (`PhaseLockedLoop`); by default 2000 samples.
-
-    Returns
-    -------
-    Tracked
-
-    Raises
-    ------
-    ConfigError
-        When the observer cannot be followed (`PhaseLockedLoop`), or a parameter is unknown or not finite.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.core import gain
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import Observer, track_parameter
-    >>> from kros.synthesis import Injection
-    >>> lifting = Lifting(("x",), ("sin(10*x + phase)",), ("phase",))
-    >>> A, K = np.array([[1.0, 0.002], [0.0, 0.0]]), gain([[0.2], [0.0]], 0.001)
-    >>> model = A, np.array([[0.001], [0.0]]), (0,), ("u",)
-    >>> observer = Observer("x", lifting, *model, K, Injection.STATE, 0.001, {"phase": 0.0})
-    >>> x = np.zeros((8000, 1, 1))
-    >>> for k in range(7999):
-    ...     x[k + 1] = x[k] + 0.001 + 0.002 * np.sin(10 * x[k] + 0.5)
-    >>> found = track_parameter(observer, x, np.ones((8000, 1, 1)), settle_s=0.5)
-    >>> found.values[-1].round(2).tolist()
-    [0.5]
-    """
-    batch = np.shape(y)[1]
-    loop = PhaseLockedLoop(observer, name, batch, settle_s)
-    run = stepped(Course(observer, batch, parameters, loop), screened(observer, y, u))
-    return Tracked(observer.runtime.clip_estimate(run.estimates), run.followed, run.status > 0)
 
 
 def least_innovation(

@@ -8,13 +8,11 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-import numpy as np
-
 from ..core.artifacts import load_artifact, plain, read_json
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
 from ..synthesis.result import Synthesis
-from ..uncertainty import UncertainModel, VariationAndNoise
+from ..uncertainty import UncertainModel
 from .config import Stage
 from .engine.context import Context
 from .engine.store import Store
@@ -138,10 +136,8 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
         },
     }
     if store.holds("uncertainty", name, "noise"):
-        noise = VariationAndNoise.load(store.path("uncertainty", name, "noise"))
-        place = int(noise.residual.max(axis=0).argmax())
-        share = noise.noise_share
-        entry["noise_share"] = {"median": np.median(share), "at_peak": share[place], "peak_hz": noise.freqs_hz[place]}
+        facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
+        entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
     return entry
 
 

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.mixed import mixed
     from .problem.observer_problem import ObserverProblem
-    from .reduction import reduce_controller
     from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
     from .riccati.h2 import h2
@@ -41,7 +40,6 @@ _HOME = {
     "hinf": "riccati.hinf",
     "kalman": "riccati.kalman",
     "mixed": "mixed_norms.mixed",
-    "reduce_controller": "reduction",
     "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",
 }
@@ -57,7 +55,6 @@ __all__ = [
     "hinf",
     "kalman",
     "mixed",
-    "reduce_controller",
     "residual_h2",
     "worst_case_h2",
 ]

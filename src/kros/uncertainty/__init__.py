@@ -14,30 +14,19 @@ Examples
 
 from ..core.removed import refusing
 from ..core.small_matrices import sigma_max
-from .forms import Form, bounds, misfit, rebuild, residual
+from .forms import Form, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
-from .nominal import NominalChoice, choose_nominal
+from .nominal import choose_nominal
 from .outliers.model import OutlierModel, score_outliers
-from .outliers.score import OutlierScore
 from .quantify import UncertainModels, quantify
-from .variation import VariationAndNoise, variation_and_noise
-from .weights.cover import Cover
-from .weights.magnitude import FittedMagnitude, fit_magnitude
-from .weights.weight import Weight
+from .weights.magnitude import fit_magnitude
 
 __all__ = [
-    "Cover",
-    "FittedMagnitude",
     "Form",
-    "NominalChoice",
     "OutlierModel",
-    "OutlierScore",
     "ResponseUncertainty",
     "UncertainModel",
     "UncertainModels",
-    "VariationAndNoise",
-    "Weight",
-    "bounds",
     "choose_nominal",
     "fit_magnitude",
     "misfit",
@@ -46,7 +35,6 @@ __all__ = [
     "residual",
     "score_outliers",
     "sigma_max",
-    "variation_and_noise",
 ]
 
 __getattr__ = refusing(__name__)

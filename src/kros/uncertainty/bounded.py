@@ -8,8 +8,7 @@ claim there.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -20,11 +19,11 @@ from ..core.frequency import check_grid, log_grid
 from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
-from .inputs import check_candidate, check_ids, check_response, check_scales, find_nominal, read_systems
+from .inputs import Options, check_candidate, check_response, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
-from .nominal import choose_nominal
-from .settings import SET, FitSettings
-from .weights.bilinear import BilinearAxis, beyond, continuous_grid
+from .nominal import NominalChoice, choose_nominal
+from .settings import SET
+from .weights.bilinear import BilinearAxis, continuous_grid
 from .weights.fit import Target, fit_weight
 from .weights.residuals import Residuals
 
@@ -34,54 +33,38 @@ POOLED = "pooled"  # name of a nominal that is no unit
 _LOG = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
-    """Options of `quantify` for systems and responses, described there."""
-
-    unit_ids: Sequence[str] | None = None
-    output_scale: npt.ArrayLike | None = None
-    input_scale: npt.ArrayLike | None = None
-    nominal: Any = None
-    max_order: int = 4
-    tolerance_db: float = 1.0
-    sample_period_s: float = 0.0
-    fit: FitSettings = field(default_factory=FitSettings)
-
-    @classmethod
-    def of(cls, options: dict[str, Any]) -> Options:
-        """Check options by name, order and tolerance."""
-        unknown = sorted(set(options) - set(cls.__dataclass_fields__))
-        if unknown:
-            raise ConfigError(f"Quantify: unknown {', '.join(unknown)}; known: {', '.join(cls.__dataclass_fields__)}.")
-        read = cls(**options)
-        if not (isinstance(read.max_order, int | np.integer) and read.max_order >= 0 and read.tolerance_db >= 0):
-            raise ConfigError(
-                f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
-                f"{read.tolerance_db} not negative."
-            )
-        return read
-
-
 def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, options: Options) -> UncertainModel:
     """Return the set of systems, discrete or continuous."""
-    system, ids, scales = read_systems(models, options.unit_ids, options.output_scale, options.input_scale)
-    freqs, axis = _axis(system, freqs_hz, getattr(models, "longest_s", None))
-    units = scale_system(system, *scales)
+    system, options = read_systems(models, options)
+    scales, ids = options.scales(system.D.shape[-2:]), options.ids(system.batch_shape[0])
+    units, axis = scale_system(system, *scales), None
+    if system.dt == 0:
+        freqs = continuous_grid(system, freqs_hz)
+        axis = BilinearAxis.over(freqs)
+    elif freqs_hz is None:
+        freqs = log_grid(system.dt, longest_s=getattr(models, "longest_s", None))
+    else:
+        freqs = check_grid(freqs_hz, system.dt)
     responses = units.frequency_response(freqs)
     choices = {other: choose_nominal(responses, other) for other in Form}
     if isinstance(options.nominal, StateSpace):
         check_candidate(options.nominal, system)
         index, chosen = -1, options.nominal
     else:
-        index = find_nominal(options.nominal, ids, choices[form].index)
+        index = options.row(ids, choices[form].index)
         chosen = system[index]
-    base = scale_system(chosen, *scales)
-
-    def units_at(at_hz: Array, rows: Array) -> Array:
-        return units[rows].frequency_response(at_hz)
-
-    residuals = Residuals(form, base.frequency_response, units_at, np.arange(len(ids)), (base, units))
-    bound = _bound(residuals, freqs, axis or system.dt, options)
+    base, last_hz = scale_system(chosen, *scales), np.inf
+    if axis is not None:  # constant beyond the grid: there a strictly proper plant has numerically no pseudo-inverse
+        base, units, last_hz = axis.discrete(base), axis.discrete(units), float(axis.discrete_hz(freqs[-1]))
+    residuals = Residuals(
+        form,
+        lambda at_hz: base.frequency_response(np.minimum(at_hz, last_hz)),
+        lambda at_hz, rows: units[rows].frequency_response(np.minimum(at_hz, last_hz)),
+        np.arange(len(ids)),
+        (base, units),
+        proven=axis is None,
+    )
+    bound = _bound(residuals, freqs, axis, system.dt, options)
     return UncertainModel(nominal_system=chosen, **_fields(ids, index, freqs, scales, choices, bound))
 
 
@@ -97,33 +80,30 @@ def bound_responses(
         raise DimensionError(
             f"Quantify: responses at {G.shape[1]} frequencies need as many freqs_hz, found {len(freqs)}."
         )
-    ids, nominal = check_ids(options.unit_ids, len(G)), options.nominal
+    ids, nominal, scales = options.ids(len(G)), options.nominal, options.scales(G.shape[2:])
     given = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
     for name, value in zip((*ids, "the nominal"), [*G, np.asarray(nominal)] if given else G, strict=False):
         check_response(name, value, G.shape[1:], freqs)
-    scales = check_scales(options.output_scale, options.input_scale, G.shape[2:])
     units = G / scales[0][:, None] * scales[1]
     choices = {other: choose_nominal(units, other) for other in Form}
-    index = -1 if given else find_nominal(nominal, ids, choices[form].index)
+    index = -1 if given else options.row(ids, choices[form].index)
     chosen = np.asarray(nominal) if given else G[index]
-    base = chosen / scales[0][:, None] * scales[1]
-
-    def units_at(at_hz: Array, rows: Array) -> Array:
-        return _between(freqs, units[rows], at_hz)
-
-    residuals = Residuals(form, lambda at_hz: _between(freqs, base[None], at_hz)[0], units_at, np.arange(len(ids)))
-    bound = _bound(residuals, freqs, dt or BilinearAxis.over(freqs), options)
-    fields = _fields(ids, index, freqs, scales, choices, bound)
-    fields["certificate"], fields["unresolved_hz"] = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, **fields)
+    base, axis = (chosen / scales[0][:, None] * scales[1])[None], None if dt else BilinearAxis.over(freqs)
+    at = freqs if axis is None else axis.discrete_hz(freqs)
+    residuals = Residuals(
+        form, lambda f: _between(at, base, f)[0], lambda f, rows: _between(at, units[rows], f), np.arange(len(ids))
+    )
+    fields = _fields(ids, index, freqs, scales, choices, _bound(residuals, freqs, axis, dt, options))
+    certificate = _certificate(freqs, fields["bounds"][form])
+    return ResponseUncertainty(nominal_response=chosen, sample_period_s=dt, certificate=certificate, **fields)
 
 
-def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
-    """Return where a bound of responses holds, in words, and the frequencies of peaks that are not resolved."""
+def _certificate(freqs: Array, bound: Array) -> str:
+    """Return where a bound of responses holds, and which of its peaks the frequencies do not resolve."""
     text = f"at the {len(freqs)} frequencies given, {freqs[0]:.6g} to {freqs[-1]:.6g} Hz; not between or beyond them"
     middle, low = bound[1:-1], np.minimum(bound[:-2], bound[2:])
     top = (middle >= bound[:-2]) & (middle >= bound[2:])
-    unresolved = freqs[1:-1][top & (middle > np.maximum(SET.resolved * low, SET.negligible * bound.max()))]
+    unresolved = freqs[1:-1][top & (middle > np.maximum(SET.resolved * low, SET.exact * bound.max()))]
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
@@ -132,18 +112,7 @@ def _certificate(freqs: Array, bound: Array) -> tuple[str, Array]:
             "may be larger beside them; measure more densely there.",
             some,
         )
-    return text, unresolved
-
-
-def _axis(
-    system: StateSpace, freqs_hz: npt.ArrayLike | None, longest_s: float | None
-) -> tuple[Array, BilinearAxis | None]:
-    """Return the grid, and the map of the imaginary axis to a unit circle for continuous systems."""
-    if system.dt > 0:
-        grid = log_grid(system.dt, longest_s=longest_s) if freqs_hz is None else check_grid(freqs_hz, system.dt)
-        return grid, None
-    wide = beyond(continuous_grid(system) if freqs_hz is None else check_grid(freqs_hz, None))
-    return wide, BilinearAxis.over(wide)
+    return text
 
 
 def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
@@ -155,30 +124,24 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
     return np.asarray(values[:, left] * (1 - share) + values[:, right] * share)
 
 
-def _bound(residuals: Residuals, freqs_hz: Array, time: float | BilinearAxis, options: Options) -> dict[str, Any]:
-    """Return weights for the residuals and the remainder, on the mapped axis and back for continuous time."""
-    if not isinstance(time, BilinearAxis):
-        return _bound_discrete(residuals, freqs_hz, time, options)
-    bound = _bound_discrete(time.mapped(residuals), time.discrete_hz(freqs_hz), time.period_s, options)
-    weights = {name: bound[name] for name in ("weight", "remainder") if bound.get(name) is not None}
-    return bound | {name: weight.mapped(time.continuous) for name, weight in weights.items()}
-
-
-def _bound_discrete(residuals: Residuals, freqs_hz: Array, dt: float, options: Options) -> dict[str, Any]:
+def _bound(
+    residuals: Residuals, freqs_hz: Array, axis: BilinearAxis | None, dt: float, options: Options
+) -> dict[str, Any]:
     """Return bound, cover, weight, misfit, and cover and weight of the remainder where the form leaves one."""
-    target = Target(dt, options.max_order, options.tolerance_db, options.fit)
-    weight, cover = fit_weight(residuals, freqs_hz, target)
-    G, ratios, largest = residuals.nominal(freqs_hz), [], []
-    for rows in residuals.blocks(options.fit.block):
-        E = residuals.of(rows).at(freqs_hz)
-        ratios.append(misfit(residuals.form, G, residuals.units(freqs_hz, rows), E))
-        largest.append(sigma_max(E).max(axis=0))
-    ratio, form = np.concatenate(ratios), residuals.form
-    bound = {"bound": np.max(largest, axis=0), "cover": cover, "weight": weight, "misfit": ratio, "form": form}
-    if not _leaves_out(residuals.form, ratio):
-        return bound
-    remainder, remainder_cover = fit_weight(replace(residuals, remainder=True), freqs_hz, target)
-    return bound | {"remainder": remainder, "remainder_cover": remainder_cover}
+    freqs = freqs_hz if axis is None else axis.discrete_hz(freqs_hz)
+    target = Target(dt if axis is None else axis.period_s, options.max_order, options.tolerance_db)
+    weight, cover = fit_weight(residuals, freqs, target)
+    G, ratios, largest, form = residuals.nominal(freqs), [], [], residuals.form
+    for rows in residuals.blocks():
+        ratios.append(misfit(form, G, residuals.units(freqs, rows)))
+        largest.append(sigma_max(residuals.of(rows).at(freqs)).max(axis=0))
+    bound: dict[str, Any] = {"form": form, "bound": np.max(largest, axis=0), "misfit": np.concatenate(ratios)}
+    bound |= {"weight": weight, "cover": cover}
+    if _leaves_out(form, bound["misfit"]):
+        bound["remainder"] = fit_weight(replace(residuals, remainder=True), freqs, target)[0]
+    if axis is not None:
+        bound |= {name: bound[name].mapped(axis.continuous) for name in ("weight", "remainder") if name in bound}
+    return bound
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:
@@ -199,18 +162,22 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
 
 
 def _fields(
-    ids: tuple[str, ...], index: int, freqs_hz: Array, scales: tuple[Array, Array], choices: Any, bound: dict[str, Any]
+    ids: tuple[str, ...],
+    index: int,
+    freqs_hz: Array,
+    scales: tuple[Array, Array],
+    choices: dict[Form, NominalChoice],
+    bound: dict[str, Any],
 ) -> dict[str, Any]:
     """Return the fields of `Uncertainty` for the nominal `index` among the units."""
-    name, form = ids[index] if index >= 0 else POOLED, bound["form"]
-    return {
+    name, form, largest = ids[index] if index >= 0 else POOLED, bound["form"], bound.pop("bound")
+    return bound | {
         "unit_ids": ids,
         "nominal": index,
         "nominal_id": name,
         "freqs_hz": freqs_hz,
         "output_scale": scales[0],
         "input_scale": scales[1],
-        "bounds": {f: choice.bound for f, choice in choices.items()} | {form: bound["bound"]},
+        "bounds": {f: choice.bound for f, choice in choices.items()} | {form: largest},
         "nominals": {f: ids[choice.index] for f, choice in choices.items()} | {form: name},
-        **{key: value for key, value in bound.items() if key != "bound"},
     }

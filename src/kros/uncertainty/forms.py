@@ -21,7 +21,6 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
@@ -132,59 +131,19 @@ def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array
         return G + G @ E
     if form is Form.OUTPUT_MULTIPLICATIVE:
         return G + E @ G
-    inverse = _inverse(inverted_matrix(form, G, E))
+    product = E @ G if form is Form.INVERSE_ADDITIVE else E
+    inverse = _inverse(np.eye(product.shape[-1]) - product)
     return inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse
 
 
-def inverted_matrix(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
-    """Return what an inverse form inverts: `1 - E G` or `1 - E`, shape (..., q, q)."""
-    form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
-    product = E @ G if form is Form.INVERSE_ADDITIVE else E
-    return np.eye(product.shape[-1]) - product
-
-
-def bounds(form: Form | str, responses: Array, *, paper: bool = False, nominals: Sequence[int] | None = None) -> Array:
-    """Return the largest residual over the other units, for every nominal asked for.
-
-    Parameters
-    ----------
-    form : Form or str
-    responses : ndarray, shape (unit, frequency, p, m), complex
-        In scaled coordinates.
-    paper : bool
-        The published pipeline's variants.
-    nominals : sequence of int, optional
-        All units by default.
-
-    Returns
-    -------
-    ndarray, shape (nominal, frequency)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import bounds
-    >>> responses = np.array([1.0, 1.1, 0.8]).reshape(3, 1, 1, 1)  # unit, frequency, output, input
-    >>> bounds("additive", responses).round(9).ravel().tolist()
-    [0.2, 0.3, 0.3]
-    """
-    form, G = as_form(form), check_responses(responses)
-    rows = range(len(G)) if nominals is None else nominals
-    others = (np.delete(G, j, axis=0) for j in rows)
-    sizes = (sigma_max(residual(form, G[j], Gp, paper=paper)) for j, Gp in zip(rows, others, strict=True))
-    return np.array([size.max(axis=0, initial=0.0) for size in sizes])
-
-
-def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None = None) -> Array:
+def misfit(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> Array:
     """Return what the form cannot rebuild: `sigma_max(rebuilt Gp - Gp) / sigma_max(Gp)`.
 
     Parameters
     ----------
     form : Form or str
-    nominal : ndarray, shape (frequency, p, m), complex
-    responses : ndarray, shape (unit, frequency, p, m), complex
-    E : ndarray, shape (unit, frequency, p', m'), optional
-        Residuals, when already computed.
+    nominal : array_like, shape (frequency, p, m), complex
+    responses : array_like, shape (unit, frequency, p, m), complex
 
     Returns
     -------
@@ -200,26 +159,22 @@ def misfit(form: Form | str, nominal: Array, responses: Array, E: Array | None =
     >>> misfit("input_multiplicative", nominal, np.array([[[[1.0], [0.1]]]])).round(3).tolist()
     [[0.1]]
     """
-    form = as_form(form)
-    E = residual(form, nominal, responses) if E is None else E
-    error = sigma_max(rebuild(form, nominal, E) - responses)
-    size = sigma_max(responses)
+    _, rest, regular = completion(form, nominal, responses)
+    error, size = sigma_max(rest), sigma_max(responses)
     ratio = np.divide(error, size, out=np.zeros_like(error), where=size > 0)
-    if form.inverse:
-        ratio[~(np.linalg.cond(inverted_matrix(form, nominal, E)) <= SET.condition)] = np.nan
-    return ratio
+    return np.where(regular, ratio, np.nan)
 
 
-def completion(
-    form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike, E: Array | None = None
-) -> tuple[Array, Array]:
-    """Return residuals, zero where an inverse form is near singular, and the remainder."""
+def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> tuple[Array, Array, Array]:
+    """Return residuals, zero where an inverse form is near singular, the remainder, and where it is not."""
     form, G, Gp = as_form(form), np.asarray(nominal), np.asarray(responses)
-    E = residual(form, G, Gp) if E is None else E
+    E = residual(form, G, Gp)
+    regular = np.ones(E.shape[:-2], bool)
     if form.inverse:
-        regular = np.linalg.cond(inverted_matrix(form, G, E)) <= SET.condition
+        product = E @ G if form is Form.INVERSE_ADDITIVE else E
+        regular = np.linalg.cond(np.eye(product.shape[-1]) - product) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)
-    return E, Gp - rebuild(form, G, E)
+    return E, Gp - rebuild(form, G, E), regular
 
 
 def check_responses(responses: npt.ArrayLike) -> Array:

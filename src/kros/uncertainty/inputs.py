@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,31 +15,68 @@ from ..core.lti import StateSpace
 Array = npt.NDArray[Any]
 
 
-def read_systems(
-    models: Any, unit_ids: Sequence[str] | None, output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None
-) -> tuple[StateSpace, tuple[str, ...], tuple[Array, Array]]:
-    """Return models as a checked batch, with ids and scales."""
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of `quantify` for systems and responses, described there."""
+
+    unit_ids: Sequence[str] | None = None
+    output_scale: npt.ArrayLike | None = None
+    input_scale: npt.ArrayLike | None = None
+    nominal: Any = None
+    max_order: int = 4
+    tolerance_db: float = 1.0
+    sample_period_s: float = 0.0
+
+    @classmethod
+    def of(cls, options: dict[str, Any]) -> Options:
+        """Check options by name, order and tolerance."""
+        unknown = sorted(set(options) - set(cls.__dataclass_fields__))
+        if unknown:
+            raise ConfigError(f"Quantify: unknown {', '.join(unknown)}; known: {', '.join(cls.__dataclass_fields__)}.")
+        read = cls(**options)
+        if not (isinstance(read.max_order, int | np.integer) and read.max_order >= 0 and read.tolerance_db >= 0):
+            raise ConfigError(
+                f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
+                f"{read.tolerance_db} not negative."
+            )
+        return read
+
+    def scales(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
+        """Return the ranges of outputs and inputs."""
+        return check_scale("output", self.output_scale, shape[0]), check_scale("input", self.input_scale, shape[1])
+
+    def ids(self, count: int) -> tuple[str, ...]:
+        """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
+        ids = tuple(str(k) for k in range(count)) if self.unit_ids is None else tuple(self.unit_ids)
+        if len(ids) != count or len(set(ids)) != count:
+            problem = f"Quantify: needs one id for each of {count} units, all different"
+            raise DimensionError(f"{problem}, found {len(ids)} ({', '.join(ids[:5])} ...).")
+        if count < 2:
+            needs = f"uncertainty of a population needs at least two units, found {count} ({', '.join(ids)})"
+            raise DataError(f"Quantify: {needs}; record more units.")
+        return ids
+
+    def row(self, ids: tuple[str, ...], best: int) -> int:
+        """Return the row of the nominal among the units: by name or row, otherwise the best."""
+        index = best if self.nominal is None else self.nominal
+        if isinstance(index, str) and index in ids:
+            return ids.index(index)
+        if not isinstance(index, (int, np.integer)) or not 0 <= index < len(ids):
+            known = f"give one of the units {', '.join(ids[:10])}, a system, or a row below {len(ids)}"
+            raise ConfigError(f"Quantify: nominal {index!r} is out of range; {known}.")
+        return int(index)
+
+
+def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
+    """Return models as a batch of stable systems, and the options with the names and scales that models have."""
     if hasattr(models, "systems") and hasattr(models, "unit_ids"):
-        output_scale = models.output_scale if output_scale is None else output_scale
-        input_scale = models.input_scale if input_scale is None else input_scale
-        unit_ids = tuple(models.unit_ids) if unit_ids is None else tuple(unit_ids)
-        models = models.systems(unit_ids)
+        names = ("output_scale", "input_scale", "unit_ids")
+        known = {name: getattr(models, name) for name in names if getattr(options, name) is None}
+        options = replace(options, **known)
+        models = models.systems(tuple(options.unit_ids or ()))
     system = stack_systems(models)
-    ids = check_ids(unit_ids, system.batch_shape[0])
-    _check_stable(system, tuple(f"unit {name}" for name in ids))
-    return system, ids, check_scales(output_scale, input_scale, system.D.shape[-2:])
-
-
-def check_ids(unit_ids: Sequence[str] | None, count: int) -> tuple[str, ...]:
-    """Return the names of units, ``0, 1, ...`` by default, or raise an error where they do not fit."""
-    ids = tuple(str(k) for k in range(count)) if unit_ids is None else tuple(unit_ids)
-    if len(ids) != count or len(set(ids)) != count:
-        problem = f"Quantify: needs one id for each of {count} units, all different"
-        raise DimensionError(f"{problem}, found {len(ids)} ({', '.join(ids[:5])} ...).")
-    if count < 2:
-        needs = f"uncertainty of a population needs at least two units, found {count} ({', '.join(ids)})"
-        raise DataError(f"Quantify: {needs}; record more units.")
-    return ids
+    require_stable(system, tuple(f"unit {name}" for name in options.ids(system.batch_shape[0])))
+    return system, options
 
 
 def stack_systems(models: Any) -> StateSpace:
@@ -64,18 +102,15 @@ def stack_systems(models: Any) -> StateSpace:
     return models
 
 
-def find_nominal(nominal: Any, names: tuple[str, ...], best: int) -> int:
-    """Row of the nominal among the units: by name or row, otherwise the best."""
-    if isinstance(nominal, str):
-        if nominal not in names:
-            raise ConfigError(f"Quantify: nominal {nominal!r} is not among the units {', '.join(names[:10])}.")
-        return names.index(nominal)
-    index = best if nominal is None else nominal
-    if not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
-        raise ConfigError(
-            f"Quantify: nominal {index!r} is out of range; give a name, a system, or a row below {len(names)}."
-        )
-    return int(index)
+def _padded(system: StateSpace, n_states: int) -> StateSpace:
+    """Add states without input and output, at rest after a sample or as slow as the slowest."""
+    more = n_states - system.n_states
+    A = np.pad(system.A, (0, more))
+    if system.dt == 0 and more:
+        slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
+        A[system.n_states :, system.n_states :] = -max(slowest, np.finfo(float).tiny) * np.eye(more)
+    B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
+    return StateSpace(A, B, C, system.D, system.dt)
 
 
 def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
@@ -86,23 +121,16 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     return scale
 
 
-def check_scales(
-    output_scale: npt.ArrayLike | None, input_scale: npt.ArrayLike | None, shape: tuple[int, ...]
-) -> tuple[Array, Array]:
-    """Return the ranges of outputs and inputs."""
-    return check_scale("output", output_scale, shape[0]), check_scale("input", input_scale, shape[1])
-
-
 def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
     """Raise an error when a nominal that is no unit is not one stable system like the units."""
     kinds = [(s.n_outputs, s.n_inputs, s.dt) for s in (candidate, system)]
     if candidate.batch_shape or kinds[0] != kinds[1]:
         problem = f"Quantify: the nominal should be one system with (outputs, inputs, sampling period) {kinds[1]}"
         raise DimensionError(f"{problem}, found {kinds[0]} in a batch of {candidate.batch_shape}.")
-    _check_stable(candidate[None], ("the nominal",))
+    require_stable(candidate[None], ("the nominal",))
 
 
-def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
+def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     count = (len(names),)
     matrices = (system.A, system.B, system.C, system.D)
@@ -122,17 +150,6 @@ def _check_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     raise DataError(f"{problem}; identify with more regularisation or leave it out.")
 
 
-def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output, at rest after a sample or as slow as the slowest."""
-    more = n_states - system.n_states
-    A = np.pad(system.A, (0, more))
-    if system.dt == 0 and more:
-        slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
-        A[system.n_states :, system.n_states :] = -max(slowest, 1e-300) * np.eye(more)
-    B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
-    return StateSpace(A, B, C, system.D, system.dt)
-
-
 def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
     """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
     if response.shape != shape:
@@ -145,13 +162,11 @@ def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Ar
         )
 
 
-def read_response_data(
-    data: Sequence[Any], freqs_hz: npt.ArrayLike | None, options: dict[str, Any]
-) -> tuple[Array, Array]:
+def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
     """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first, nominal = data[0], options.get("nominal")
-    beside = [nominal] if hasattr(nominal, "frdata") else []
-    for k, other in enumerate([*data, *beside]):
+    everything = [*data, nominal] if hasattr(nominal, "frdata") else [*data]
+    for k, other in enumerate(everything):
         name = f"response {k}" if k < len(data) else "the nominal"
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
             raise DimensionError(
@@ -162,12 +177,10 @@ def read_response_data(
                 f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
                 f"{first.frdata.shape} and {first.dt}; bring them to one."
             )
-    if freqs_hz is not None:
-        raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
     if first.dt is True:
         raise DimensionError("Quantify: the responses have no sampling period (dt = True); give it in seconds.")
     options["sample_period_s"] = float(first.dt or 0.0)
-    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in [*data, *beside]])
-    if beside:
+    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in everything])
+    if len(everything) > len(data):
         options["nominal"] = responses[-1]
     return responses[: len(data)], np.asarray(first.omega, float) / (2 * np.pi)

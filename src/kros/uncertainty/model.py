@@ -18,8 +18,8 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
-from .weights.certificate import Method
 from .weights.cover import Cover
+from .weights.proof import Method
 from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
@@ -27,47 +27,22 @@ Array = npt.NDArray[Any]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Uncertainty:
-    """A bound on how the units of a population differ from a nominal one.
-
-    Parameters
-    ----------
-    form : Form
-    unit_ids : tuple of str
-        Units that the weights cover.
-    nominal : int
-        Row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one).
-    nominal_id : str
-    freqs_hz : ndarray, shape (frequency,), Hz
-    output_scale : ndarray, shape (p,)
-    input_scale : ndarray, shape (m,)
-    bounds : dict of Form to ndarray, shape (frequency,)
-        Largest residual over the other units for the best nominal of each form, and for the nominal of `form`.
-    nominals : dict of Form to str
-        Unit behind each of these bounds.
-    cover : Cover
-        Optimal cover of the residuals, frequency by frequency.
-    weight : Weight
-    misfit : ndarray, shape (unit, frequency)
-        What the form cannot rebuild, relative to the unit; NaN where the inverse form is near singular.
-    remainder : Weight or None
-        Additive weights for `Gp - rebuilt(G, E)`, where the form does not rebuild every unit.
-    remainder_cover : Cover or None
-    """
+    """A bound on how the units of a population differ from a nominal one."""
 
     form: Form
-    unit_ids: tuple[str, ...]
-    nominal: int
+    unit_ids: tuple[str, ...]  # units that the weights cover
+    nominal: int  # row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one)
     nominal_id: str
-    freqs_hz: Array
-    output_scale: Array
-    input_scale: Array
+    freqs_hz: Array  # (frequency,), Hz
+    output_scale: Array  # (p,)
+    input_scale: Array  # (m,)
+    # (frequency,): largest residual over the other units for the best nominal of each form, and that of `form`
     bounds: dict[Form, Array]
-    nominals: dict[Form, str]
-    cover: Cover
+    nominals: dict[Form, str]  # unit behind each of these bounds
+    cover: Cover  # optimal cover of the residuals, frequency by frequency
     weight: Weight
-    misfit: Array
-    remainder: Weight | None = None
-    remainder_cover: Cover | None = None
+    misfit: Array  # (unit, frequency): what the form cannot rebuild, relative to the unit; NaN near singular inverses
+    remainder: Weight | None = None  # for `Gp - rebuilt(G, E)`, additive, where the form does not rebuild every unit
 
     @property
     def peak_db(self) -> dict[Form, float]:
@@ -104,9 +79,11 @@ class ResponseUncertainty(Uncertainty):
         Zero for continuous time.
     certificate : str
         Where the bound holds.
-    unresolved_hz : ndarray, shape (n,), Hz
-        Frequencies of local maxima of the bound that fall by more than 3 dB to a neighbouring frequency: peaks that the
-        grid does not resolve, and that may be higher beside it. All other fields are those of `Uncertainty`.
+
+    Notes
+    -----
+    Local maxima of the bound that fall by more than 3 dB to a neighbouring frequency are named in the certificate: the
+    grid does not resolve these peaks, which may be higher beside it. All other fields are those of `UncertainModel`.
 
     Examples
     --------
@@ -122,7 +99,6 @@ class ResponseUncertainty(Uncertainty):
     nominal_response: Array
     sample_period_s: float
     certificate: str
-    unresolved_hz: Array
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -132,7 +108,13 @@ class UncertainModel(Uncertainty):
     Parameters
     ----------
     nominal_system : StateSpace
-        In physical units; all others are those of `Uncertainty`.
+        In physical units.
+
+    Notes
+    -----
+    ``bounds`` and ``nominals`` are the largest residuals of every form and the units behind them, ``weight`` has the
+    diagonal systems ``left`` and ``right``, ``cover`` the magnitudes that no diagonal weight is below, ``misfit`` is
+    what the form cannot rebuild of every unit, and ``remainder`` the weights of that; the rest is as in `quantify`.
 
     Examples
     --------
@@ -161,15 +143,16 @@ class UncertainModel(Uncertainty):
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
         arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
         arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
-        arrays |= _pack_system("nominal", self.nominal_system) | _pack_weight("weight", self.weight, self.cover)
+        arrays |= {f"nominal_{x}": getattr(self.nominal_system, x) for x in "ABCD"}
+        arrays |= _pack_weight("weight", self.weight) | {"cover_left": self.cover.left, "cover_right": self.cover.right}
         content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
             "sample_period_s": self.sample_period_s,
             "nominals": {form.value: unit for form, unit in self.nominals.items()},
             "weight": {name: getattr(self.weight, name) for name in _OF_WEIGHT},
             "remainder": None,
         }
-        if self.remainder is not None and self.remainder_cover is not None:
-            arrays |= _pack_weight("remainder", self.remainder, self.remainder_cover)
+        if self.remainder is not None:
+            arrays |= _pack_weight("remainder", self.remainder)
             content["remainder"] = {name: getattr(self.remainder, name) for name in _OF_WEIGHT}
         save_artifact(Path(folder), "uncertain_model", content, arrays)
 
@@ -181,18 +164,26 @@ class UncertainModel(Uncertainty):
         axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {}, Path(folder))
         dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
-        weight, cover = _unpack_weight("weight", content["weight"], arrays, dt)
+        weight, cover = (
+            _unpack_weight("weight", content["weight"], arrays, dt),
+            Cover(arrays["cover_left"], arrays["cover_right"]),
+        )
         facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
         if content["remainder"] is not None:
-            facts["remainder"], facts["remainder_cover"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
+            facts["remainder"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
         facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
-        return cls(nominal_system=_unpack_system("nominal", arrays, dt), cover=cover, weight=weight, **facts)
+        return cls(
+            nominal_system=_unpack_system("nominal", arrays, dt),
+            cover=cover,
+            weight=weight,
+            **facts,
+        )
 
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "within_tolerance", "method")
+_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "method")
 
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
@@ -204,22 +195,17 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
 
 
-def _pack_system(name: str, system: StateSpace) -> dict[str, Array]:
-    return {f"{name}_{x}": getattr(system, x) for x in "ABCD"}
-
-
 def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace:
     A, B, C, D = (arrays[f"{name}_{x}"] for x in "ABCD")
     return StateSpace(A, B, C, D, dt)
 
 
-def _pack_weight(name: str, weight: Weight, cover: Cover) -> dict[str, Array]:
-    packed = _pack_system(f"{name}_left", weight.left) | _pack_system(f"{name}_right", weight.right)
-    return packed | {f"{name}_cover_left": cover.left, f"{name}_cover_right": cover.right}
+def _pack_weight(name: str, weight: Weight) -> dict[str, Array]:
+    sides = (("left", weight.left), ("right", weight.right))
+    return {f"{name}_{side}_{x}": getattr(system, x) for side, system in sides for x in "ABCD"}
 
 
-def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> tuple[Weight, Cover]:
+def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> Weight:
     orders = {side: tuple(facts[side]) for side in ("left_orders", "right_orders")}
     left, right = (_unpack_system(f"{name}_{side}", arrays, dt) for side in ("left", "right"))
-    weight = Weight(left, right, **facts | orders | {"method": Method(facts["method"])})
-    return weight, Cover(arrays[f"{name}_cover_left"], arrays[f"{name}_cover_right"])
+    return Weight(left, right, **facts | orders | {"method": Method(facts["method"])})

@@ -7,26 +7,25 @@ model
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
-from ..core.errors import IdentificationError
-from ..core.lti import StateSpace
+from ..core.errors import ConfigError, IdentificationError
 from ..core.small_matrices import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored
-from .bounded import Options, bound_responses, bound_systems
+from .bounded import bound_responses, bound_systems
 from .forms import Form, as_form, residual
-from .inputs import read_response_data
-from .model import ResponseUncertainty, UncertainModel
+from .inputs import Options, read_response_data
+from .model import UncertainModel
 from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
@@ -35,29 +34,12 @@ from .settings import QuantifySettings
 Array = npt.NDArray[Any]
 
 _KIND = "choice"
-_FACTS = ("nominal", "worst_off_nominal", "max_order", "pooled")
+_FACTS = ("nominal", "worst_off_nominal")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainModels:
-    """What `kros.quantify` returns.
-
-    Parameters
-    ----------
-    models : IdentifiedModels
-        Where it comes from, with the recordings.
-    nominal, worst_off_nominal : str
-        Units: the one that all others are compared with, and the one farthest from it.
-    sets : mapping of str to UncertainModel
-        By kind of model.
-    scores : tuple of dict
-        Outlier scores, one row a unit and condition.
-    outliers : mapping of str to OutlierModel
-        By place of the models in `models.sets`.
-    max_order : int
-        Highest order of a weight.
-    pooled : bool
-        Whether observers whose nominal need not be a unit may have the mean of the units' models.
+    """What `kros.quantify` returns for models of `kros.identify`.
 
     Examples
     --------
@@ -68,14 +50,12 @@ class UncertainModels:
     (['linear_edmd'], True)
     """
 
-    models: IdentifiedModels
-    nominal: str
-    worst_off_nominal: str
-    sets: Mapping[str, UncertainModel]
-    scores: tuple[dict[str, Any], ...] = ()
-    outliers: Mapping[str, OutlierModel] = field(default_factory=dict)
-    max_order: int = 4
-    pooled: bool = True
+    models: IdentifiedModels  # with the recordings
+    nominal: str  # unit that all others are compared with
+    worst_off_nominal: str  # the unit farthest from it
+    sets: Mapping[str, UncertainModel]  # by kind of model
+    scores: tuple[dict[str, Any], ...] = ()  # outlier scores, one row a unit and condition
+    outliers: Mapping[str, OutlierModel] = field(default_factory=dict)  # by place of the models in `models.sets`
 
     def __repr__(self) -> str:
         flagged = sum(bool(row["outlier"]) for row in self.scores)
@@ -115,19 +95,6 @@ class UncertainModels:
         return cls(models=models, sets=sets, scores=scores, outliers=outliers, **facts)
 
 
-@overload
-def quantify(models: IdentifiedModels, *, work: Work | None = None, **settings: Any) -> UncertainModels: ...
-@overload
-def quantify(
-    models: Array, form: Form | str = ..., freqs_hz: npt.ArrayLike | None = None, **options: Any
-) -> ResponseUncertainty: ...
-@overload
-def quantify(
-    models: StateSpace | ModelSet | Sequence[Any] | Mapping[str, Any],
-    form: Form | str = ...,
-    freqs_hz: npt.ArrayLike | None = None,
-    **options: Any,
-) -> UncertainModel: ...
 def quantify(
     models: Any,
     form: Form | str = Form.INVERSE_INPUT_MULTIPLICATIVE,
@@ -195,11 +162,11 @@ def quantify(
     if isinstance(models, Mapping):
         options["unit_ids"], models = tuple(models), list(models.values())
     if isinstance(models, list | tuple) and models and all(hasattr(model, "frdata") for model in models):
-        models, freqs_hz = read_response_data(models, freqs_hz, options)
-    read = Options.of(options)
-    if isinstance(models, np.ndarray):
-        return bound_responses(models, as_form(form), freqs_hz, read)
-    return bound_systems(models, as_form(form), freqs_hz, read)
+        if freqs_hz is not None:
+            raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
+        models, freqs_hz = read_response_data(models, options)
+    bound = bound_responses if isinstance(models, np.ndarray) else bound_systems
+    return bound(models, as_form(form), freqs_hz, Options.of(options))
 
 
 def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
@@ -222,8 +189,6 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         sets=sets,
         scores=tuple(scores),
         outliers=outliers,
-        max_order=settings.max_order,
-        pooled=settings.nominal is None,
     )
 
 

@@ -3,8 +3,7 @@ r"""Residuals of every unit beside weights, in both readings: entry by entry as 
     |E_ij|                       against  |W_ij|, the best fit to the largest of the covered units    entrywise
     sigma_max(W_L^-1 E W_R^-1)   against  one                                                         sound
 
-Nothing here decides anything: it is what pictures of an uncertain model and of an outlier show. A unit that the weights
-were not made for exceeds one where it sticks out.
+Pictures of an uncertain model and of an outlier show it; a unit that the weights were not made for exceeds one.
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
 from .settings import SET
-from .weights.cover import Cover, cover_ratio
+from .weights.cover import Cover
 from .weights.entries import fit_entries
 from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
+_FACTS = ("form", "nominal_id", "unit_ids", "outside", "entry_excess")
 _ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
 
 
@@ -52,7 +52,7 @@ class UnitResiduals:
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``unit_residuals.json``."""
-        content = {name: getattr(self, name) for name in ("form", "nominal_id", "unit_ids", "outside", "entry_excess")}
+        content = {name: getattr(self, name) for name in _FACTS}
         save_artifact(Path(folder), "unit_residuals", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
@@ -62,14 +62,9 @@ class UnitResiduals:
         content, arrays = load_artifact(Path(folder), "unit_residuals")
         axes = dict(zip(_ARRAYS, ("f", "ufpm", "uf", "fpm", "fpm", "pm"), strict=True))
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
-        return cls(
-            form=Form(content["form"]),
-            nominal_id=content["nominal_id"],
-            unit_ids=tuple(content["unit_ids"]),
-            outside=tuple(content["outside"]),
-            entry_excess=float("nan") if content["entry_excess"] is None else content["entry_excess"],
-            **{name: arrays[name] for name in _ARRAYS},
-        )
+        facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
+        facts |= {name: tuple(content[name]) for name in ("unit_ids", "outside")} | {"form": Form(content["form"])}
+        return cls(**facts | {"entry_excess": float("nan") if facts["entry_excess"] is None else facts["entry_excess"]})
 
 
 def unit_residuals(
@@ -87,7 +82,7 @@ def unit_residuals(
         raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
-    sizes, ratio = np.abs(E), cover_ratio(E, cover.left, cover.right)
+    sizes, ratio = np.abs(E), cover.ratio(E)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
     rows = np.flatnonzero(inside)  # at most 200 of the covered units, evenly spread, and all others
     some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]

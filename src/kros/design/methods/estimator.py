@@ -11,7 +11,7 @@ import numpy as np
 
 from ...identify.model_set import kind_of
 from ...observer import EstimatorSettings, Recordings, identify_estimator
-from ...observer.sensor import Sensor, sides
+from ...observer.sensor import Sensor
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Method
 
@@ -44,10 +44,11 @@ class Estimator(Method):
             self.settings,
         )
         runtime = identified.observer.runtime
-        lower, upper = sides(task.limits, identified.observer.lifting.states)
-        if runtime.lower is not None and runtime.upper is not None:
-            lower, upper = np.maximum(lower, runtime.lower), np.minimum(upper, runtime.upper)
-        runtime = replace(runtime, lower=lower, upper=upper)
+        if task.limits is not None and runtime.lower is not None and runtime.upper is not None:
+            n = len(task.limits[0])
+            lower, upper = runtime.lower.copy(), runtime.upper.copy()
+            lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
+            runtime = replace(runtime, lower=lower, upper=upper)
         observer = replace(identified.observer, runtime=runtime, seen=training.seen, sensor=task.sensor)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)

@@ -14,7 +14,7 @@ from ...observer.residual.models import Refitted, refitted_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
 from ...synthesis import Synthesis
 from ..task import Design, DesignTask, Method
-from ..validation import hidden_mean
+from ..validation import hidden_mean, percent_of
 
 EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"
 
@@ -41,7 +41,7 @@ class KalmanTuned(Method):
         tried = [Candidate(task.open_loop(), {"process_noise_level": 0.0}), *candidates(task)]
         models = [(None, None) if t.model is None else (t.model.A, t.model.B) for t in tried]
         observers = [task.observer(t.synthesis, *model) for t, model in zip(tried, models, strict=True)]
-        errors = hidden_mean(task.training.read().percent_of_all(observers), task.models.measured)
+        errors = hidden_mean(percent_of(observers, task.training.read()), task.models.measured)
         first = int(np.argmin(errors))
         if not np.isfinite(errors[first]):
             diverges = "every candidate diverges on the training episodes, and so does the model alone"
@@ -66,7 +66,7 @@ class Candidate:
 
 def candidates(task: DesignTask) -> list[Candidate]:
     """Return gains for process noise of two shapes and many sizes, for the nominal model and models with new rows."""
-    models, batch, n = task.models, task.training.read().batch, task.models.lifting.n_states
+    models, batch, n = task.models, task.training.read(), task.models.lifting.n_states
     lifting, R, nominal = models.lifting, np.diag(task.noise**2), models.index(task.unit)
     refitted, residual = refitted_models(lifting, models.A[nominal], models.B[nominal], models.measured, batch)
     covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)

@@ -53,7 +53,7 @@ def promising(task: DesignTask) -> list[ResidualModel]:
     models, row = task.models, task.models.index(task.unit)
     nominal = models.lifting, models.A[row], models.B[row], models.measured
     scale = models.output_scale[: models.lifting.n_states]
-    tried = residual_models(*nominal, task.training.read().batch, task.noise, scale)
+    tried = residual_models(*nominal, task.training.read(), task.noise, scale)
     usable = [model for model in tried if np.isfinite(model.promised).all()]
     if not usable:
         raise SynthesisError(

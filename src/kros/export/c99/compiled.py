@@ -58,7 +58,6 @@ class CompiledObserver:
     def __init__(self, folder: Path, library: Path) -> None:
         manifest = json.loads((Path(folder) / "manifest.json").read_text())
         self.name, self.states = manifest["name"], tuple(manifest["states"])
-        self.conditions = tuple(manifest.get("conditions", ()))
         self.parameters, self.state_bytes = tuple(manifest["parameters"]), int(manifest["state_bytes"])
         self._q, self._m = len(manifest["measured"]), len(manifest["inputs"])
         self._real = np.float32 if manifest["precision"] == "float" else np.float64
@@ -98,7 +97,6 @@ class CompiledObserver:
         y: Array,
         u: Array,
         parameters: Mapping[str, float] | None = None,
-        condition: str | None = None,
         machine: npt.NDArray[np.uint8] | None = None,
     ) -> tuple[Array, npt.NDArray[Any]]:
         """Estimate one recording, sample by sample.
@@ -107,8 +105,6 @@ class CompiledObserver:
         ----------
         y, u : ndarray, shape (n_samples, q), (n_samples, m)
         parameters : mapping of str to float, optional
-        condition : str, optional
-            Recorded condition that the machine is in, as far as the monitor knows it.
         machine : ndarray, optional
             What `start` returned, to go on from; it is moved on. A new one by default.
 
@@ -122,14 +118,12 @@ class CompiledObserver:
         if y.ndim != 2 or u.ndim != 2 or len(y) != len(u) or (y.shape[1], u.shape[1]) != (self._q, self._m):
             problem = f"Compiled observer {self.name}: needs y (n, {self._q}) and u (n, {self._m})"
             raise DimensionError(f"{problem}, found {y.shape} and {u.shape}.")
-        machine = self.start(y[0], parameters, condition) if machine is None else machine
+        machine = self.start(y[0], parameters) if machine is None else machine
         x_hat, status = np.empty((len(y), len(self.states))), np.empty(len(y), dtype=np.uint32)
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
 
-    def start(
-        self, y: Array, parameters: Mapping[str, float] | None = None, condition: str | None = None
-    ) -> npt.NDArray[np.uint8]:
+    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> npt.NDArray[np.uint8]:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
         machine = np.zeros(self.state_bytes, dtype=np.uint8)
         real = ctypes.c_float if self._real is np.float32 else ctypes.c_double
@@ -137,11 +131,6 @@ class CompiledObserver:
         for name, value in (parameters or {}).items():
             self._c[f"{self.name}_set_{name}"](_at(machine), real(value))
         self._reset(_at(machine), _at(np.ascontiguousarray(y, dtype=float)))
-        if condition is not None:
-            if condition not in self.conditions:
-                problem = f"Compiled observer {self.name}: the condition {condition!r} is unknown"
-                raise ConfigError(f"{problem}; known are {self.conditions}.")
-            self._c[f"{self.name}_in_condition"](_at(machine), ctypes.c_uint32(1 + self.conditions.index(condition)))
         return machine
 
 

@@ -13,9 +13,9 @@ from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
-from ...observer.monitor import LARGEST, QUIET, RECOVERY, poisson_interval
+from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
-from ...observer.screen import BEYOND, LONGEST, Bounds, Screen
+from ...observer.screen import BEYOND, LONGEST, Screen
 from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
@@ -79,25 +79,31 @@ class Source:
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
-        parts = (self.names(), self.sizes(), self.linear(), self.limits(), self.origin())
-        context = {key: value for part in parts for key, value in part.items()}
         formulas, write = self.observer.lifting.formulas, Precision().literal
-        return context | {
-            "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
-            "gamma": [c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas],
-            "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
-            "monitor": self.monitor(),
-            "guard": self.guard(),
-            "bank": self.bank(),
-            "tracked": self.tracked(),
-            "load": self.load_torque(),
-            "sample_period_s": write(self.observer.sample_period_s),
-        }
+        return (
+            self.names()
+            | self.sizes()
+            | self.linear()
+            | self.limits()
+            | self.origin()
+            | {
+                "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
+                "gamma": [
+                    c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas
+                ],
+                "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
+                "monitor": self.monitor(),
+                "guard": self.guard(),
+                "bank": self.bank(),
+                "tracked": self.tracked(),
+                "load": self.load_torque(),
+                "sample_period_s": write(self.observer.sample_period_s),
+            }
+        )
 
     def names(self) -> dict[str, Any]:
         """Return names and units of measure."""
-        o, factors = self.observer, self.factors()
-        measured = [o.lifting.states[i] for i in o.measured]
+        o, factors, measured = self.observer, self.factors(), self.measured
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -139,29 +145,26 @@ class Source:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
         write = self.precision.literal
-        found = {
-            "model": self.sums(self.realised.model),
-            "correction": self.sums(o.into[:n] @ np.hstack([K.C, K.D])),
-            "controller": self.sums(np.hstack([K.A, K.B])),
-        }
-        return found | {
-            "operations": sum(len(row) for rows in found.values() for row in rows),
+        parts = self.realised.model, o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
+        sums = dict(zip(("model", "correction", "controller"), map(self.sums, parts), strict=True))
+        return sums | {
+            "operations": sum(np.count_nonzero(part) for part in parts),
             "less": [(j, i, None if factor == 1 else write(factor)) for j, i, factor in self.realised.less],
             "filter_gain": self.sums(o.filter_gain),
         }
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
-        o, run, screen = self.observer, self.observer.runtime, Screen.of(self.observer)
-        ends = {"lower": (run.lower, -np.inf), "upper": (run.upper, np.inf)}
-        wide = replace(self, precision=Precision())
+        o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
+        none, wide = np.full(o.lifting.n_states, np.inf), replace(self, precision=Precision())
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
-            "clips_estimate": run.lower is not None or run.upper is not None,
-            **{k: wide.numbers(np.full(o.lifting.n_states, end) if v is None else v) for k, (v, end) in ends.items()},
+            "clips_estimate": bool(limits),
+            "lower": wide.numbers(limits.get("lower", -none)),
+            "upper": wide.numbers(limits.get("upper", none)),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
-            "y_bounds": self.bounds(screen.measured),
-            "u_bounds": self.bounds(screen.inputs),
+            "y_bounds": bounds[:q],
+            "u_bounds": bounds[q:],
             "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
 
@@ -253,8 +256,8 @@ class Source:
         return {
             "load_name": plain(self.load.load),
             "current_name": plain(self.load.current),
-            "factor": self.load_factor(self.load.current),
-            "angle_factor": self.load_factor(self.observer.lifting.states[self.observer.measured[0]]),
+            "factor": self.factor(self.load.current),
+            "angle_factor": self.factor(self.measured[0]),
             "load": places.index(self.load.load),
             "current": places.index(self.load.current),
             "pole": write(level.pole),
@@ -264,7 +267,7 @@ class Source:
             "trusted": write(level.trusted * level.limit) if np.isfinite(level.limit) else None,
         }
 
-    def load_factor(self, name: str) -> str | None:
+    def factor(self, name: str) -> str | None:
         """Return the literal of a channel's factor; None where it is one."""
         return next(iter(self.literals(recorded_factors(self.observer, [name]).tolist())), None)
 
@@ -307,24 +310,18 @@ class Source:
             "largest": self.precision.literal(LARGEST),
             "one": self.precision.literal(1.0),
             "settle": own.settle,
-            "conditions": [plain(c) for c in own.bounds],
-            "products": [self.precision.literal(own.product(c)) for c in (None, *own.bounds)],
             "recovery": RECOVERY,
-            "rates": {
-                "percent": f"{100 * own.false_alarm_rate:g}",
-                "units": own.units,
-                "alarms": own.alarms,
-                "hours": f"{own.hours:.3g}",
-                "interval": [f"{v / own.hours:.3g}" for v in poisson_interval(own.alarms)] if own.hours else None,
-            },
+            "percent": f"{100 * own.false_alarm_rate:g}",
+            "units": own.units,
         }
 
     def guard(self) -> dict[str, Any]:
         """Return the bounds of states and of the correction, and how long a start takes."""
         own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
         low, high = (np.clip(side, -self.most, self.most) for side in bounds(own, n, order))
-        wide = {"lower": self.wide(low[:n]), "upper": self.wide(high[:n])}
-        return wide | {"correction": self.numbers(high[n:]), "settle": 0 if own is None else own.settle}
+        settle = 0 if own is None else own.settle
+        correction = self.numbers(high[n:])
+        return {"lower": self.wide(low[:n]), "upper": self.wide(high[:n]), "correction": correction, "settle": settle}
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
@@ -355,17 +352,15 @@ class Source:
         """Return literals in double precision."""
         return [Precision().literal(float(v)) for v in values]
 
-    def bounds(self, bounds: Bounds) -> list[dict[str, str]]:
-        """Return the bounds of every channel in double precision, and those of good samples in single."""
-        most, single = float(np.finfo(float).max), float(np.finfo(np.float32).max)
-        rows = []
-        for row in zip(bounds.lower, bounds.upper, bounds.least, bounds.most, strict=True):
-            lower, upper, least, furthest = (float(np.clip(v, -most, most)) for v in row)
-            wide = {"lower": lower, "upper": upper, "least": least, "most": furthest}
-            inner = {"low": max(lower, least, -single), "high": min(upper, furthest, single)}
-            texts = {name: Precision().literal(v) for name, v in wide.items()}
-            rows.append(texts | {name: Precision("float").literal(v) for name, v in inner.items()})
-        return rows
+    def bounds(self) -> list[dict[str, str]]:
+        """Return the bounds of measurements and inputs in double precision, and those of good samples in single."""
+        screen, single = Screen.of(self.observer), float(np.finfo(np.float32).max)
+        wide = {name: getattr(screen, name) for name in ("lower", "upper", "least", "most")}
+        inner = {"low": np.maximum(screen.lower, screen.least), "high": np.minimum(screen.upper, screen.most)}
+        texts = {name: replace(self, precision=Precision()).numbers(values) for name, values in wide.items()}
+        narrow = replace(self, precision=Precision("float"))
+        texts |= {name: narrow.numbers(np.clip(values, -single, single)) for name, values in inner.items()}
+        return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
 
 
 def _uncorrected(observer: Observer) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
@@ -14,15 +13,12 @@ import numpy as np
 from ...core.artifacts import json_bytes, with_checksum
 from ...core.errors import ConfigError
 from ...core.files import whole_folder, write_bytes
-from ...loops.compiler import find_compiler
 from ...observer import Observer
 from ...observer.file import observer_content
 from ..text import rendered, require_identifier
-from .accuracy import Accuracy, HeldOut
 from .golden import Golden
 from .numbers import LoadOutput, Source
 
-log = logging.getLogger(__name__)
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
 
 
@@ -33,7 +29,6 @@ def export_c(
     precision: str = "double",
     track: str | None = None,
     load: LoadOutput | None = None,
-    held_out: HeldOut | None = None,
 ) -> Path:
     """Write an observer as C99 source with a self-test, a project and a description.
 
@@ -53,9 +48,6 @@ def export_c(
         A lifting parameter that follows the machine by a phase-locked loop (`PhaseLockedLoop`).
     load : LoadOutput, optional
         Load torque and total current with their levels, as outputs of their own.
-    held_out : HeldOut, optional
-        Recordings on which the numerical error is measured, where there is a compiler; the manifest and the description
-        name it.
 
     Returns
     -------
@@ -86,12 +78,6 @@ def export_c(
     if precision not in _TOLERANCE:
         raise ConfigError(f"Export to C: precision should be 'double' or 'float', found {precision!r}.")
     files = c_files(observer, name, precision, track, load)
-    if held_out is not None and find_compiler() is not None:
-        try:
-            accuracy = Accuracy.of(files, observer, held_out, track)
-            files = c_files(observer, name, precision, track, load, accuracy)
-        except ConfigError as error:
-            log.warning("Numerical error: not measured: %s", error)
     with whole_folder(Path(out)) as folder:
         for file, text in files.items():
             write_bytes(folder / file, text.encode())
@@ -104,7 +90,6 @@ def c_files(
     precision: str,
     track: str | None = None,
     load: LoadOutput | None = None,
-    accuracy: Accuracy | None = None,
 ) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     for parameter in observer.lifting.parameters:
@@ -113,7 +98,6 @@ def c_files(
     context = source.context() | {
         "version": version("kros"),
         "tolerance": _TOLERANCE[precision],
-        "accuracy": None if accuracy is None else accuracy.content(),
         "golden": _golden(observer, source, track, _TOLERANCE[precision]),
     }
     context["state_bytes"] = _state_bytes(context)
@@ -142,7 +126,6 @@ def _golden(observer: Observer, source: Source, track: str | None, tolerance: fl
 
 def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
     deployed = json_bytes(with_checksum(observer_content(observer)))
-    conditions = [] if observer.monitor is None else list(observer.monitor.bounds)
     return {
         "name": context["name"],
         "precision": context["real"],
@@ -153,8 +136,6 @@ def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
         "units_of_measure": {s["name"]: s["unit"] for s in context["signals"]},
         "sample_period_s": observer.sample_period_s,
         "state_bytes": context["state_bytes"],
-        "numerical_error": context["accuracy"],
-        **({"conditions": conditions} if conditions else {}),
         "observer": observer.name,
         "kros": version("kros"),
         "source": "sha256:" + hashlib.sha256(deployed).hexdigest(),
@@ -176,6 +157,6 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     reals += of("n") + of("order") + 2 if of("tracked") else 0
     reals += 2 * of("recorded") + of("q") * (bank["filters"] + 1) if bank else 0
     reals += of("q") * monitor["bands"] * 3 + 1 if monitor else 0
-    words = of("m") + bool(of("delay")) + bool(monitor) + 2 + bool(monitor and monitor["conditions"])
+    words = of("m") + bool(of("delay")) + bool(monitor) + 2
     align = 8 if doubles or real == 8 else 4
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align

@@ -23,7 +23,7 @@ from ...observer.units import recorded_channel
 from ..c99.compiled import FLAGS
 from ..c99.numbers import Source
 from ..c99.write import c_files
-from ..text import plain, plain_names, rendered, require_identifier
+from ..text import plain, rendered, require_identifier
 
 log = logging.getLogger(__name__)
 _KROS = uuid.UUID("4b0a3f5e-7f2c-5d0e-9a61-6b726f733939")
@@ -42,8 +42,7 @@ def export_fmu(
 
     Measurements, inputs and parameters are variables of their own names, estimates end in ``_hat``, all in the units of
     the recordings; ``status`` holds the bits of `SampleStatus`. A communication step of one sampling period takes one
-    sample and gives the estimate for its end. ``condition``, where the monitor knows some, is a tunable enumeration:
-    the recorded condition that the machine is in, ``unknown`` at first.
+    sample and gives the estimate for its end.
 
     Parameters
     ----------
@@ -108,7 +107,6 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
         "units": units,
         "estimates": len(estimates),
         "variables": variables(observer, units, estimates),
-        "conditions": conditions(observer),
         "wide_parameters": [f"{observer.parameters.get(p, 0.0):.17g}" for p in observer.lifting.parameters],
     }
     files = {f"sources/{name}_fmu.c": "machine.c", "modelDescription.xml": f"model{fmi}.xml"}
@@ -137,15 +135,7 @@ def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[
         add(name, "output", "estimate of {} at the end of the step", None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
     add("status", "output", bits, None, kind="bits")
-    if conditions(observer):
-        add("condition", "parameter", "{} that the machine is in, as far as the monitor knows it", "0", kind="choice")
     return found
-
-
-def conditions(observer: Observer) -> list[str]:
-    """Return the conditions that the monitor knows, the unknown one first; nothing where it knows none."""
-    known = () if observer.monitor is None else observer.monitor.bounds
-    return ["unknown", *plain_names(known)] if known else []
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:

@@ -8,9 +8,8 @@ True
 """
 
 from ...core.removed import refusing
-from .model import Refinement
 from .population import refine_population
 from .search import GaussNewton, RefineOptions
 
-__all__ = ["GaussNewton", "RefineOptions", "Refinement", "refine_population"]
+__all__ = ["GaussNewton", "RefineOptions", "refine_population"]
 __getattr__ = refusing(__name__)

@@ -80,7 +80,7 @@ class ResponsePrior:
         return out
 
 
-def peak_residual_db(A: Array, B: Array, points: int = 200) -> float:
+def peak_residual(A: Array, B: Array, points: int = 200) -> float:
     """Return the peak of ``G^+ (G_nominal - G)`` for the nominal unit that makes it smallest, channels over ranges."""
     if len(A) < 2:
         return float("nan")
@@ -97,7 +97,6 @@ def peak_residual_db(A: Array, B: Array, points: int = 200) -> float:
         return sigma_max_first(multiply(inverse[:, :, None, witness, every], G[:, :, rows] - farthest))
 
     if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
-        return -np.inf
+        return 0.0
     _, _, peaks, exact = smallest_largest((len(A), points), 0, bound_of, against, lambda bound: bound.max(axis=-1))
-    with np.errstate(divide="ignore"):
-        return float(20 * np.log10(peaks[exact].min()))
+    return float(peaks[exact].min())

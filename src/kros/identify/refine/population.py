@@ -10,7 +10,7 @@ held-out training episodes: the strongest one whose error is as good as the best
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -23,11 +23,10 @@ from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from ..factors import Factor, Ranges
 from ..free_run import free_run
-from .metric import ResponsePrior, peak_residual_db
-from .model import Refinement, TradeOff, TrainingData
+from .metric import ResponsePrior, peak_residual
 from .problem import OneStep, RefinementProblem, stability_barrier
 from .search import Evaluate, GaussNewton, RefineOptions, Solution
-from .segments import Segments, held_segments, read_segments
+from .segments import Segments, TrainingData, held_segments, read_segments
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -42,7 +41,7 @@ def refine_population(
     factor: Factor,
     pooled: npt.NDArray[np.bool_] | None = None,
     options: RefineOptions | None = None,
-) -> tuple[KoopmanMatrices, Refinement]:
+) -> KoopmanMatrices:
     """Refine the models of a population on free-run error.
 
     Parameters
@@ -60,9 +59,8 @@ def refine_population(
 
     Returns
     -------
-    models : KoopmanMatrices
+    KoopmanMatrices
         Stable linear models with a bounded re-lifted free run on every training episode.
-    refinement : Refinement
 
     Raises
     ------
@@ -81,45 +79,37 @@ def refine_population(
     >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
     >>> factor = combine(episode_factors(motors, keys, Lifting(motors.states)))
     >>> options = RefineOptions(horizons=(20,), segments=4, search=GaussNewton(iterations=3), path_iterations=3)
-    >>> models, refinement = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
+    >>> models = refine_population(motors, keys, Lifting(motors.states), {}, factor, options=options)
     >>> models.A.shape, bool(models.spectral_radius().max() < 1)
     ((2, 3, 3), True)
     """
     marks = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters if name in parameters}
     data = TrainingData(population, keys, lifting, values, factor, marks)
-    data.require_factors((len(keys),))
+    data.require_factors()
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
-    models, refinement = _refine(data.divided_by(ranges), options or RefineOptions())
-    return ranges.restore(models), refinement.divided_by(ranges.inverse)
+    return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions()))
 
 
-def _refine(data: TrainingData, options: RefineOptions) -> tuple[KoopmanMatrices, Refinement]:
+def _refine(data: TrainingData, options: RefineOptions) -> KoopmanMatrices:
     """Refine in channels divided by their ranges."""
     count, longest = options.segments, max(options.horizons)
     segments = read_segments(data.population, data.keys, longest, count, options.seed, data.lifting.history)
     fitted = segments.first(count - held_segments(count, data.keys))
-    start, problem, error = start_pooled(data, fitted, options)
+    start, problem = start_pooled(data, fitted, options)
     one_model = problem.of_one_model(data.rows)
-    common = refine_pooled(start, one_model, error, lambda V: trade_off(data, problem, V, np.inf).score)
+    common = refine_pooled(start, one_model)
     problem = _around(problem, one_model, common)
-    path, rows = _path(data, problem, common)
-    choice = _choose(rows, options)
-    log.info("prior of strength %g chosen, held-out score %.4g", rows[choice].strength, rows[choice].score)
-    final = replace(problem, segments=segments).with_prior(rows[choice].strength)
-    solution = _settle(final, path[choice])
+    path, scores, peaks = _path(data, problem, common)
+    choice = _choose(scores, peaks, options)
+    strength = _falling(options)[choice]
+    log.info("prior of strength %g chosen, held-out score %.4g", strength, scores[choice])
+    final = replace(problem, segments=segments).with_prior(strength)
+    solution = _fit(final, path[choice], replace(options.search, iterations=options.final_iterations))
     models = final.matrices(solution.V)
     _require_stable(tuple(data.keys), models.spectral_radius(), options.margin)
     require_bounded(data, models, options.bound)
-    return models, Refinement(
-        pooled=problem.matrices(common),
-        strength=rows[choice].strength,
-        trade_off=(trade_off(data, problem, common, np.inf), *rows),
-        sigma=problem.sigma,
-        converged=solution.converged,
-        information=solution.matrix[:, :-1, :-1],
-        whitening=problem.T,
-    )
+    return models
 
 
 def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Array) -> RefinementProblem:
@@ -129,22 +119,31 @@ def _around(problem: RefinementProblem, one_model: RefinementProblem, common: Ar
     return replace(problem, sigma=normalised(one_model, common[None]).sigma, edged=True, prior=prior)
 
 
-def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], list[TradeOff]]:
-    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty."""
+def _falling(options: RefineOptions) -> list[float]:
+    """Return the strengths of the prior, strongest first."""
+    return sorted(options.strengths, reverse=True)
+
+
+def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
+    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty.
+
+    Returns their parameters, held-out scores and peak residuals.
+    """
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)
     path: list[Array] = []
-    rows: list[TradeOff] = []
-    for strength in sorted(options.strengths, reverse=True):
+    rows: list[tuple[float, float]] = []
+    for strength in _falling(options):
         V = _fit(problem.with_prior(strength), V, search).V
         path.append(V)
-        rows.append(trade_off(data, problem, V, strength))
-        log.debug("prior of strength %g: score %.4g, peak residual %.1f dB", strength, rows[-1].score, rows[-1].peak_db)
-        earlier = rows[-1 - options.patience].score if len(rows) > options.patience else np.inf
-        if rows[-1].score > (1 - options.tolerance / 2) * earlier or _too_uncertain(rows[-1], options):
+        rows.append(trade_off(data, problem, V))
+        log.debug("prior of strength %g: score %.4g, peak residual %.3g", strength, *rows[-1])
+        earlier = rows[-1 - options.patience][0] if len(rows) > options.patience else np.inf
+        if rows[-1][0] > (1 - options.tolerance / 2) * earlier or rows[-1][1] > options.largest_residual:
             break
-    return path, rows
+    scores, peaks = np.array(rows).T
+    return path, scores, peaks
 
 
 def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
@@ -156,38 +155,21 @@ def _fit(problem: RefinementProblem, V: Array, search: GaussNewton) -> Solution:
     return search.minimise(problem.evaluate, problem.admissible, V, narrowed)
 
 
-def _settle(problem: RefinementProblem, V: Array) -> Solution:
-    """Fit all units to the end: those that have not converged continue by themselves."""
-    search = problem.options.search
-    solution = _fit(problem, V, search)
-    for _ in range(problem.options.restarts):
-        rows = np.flatnonzero(~solution.converged)
-        if not rows.size:
-            break
-        solution = solution.updated(rows, _fit(problem.of_units(rows), solution.V[rows], search))
-    return solution
-
-
-def _too_uncertain(row: TradeOff, options: RefineOptions) -> bool:
-    return row.peak_db > 20 * np.log10(options.largest_residual)
-
-
-def _choose(rows: Sequence[TradeOff], options: RefineOptions) -> int:
+def _choose(scores: Array, peaks: Array, options: RefineOptions) -> int:
     """Return the strongest prior about as good as the best, or a weaker and better one that costs nothing.
 
     Uncertainty costs nothing while the peak residual is negligible. Only the last of the rows may be too uncertain.
     """
-    usable = [row for row in rows if not _too_uncertain(row, options)] or list(rows)
-    best = min(row.score for row in usable)
+    usable = peaks <= options.largest_residual
+    best = float(np.min(scores[usable] if usable.any() else scores))
     if not np.isfinite(best):
         raise IdentificationError(
             "Refinement: at every strength of the prior a free run over a held-out training episode diverges; add "
-            f"strengths above {max(row.strength for row in rows):g}."
+            f"strengths above {max(options.strengths):g}."
         )
-    choice = next(i for i, row in enumerate(rows) if row.score <= (1 + options.tolerance) * best)
-    negligible = 20 * np.log10(options.negligible_residual)
-    free = [i for i, row in enumerate(rows) if i >= choice and row.peak_db <= negligible]
-    return min(free, key=lambda i: rows[i].score, default=choice)
+    choice = int(np.argmax(scores <= (1 + options.tolerance) * best))
+    free = [i for i in range(choice, len(scores)) if peaks[i] <= options.negligible_residual]
+    return min(free, key=lambda i: scores[i], default=choice)
 
 
 def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> None:
@@ -199,10 +181,8 @@ def _require_stable(unit_ids: Sequence[str], radius: Array, margin: float) -> No
             )
 
 
-def start_pooled(
-    data: TrainingData, segments: Segments, options: RefineOptions
-) -> tuple[Array, RefinementProblem, Array]:
-    """Return pooled EDMD in whitened parameters (1, n_lifted, p), the problem of all units, and errors of states."""
+def start_pooled(data: TrainingData, segments: Segments, options: RefineOptions) -> tuple[Array, RefinementProblem]:
+    """Return pooled EDMD in whitened parameters (1, n_lifted, p), and the problem of all units."""
     lifting, rows = data.lifting, data.rows
     n, nl = lifting.n_states, lifting.n_lifted
     R = qr_triangle(data.factor.R[rows].reshape(-1, data.factor.R.shape[-1]))
@@ -216,72 +196,41 @@ def start_pooled(
     with np.errstate(invalid="ignore"):
         error = np.sqrt(normal.squares.sum(axis=0) / normal.counts.sum())
     error = np.clip(np.where(np.isfinite(error), error, 1.0), options.least_error, 1.0)
-    return V, replace(problem, sigma=error**options.balance), error
+    return V, replace(problem, sigma=error**options.balance)
 
 
-def refine_pooled(V: Array, problem: RefinementProblem, error: Array, score: Callable[[Array], float]) -> Array:
-    """Fit one model to all units, horizons growing, from every start; shape (n_lifted, p)."""
+def refine_pooled(V: Array, problem: RefinementProblem) -> Array:
+    """Fit one model to all units, on some of the segments and then on all; shape (n_lifted, p)."""
     options = problem.options
     count = max(2, -(-options.pooled_segments // problem.segments.n_units))
     few = replace(problem, segments=problem.segments.first(count))
-    briefly = replace(options.search, iterations=options.trial_iterations)
-    ends: list[tuple[float, float, Array]] = []
-    sigma = problem.sigma
-    for first, balance in options.starts:
-        inside = _stable_end(V, few, error**balance, first)
-        if inside is not None:
-            sigma = sigma if ends else normalised(few, inside).sigma
-            edged = replace(few, sigma=sigma, edged=True)
-            end = briefly.minimise(edged.evaluate, edged.admissible, inside)
-            ends.append((score(end.V[0]), float(end.cost[0]), end.V))
-            log.debug("pooled model from horizon %d, balance %g: score %.6g, cost %.6g", first, balance, *ends[-1][:2])
-    if not ends:
+    inside = _stable_end(V, few)
+    if inside is None:
         raise IdentificationError(
-            f"Refinement of the pooled model: from every start free runs over {options.horizons[-1]} samples diverge "
-            "or the model is unstable; omit lifting functions that grow, or set identify.refine = false."
+            f"Refinement of the pooled model: free runs over {options.horizons[-1]} samples diverge or the model is "
+            "unstable; omit lifting functions that grow, or set identify.refine = false."
         )
-    edged = replace(problem, sigma=sigma, edged=True)
-    best = min(ends, key=lambda row: row[:2])[2]
-    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, best).V[0])
+    edged = replace(problem, sigma=normalised(few, inside).sigma, edged=True)
+    return np.asarray(options.search.minimise(edged.evaluate, edged.admissible, inside).V[0])
 
 
-def _stable_end(V: Array, problem: RefinementProblem, sigma: Array, first: int) -> Array | None:
-    """Minimise at growing horizons, then bring the model inside the edge of stability; None where that fails."""
+def _stable_end(V: Array, problem: RefinementProblem) -> Array | None:
+    """Minimise at growing horizons, then bring the model inside by a growing penalty; None where that fails."""
     options = problem.options
-    stages = [replace(problem, sigma=sigma).at(h) for h in options.horizons if h >= min(first, options.horizons[-1])]
-    for stage in (*stages, problem):
-        solution = options.search.minimise(stage.evaluate, problem.finite, V)
+    for horizon in options.horizons:
+        solution = options.search.minimise(problem.at(horizon).evaluate, problem.finite, V)
         if not np.isfinite(solution.cost).all():
             return None
         V = solution.V
-    return _stabilise(V, problem)
-
-
-def _stabilise(V: Array, problem: RefinementProblem) -> Array | None:
-    """Bring a model inside: by shorter rows of lifted functions, which free runs ignore, else by a growing penalty."""
-    n, options = problem.lifting.n_states, problem.options
-    shortened = []
-    for share in np.linspace(1.0, 0.0, options.shortenings + 1):
-        shortened.append(V.copy())
-        shortened[-1][:, n:] *= share
-    for margin in (max(options.guard, options.margin), options.margin):
-        for trial in shortened:
-            if problem.admissible(trial, margin).all():
-                return trial
-    V = min(shortened, key=lambda trial: float(problem.matrices(trial).spectral_radius().max()))
     for heavier in 10.0 ** np.arange(options.penalties):
-
-        def evaluate(trial: Array, weight: float = heavier) -> Array:
-            edge = stability_barrier(trial, problem.T, options.guard, problem.edge_weight)
-            return problem.evaluate(trial) + weight * edge
-
-        solution = options.search.minimise(evaluate, problem.finite, V)
-        if not np.isfinite(solution.cost).all():
-            return None
-        V = solution.V
         if problem.admissible(V).all():
             return V
-    return None
+
+        def evaluate(trial: Array, weight: float = heavier * problem.edge_weight) -> Array:
+            return problem.evaluate(trial) + stability_barrier(trial, problem.T, options.guard, weight)
+
+        V = options.search.minimise(evaluate, problem.finite, V).V
+    return V if problem.admissible(V).all() else None
 
 
 def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
@@ -308,34 +257,25 @@ def free_run_errors(
     parameters: Mapping[str, Array],
     population: Population,
     keys: Sequence[EpisodeKey],
-) -> tuple[Array, Array, Array]:
-    """Return RMS errors of free runs, and the largest recorded and reached values, all (episode, n)."""
-    shape = len(keys), lifting.n_states
-    rms, top, reached = np.full(shape, np.inf), np.zeros(shape), np.full(shape, np.inf)
-    for start in range(0, len(keys), _TOGETHER):
-        episodes = {row: population.read(key) for row, key in enumerate(keys[start : start + _TOGETHER], start)}
-        by_length: dict[int, list[int]] = {}
-        for row, episode in episodes.items():
-            by_length.setdefault(len(episode), []).append(row)
-        for rows in by_length.values():
-            values = {name: given[rows] for name, given in parameters.items()}
-            part = KoopmanMatrices(models.A[rows], models.B[rows])
-            rms[rows], top[rows], reached[rows] = _errors(part, lifting, values, [episodes[row] for row in rows])
-    return rms, top, reached
-
-
-def _errors(
-    models: KoopmanMatrices, lifting: Lifting, parameters: Mapping[str, Array], episodes: Sequence[Array]
-) -> tuple[Array, Array, Array]:
-    """Do the same for episodes of one length."""
-    n, h, recorded = lifting.n_states, lifting.history, np.stack(episodes)
-    x = recorded[..., :n]
-    run = free_run(models.A, models.B, lifting, parameters, x[:, : h + 1], recorded[..., n:])
-    with np.errstate(over="ignore", invalid="ignore"):
-        rms = np.sqrt(np.mean((run - x) ** 2, axis=1))
-        sizes = rms, np.abs(run).max(axis=1)
-    rms, reached = (np.where(np.isfinite(values), values, np.inf) for values in sizes)
-    return rms, np.abs(x).max(axis=1), reached
+) -> tuple[Array, Array]:
+    """Return RMS errors of free runs, and the largest values that they reach, both (episode, n)."""
+    n, h = lifting.n_states, lifting.history
+    errors = []
+    for part in (slice(start, start + _TOGETHER) for start in range(0, len(keys), _TOGETHER)):
+        episodes = [population.read(key) for key in keys[part]]
+        recorded = np.zeros((len(episodes), max(map(len, episodes)), episodes[0].shape[1]))
+        for row, episode in enumerate(episodes):
+            recorded[row, : len(episode)] = episode
+        values = {name: given[part] for name, given in parameters.items()}
+        first, u = recorded[:, : h + 1, :n], recorded[..., n:]
+        runs = free_run(models.A[part], models.B[part], lifting, values, first, u)
+        with np.errstate(over="ignore", invalid="ignore"):
+            for episode, run in zip(episodes, runs, strict=True):
+                x, reached = episode[:, :n], run[: len(episode)]
+                errors.append((np.sqrt(np.mean((reached - x) ** 2, axis=0)), np.abs(reached).max(axis=0)))
+    both = np.array(errors)
+    both[~np.isfinite(both)] = np.inf
+    return both[:, 0], both[:, 1]
 
 
 def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -> None:
@@ -344,20 +284,18 @@ def require_bounded(data: TrainingData, models: KoopmanMatrices, bound: float) -
     keys = [key for episodes in data.keys.values() for key in episodes]
     values = {name: given[rows] for name, given in data.parameters.items()}
     each = KoopmanMatrices(models.A[rows], models.B[rows])
-    _, _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
+    _, reached = free_run_errors(each, data.lifting, values, data.population, keys)
     for which, state in np.argwhere(~(reached <= bound)):
         size = f"{reached[which, state]:.3g} times the range of {data.lifting.states[state]!r}, beyond {bound:g}"
         remedy = "use functions that stay bounded, drop the episode, or set identify.refine = false"
         raise IdentificationError(f"Refinement: the free run over {keys[which]} reaches {size}; {remedy}.")
 
 
-def trade_off(data: TrainingData, problem: RefinementProblem, V: Array, strength: float) -> TradeOff:
-    """Return accuracy on held-out training episodes, and uncertainty, of models (unit, n_lifted, p) or one for all."""
+def trade_off(data: TrainingData, problem: RefinementProblem, V: Array) -> tuple[float, float]:
+    """Return the error on held-out training episodes and the peak residual of models (unit, n_lifted, p) or of one."""
     rows, count = data.rows, len(data.keys)
     models = problem.matrices(np.broadcast_to(V, (count, *V.shape[-2:]))[rows])
     last = [episodes[-1] for episodes in data.keys.values()]
     values = {name: given[rows] for name, given in data.parameters.items()}
-    rms, top, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
-    percent = np.median(100 * rms / np.where(top > 0, top, 1.0), axis=0)  # a state may rest at zero in the last episode
-    score = np.mean((rms / problem.sigma) ** 2)
-    return TradeOff(strength, tuple(percent.tolist()), float(score), peak_residual_db(models.A, models.B))
+    rms, _ = free_run_errors(models, data.lifting, values, data.population, [last[row] for row in rows])
+    return float(np.mean((rms / problem.sigma) ** 2)), peak_residual(models.A, models.B)

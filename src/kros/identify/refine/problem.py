@@ -128,12 +128,12 @@ class RefinementProblem:
         assert self.prior is not None
         return replace(self, prior=self.prior.scaled(strength * self.residuals))
 
-    def admissible(self, V: Array, margin: float | None = None) -> npt.NDArray[np.bool_]:
+    def admissible(self, V: Array) -> npt.NDArray[np.bool_]:
         """Return which models are finite and stable as linear systems."""
         A = (V @ self.T.T)[..., : self.lifting.n_lifted]
         finite = np.asarray(np.isfinite(A).all(axis=(-1, -2)))
         radius = np.abs(np.linalg.eigvals(np.where(finite[..., None, None], A, 0.0))).max(axis=-1)
-        return np.asarray(finite & (radius < 1 - (self.options.margin if margin is None else margin)))
+        return np.asarray(finite & (radius < 1 - self.options.margin))
 
     def matrices(self, V: Array) -> KoopmanMatrices:
         """Return A and B of whitened parameters."""

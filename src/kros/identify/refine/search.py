@@ -20,20 +20,7 @@ class Solution:
     """Where the search ended."""
 
     V: Array  # (problem, rows, columns)
-    matrix: Array  # [J r]^T [J r] at V, (problem, P + 1, P + 1)
-    iterations: int
-    converged: npt.NDArray[np.bool_]  # (problem,)
-
-    @property
-    def cost(self) -> Array:
-        """Sum of squared residuals, shape (problem,)."""
-        return self.matrix[:, -1, -1]
-
-    def updated(self, rows: Rows, part: Solution) -> Solution:
-        """Return the solution with some problems as another search left them."""
-        V, matrix, converged = self.V.copy(), self.matrix.copy(), self.converged.copy()
-        V[rows], matrix[rows], converged[rows] = part.V, part.matrix, part.converged
-        return Solution(V, matrix, self.iterations + part.iterations, converged)
+    cost: Array  # sum of squared residuals, (problem,)
 
 
 @dataclass(frozen=True)
@@ -103,7 +90,7 @@ class GaussNewton:
             mu = np.where(better, mu / self.factor, mu * self.factor)
             damping[rows] = np.clip(mu, self.least_damping, self.most_damping)
             used += 1
-        return Solution(V, matrix, used, done)
+        return Solution(V, matrix[:, -1, -1])
 
 
 def _step(matrix: Array, mu: Array) -> Array:
@@ -135,7 +122,7 @@ class RefineOptions:
     """
 
     # Data of the search
-    horizons: tuple[int, ...] = (5, 20, 80, 320, 1000)  # of the free runs; the last one is minimised
+    horizons: tuple[int, ...] = (320, 1000)  # of the free runs, one after the other; the last one is minimised
     segments: int = 24  # stretches of recordings of every unit, spread over its training episodes
     pooled_segments: int = 120  # of all units together, from which the pooled model is sought; it is finished on all
     compared: int = 64  # residuals of a state in a segment, at least: neighbouring errors of a long run say the same
@@ -143,8 +130,6 @@ class RefineOptions:
 
     # Pooled model
     alpha_factor: float = 4.0  # its EDMD start has this times the smallest alpha that stabilises it
-    starts: tuple[tuple[int, float], ...] = ((5, 0.8), (320, 0.8))  # first horizon, balance: there are several minima
-    trial_iterations: int = 4  # within the edge of stability, before whole free runs compare the ends of the starts
     balance: float = 0.65  # errors count in units of error**balance of EDMD: 0 weighs ranges, 1 the improvement
     least_error: float = 1e-6  # of a state's free run by EDMD: exact data have none to scale by
     row_weight: float = 0.1  # of a lifted function's one-step error, which does not enter free runs
@@ -152,8 +137,7 @@ class RefineOptions:
     # Stability
     margin: float = 1e-5  # stable means a spectral radius below one less this
     guard: float = 2e-3  # radii above one less this are penalised: the search slides along the edge of stability
-    shortenings: int = 20  # steps in which an unstable model's rows of lifted functions are shortened
-    penalties: int = 8  # decades over which the weight of the edge of stability then grows
+    penalties: int = 8  # decades over which the weight of the edge of stability grows for an unstable model
     bound: float = 10.0  # largest value of a free run on training episodes
 
     # Prior
@@ -166,8 +150,8 @@ class RefineOptions:
     negligible_residual: float = 0.1  # peak up to which accuracy alone decides
 
     # Search
-    search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon, and of the units at the strength chosen
-    restarts: int = 4  # searches in which units that have not converged continue
+    search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon
+    final_iterations: int = 75  # of the units at the strength chosen, at most
     path_iterations: int = 8  # at each strength before one is chosen; each starts where the stronger prior ended
 
     def __post_init__(self) -> None:
@@ -176,7 +160,6 @@ class RefineOptions:
             "horizons": min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
             "segments": self.segments >= 1,
             "pooled_segments": self.pooled_segments >= 1,
-            "starts": len(self.starts) > 0 and all(0 <= balance <= 1 for _, balance in self.starts),
             "balance": 0 <= self.balance <= 1,
             "strengths": min(self.strengths, default=0.0) > 0,
             "margin": 0 <= self.margin < 1,

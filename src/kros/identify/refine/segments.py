@@ -1,19 +1,61 @@
-"""Stretches of training episodes: drawn once, cut into shorter pieces for shorter horizons."""
+"""Training data, and stretches of its episodes: drawn once, cut into shorter pieces for shorter horizons."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError
+from ...core.errors import DataError, DimensionError
 from ...data.population import EpisodeKey, Population
+from ...data.prepare import scale_population
+from ...lifting import Lifting
+from ..factors import Factor, Ranges
 
 Array = npt.NDArray[np.float64]
 Keys = Mapping[str, Sequence[EpisodeKey]]
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingData:
+    """Training episodes of every unit with their factors; the units that are `pooled` speak for the population."""
+
+    population: Population
+    keys: Keys
+    lifting: Lifting
+    parameters: Mapping[str, Array]  # (unit,)
+    factor: Factor  # batch over units
+    pooled: npt.NDArray[np.bool_]  # (unit,)
+
+    @property
+    def rows(self) -> npt.NDArray[np.int64]:
+        """Rows of the pooled units."""
+        return np.flatnonzero(self.pooled)
+
+    def divided_by(self, ranges: Ranges) -> TrainingData:
+        """Return the data of channels divided by ranges."""
+        sizes = ranges.sizes(self.lifting, self.population.inputs)
+        return replace(
+            self,
+            population=scale_population(self.population, sizes),
+            lifting=self.lifting.in_sizes(sizes),
+            factor=ranges.factor(self.factor),
+        )
+
+    def require_factors(self) -> None:
+        """Refuse factors, parameters and marks that are not those of the units."""
+        m, units = len(self.population.inputs) + len(self.lifting.input_functions), (len(self.keys),)
+        shape = (*units, *[2 * self.lifting.n_lifted + m] * 2)
+        wrong = [name for name in self.lifting.parameters if np.shape(self.parameters.get(name, 0.0)) != units]
+        if self.factor.R.shape != shape or wrong or self.pooled.shape != units or not self.pooled.any():
+            raise DimensionError(
+                f"Refinement: needs factors of shape {shape}, found {self.factor.R.shape}, one value of parameters a "
+                f"unit (wrong: {wrong}) and a pooled unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass "
+                "factors from episode_factors."
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +90,6 @@ class Segments:
         """Return the first segments of every unit."""
         return self._each(lambda values: values[..., :count])
 
-    def one_by_one(self) -> Segments:
-        """Return every segment as a unit with one segment."""
-        return self._each(lambda values: values.reshape(*values.shape[:-2], -1, 1))
-
     def cut(self, horizon: int) -> Segments:
         """Return pieces of `horizon` steps, as many as there are segments, spread evenly over them."""
         length = min(horizon, self.horizon) + 1
@@ -81,7 +119,8 @@ def read_segments(
         if not episodes:
             raise DataError(f"Refinement: unit {unit} has no training episode; leave the unit out.")
         rng = np.random.default_rng([seed, row])
-        owners = segment_owners(keys, count)[row]
+        earlier, held = max(1, len(episodes) - 1), held_segments(count, keys)
+        owners = np.array([*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held])
         for episode in dict.fromkeys(owners.tolist()):
             samples = _read(population, episodes[episode], history)
             for column in np.flatnonzero(owners == episode):
@@ -99,16 +138,6 @@ def _read(population: Population, key: EpisodeKey, history: int) -> Array:
         problem = f"{key} has {len(samples)} samples, and delays of up to {history} need at least {history + 2}"
         raise DataError(f"Refinement: {problem}; leave the episode out or use shorter delays.")
     return samples
-
-
-def segment_owners(keys: Keys, count: int) -> npt.NDArray[np.int64]:
-    """Return which episode of its unit each segment comes from, shape (unit, segment)."""
-    held = held_segments(count, keys)
-    owners = np.empty((len(keys), count), dtype=np.int64)
-    for row, episodes in enumerate(keys.values()):
-        earlier = max(1, len(episodes) - 1)
-        owners[row] = [*(i % earlier for i in range(count - held)), *[len(episodes) - 1] * held]
-    return owners
 
 
 def held_segments(count: int, keys: Keys) -> int:

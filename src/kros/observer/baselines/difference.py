@@ -12,41 +12,17 @@ from ...core.errors import ConfigError, DimensionError
 from ...data import EpisodeBatch
 
 Array = npt.NDArray[np.float64]
-_LOWEST, _HIGHEST = 1e-3, 0.45  # of the sampling frequency
-_CANDIDATES = 24
-_EXPLAINED = 0.5  # share of a variance
 
 
 @dataclass(frozen=True)
 class FilteredDifference:
-    """Rates of measured states by filtered differences; all other states are not estimated.
-
-    Parameters
-    ----------
-    n_states : int
-    pairs : tuple of (int, int)
-        Position among the measurements, and the state that is its rate.
-    cutoff_hz : float
-        Of the low-pass, below half the sampling frequency.
-    sample_period_s : float
-    scales : tuple of float
-        Of every pair: the state over the rate, which their units of measure decide; one by default.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import FilteredDifference
-    >>> position = 2.0 * 0.001 * np.arange(500).reshape(500, 1, 1)  # 2 rad/s
-    >>> difference = FilteredDifference(2, pairs=((0, 1),), cutoff_hz=50.0, sample_period_s=0.001)
-    >>> difference.run(position, np.zeros((500, 1, 1)))[-1, 0].round(6).tolist()  # the position itself is not estimated
-    [nan, 2.0]
-    """
+    """Rates of measured states by filtered differences; all other states are not estimated."""
 
     n_states: int
-    pairs: tuple[tuple[int, int], ...]
-    cutoff_hz: float
+    pairs: tuple[tuple[int, int], ...]  # position among the measurements, and the state that is its rate
+    cutoff_hz: float  # of the low-pass, below half the sampling frequency
     sample_period_s: float
-    scales: tuple[float, ...] = ()
+    scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
     def __post_init__(self) -> None:
         if not 0 < self.cutoff_hz < 0.5 / self.sample_period_s:
@@ -80,14 +56,7 @@ class FilteredDifference:
         return np.asarray(lfilter(*butter(2, self.cutoff_hz, fs=1 / self.sample_period_s), signals))
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
-        """Return the same with the scales that fit recordings best, so that units of measure do not matter.
-
-        Parameters
-        ----------
-        batch : EpisodeBatch
-        measured : sequence of int
-            Indices of the measured states.
-        """
+        """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
         states, y = batch.states, batch.measurements(measured, arrived=False)
         inside = (np.arange(len(y))[:, None] < batch.lengths).astype(float)
         found = replace(self, scales=()).run(y, y[..., :0])
@@ -100,8 +69,8 @@ class FilteredDifference:
         return replace(self, scales=tuple(slopes))
 
 
-def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, int], ...]:
-    """Return which states recordings show to be rates of measured ones, whatever the units of measure."""
+def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
+    """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
     states, y, sample_period_s = batch.states, batch.measurements(measured, arrived=False), batch.sample_period_s
     hidden = [j for j in range(states.shape[-1]) if j not in measured]
     inside = np.arange(len(y))[:, None] < batch.lengths
@@ -121,11 +90,11 @@ def followed(batch: EpisodeBatch, measured: Sequence[int]) -> tuple[tuple[int, i
     pairs = []
     for i in range(len(share)):
         j = int(share[i].argmax()) if hidden else 0
-        if hidden and share[i, j] > _EXPLAINED and share[:, j].argmax() == i:
+        if hidden and share[i, j] > explained and share[:, j].argmax() == i:
             pairs.append((i, hidden[j]))
     return tuple(pairs)
 
 
 def cutoffs_hz(sample_period_s: float) -> Array:
     """Return the cut-offs that are tried, log-spaced from a thousandth to nearly half of the sampling frequency."""
-    return np.geomspace(_LOWEST, _HIGHEST, _CANDIDATES) / sample_period_s
+    return np.geomspace(1e-3, 0.45, 24) / sample_period_s

@@ -24,7 +24,6 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...lifting import Lifting
-from ...loops import Library, formulas, library, tape_of
 from ..screen import require_samples
 
 Array = npt.NDArray[np.float64]
@@ -32,50 +31,18 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ExtendedKalman:
-    """Extended Kalman filter.
-
-    Parameters
-    ----------
-    lifting : Lifting
-    A : ndarray, shape (n_lifted, n_lifted)
-    B : ndarray, shape (n_lifted, m)
-        With input functions, m counts them.
-    measured : tuple of int
-    inputs : tuple of str
-    Q : ndarray, shape (n, n)
-        Process noise of the original states; or (k, n, n) for k filters at once, see `run_all`.
-    R : ndarray, shape (q, q)
-        Measurement noise.
-    P0 : ndarray, shape (n, n)
-        Covariance of the first estimate, in which measured states have the measurement's noise.
-    parameters : mapping of str to float
-        Default values of the lifting's parameters, the nominal unit's.
-    delay : int
-        Samples by which measurements arrive late: the filter corrects as of then, and predicts forward through the
-        model.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.lifting import Lifting
-    >>> from kros.observer import ExtendedKalman
-    >>> A, B = np.array([[1.0, 0.01], [0.0, 0.9]]), np.array([[0.0], [0.1]])
-    >>> Q, R, P0 = np.diag([1e-6, 1e-2]), np.array([[1e-4]]), np.diag([1e-4, 1.0])
-    >>> kalman = ExtendedKalman(Lifting(("x", "v")), A, B, (0,), ("u",), Q, R, P0)
-    >>> kalman.run(np.zeros((100, 1, 1)), np.zeros((100, 1, 1))).shape
-    (100, 1, 2)
-    """
+    """Extended Kalman filter; measured states start with the measurement's noise."""
 
     lifting: Lifting
-    A: Array
-    B: Array
+    A: Array  # (n_lifted, n_lifted)
+    B: Array  # (n_lifted, m), with input functions
     measured: tuple[int, ...]
     inputs: tuple[str, ...]
-    Q: Array
-    R: Array
-    P0: Array
+    Q: Array  # (n, n), process noise of the original states; or (k, n, n) for k filters at once
+    R: Array  # (q, q), measurement noise
+    P0: Array  # (n, n), of the first estimate
     parameters: Mapping[str, float] = field(default_factory=dict)
-    delay: int = 0
+    delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
     def __post_init__(self) -> None:
         n, q = self.lifting.n_states, len(self.measured)
@@ -85,19 +52,32 @@ class ExtendedKalman:
                 f"found {self.Q.shape}, {self.P0.shape} and {self.R.shape}."
             )
 
-    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m).
+    def run(
+        self,
+        y: Array,
+        u: Array,
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        starts: npt.NDArray[np.bool_] | None = None,
+    ) -> Array:
+        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m); shape (n_samples, batch, n).
 
         Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
-        corrected at that sample, and the covariance grows.
+        corrected at that sample, and the covariance grows. At `starts`, (n_samples, batch), machines start again.
         """
-        return self.run_all(y, u, parameters)[0]
+        return self.run_all(y, u, parameters, starts)[0]
 
-    def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+    def run_all(
+        self,
+        y: Array,
+        u: Array,
+        parameters: Mapping[str, npt.ArrayLike] | None = None,
+        starts: npt.NDArray[np.bool_] | None = None,
+    ) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
+        starts = np.zeros(y.shape[:2], dtype=bool) if starts is None else starts
         if self.delay:
-            return self._late(y, u, parameters)
+            return self._late(y, u, parameters, starts)
         lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
         Q = self.Q.reshape(-1, 1, n, n)
         k, (n_samples, batch) = len(Q), y.shape[:2]
@@ -105,28 +85,34 @@ class ExtendedKalman:
             name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))
             for name, v in {**self.parameters, **(parameters or {})}.items()
         }
-        if (loops := library()) is not None:
-            return self._compiled(loops, y, u, values)
-        x = np.zeros((k, batch, n))
-        x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
-        P = np.broadcast_to(self.P0, (k, batch, n, n)).copy()
-        estimates, earlier = np.empty((n_samples, k, batch, n)), None
+        x, P = np.zeros((k, batch, n)), np.zeros((k, batch, n, n))
+        earlier = np.zeros((k, batch, len(lifting.window.earlier)))
+        estimates = np.empty((n_samples, k, batch, n))
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             for sample in range(n_samples):
+                begins, held = starts[sample] | (sample == 0), np.broadcast_to(u[sample], (k, *u[sample].shape))
                 estimates[sample] = x
+                if begins.any():
+                    x[:, begins], P[:, begins] = 0.0, self.P0
+                    x[..., C] = np.where(begins[:, None], np.where(np.isfinite(y[sample]), y[sample], 0.0), x[..., C])
+                if sample == 0:
+                    estimates[0] = x
                 x, P = self._corrected(x, P, y[sample])
-                held = np.broadcast_to(u[sample], (k, *u[sample].shape))
-                earlier = lifting.window.hold(x, held) if earlier is None else earlier
+                earlier = np.where(begins[:, None], lifting.window.hold(x, held), earlier) if begins.any() else earlier
                 window = np.concatenate([x, earlier], axis=-1)
                 F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
-                x = (
-                    lifting.lift(window, values) @ self.A[:n].T
-                    + lifting.lift_inputs(held, window, values) @ self.B[:n].T
-                )
+                x = self._ahead(window, held, values)
                 P = F @ P @ np.swapaxes(F, -1, -2) + Q
                 P = (P + P.swapaxes(-1, -2)) / 2
                 earlier = lifting.window.advance(window, held)
         return np.moveaxis(estimates, 0, 1)
+
+    def _ahead(self, window: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
+        """Return the next states by the model."""
+        n, lifting = self.lifting.n_states, self.lifting
+        return np.asarray(
+            lifting.lift(window, values) @ self.A[:n].T + lifting.lift_inputs(u, window, values) @ self.B[:n].T
+        )
 
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
@@ -135,50 +121,23 @@ class ExtendedKalman:
         L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _compiled(self, loops: Library, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
-        lifting, n, (n_samples, batch, m) = self.lifting, self.lifting.n_states, u.shape
-        Q, tape = self.Q.reshape(-1, n, n), tape_of(lifting, m, tuple(range(n)), of_inputs=False)
-        states = np.empty((n_samples, len(Q), n, batch))
-        job = {
-            "filters": len(Q),
-            "samples": n_samples,
-            "batch": batch,
-            "q": len(self.measured),
-            "slopes": len(tape.slopes),
-        }
-        job |= {
-            "A": self.A[:n],
-            "B": self.B[:n],
-            "Q": Q,
-            "R": self.R,
-            "P": self.P0,
-            "y": y,
-            "u": u,
-            "measured": self.measured,
-        }
-        job |= {"slope": tape.slopes, "states": states}
-        loops.call("kros_kalman", formulas(lifting, tape, values, m, batch), ("kalman_job", job))
-        return states.transpose(1, 0, 3, 2)
-
-    def _late(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None) -> Array:
+    def _late(
+        self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None, starts: npt.NDArray[np.bool_]
+    ) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
-        d, lifting, n = min(self.delay, len(y) - 1), self.lifting, self.lifting.n_states
-        if lifting.history:
+        d, values = min(self.delay, len(y) - 1), {**self.parameters, **(parameters or {})}
+        if self.lifting.history:
             raise DimensionError(
                 f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
-                f"{lifting.functions}."
+                f"{self.lifting.functions}."
             )
-        before = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters)
-        values = {**self.parameters, **(parameters or {})}
-        found = np.empty((len(before), len(y), *before.shape[2:]))
+        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters, starts[d:])
+        late = np.empty((len(x), len(y), *x.shape[2:]))
         for step in range(d):
-            found[:, step] = before[:, 0]  # nothing arrived but where to start
-            inputs = np.broadcast_to(u[step : len(u) - d + step], (*before.shape[:-1], u.shape[-1]))
-            before = (
-                lifting.lift(before, values) @ self.A[:n].T + lifting.lift_inputs(inputs, before, values) @ self.B[:n].T
-            )
-        found[:, d:] = before
-        return found
+            late[:, step] = x[:, 0]  # nothing arrived but where to start
+            x = self._ahead(x, np.broadcast_to(u[step : len(u) - d + step], (*x.shape[:-1], u.shape[-1])), values)
+        late[:, d:] = x
+        return late
 
 
 def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:

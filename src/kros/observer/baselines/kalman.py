@@ -12,16 +12,13 @@ from ...synthesis import kalman
 from ...synthesis.result import Synthesis
 
 Array = npt.NDArray[np.float64]
-_SWEEP_DECADES = (-6, 10)
-_DECADES_APART = 2
 
 
 def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> Iterator[tuple[float, Synthesis]]:
     """Sweep the size of white process noise over sixteen decades, the covariance itself among them."""
     shape = np.diag(shape**2) if shape.ndim == 1 else shape
     base = like_measurement_noise(C @ shape @ C.T, R)
-    start, stop = _SWEEP_DECADES
-    for level in sorted((1 / base, *np.logspace(start, stop, (stop - start) // _DECADES_APART + 1).tolist())):
+    for level in sorted((1 / base, *np.logspace(-6, 10, 9).tolist())):
         try:
             yield level, kalman(A, C, level * base * shape, R, dt)
         except SynthesisError:

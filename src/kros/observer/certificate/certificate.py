@@ -23,7 +23,7 @@ from ...core.artifacts import load_artifact, loader, save_artifact
 from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
-from .search import first_proof, frozen_gain, growing_sequence
+from .proof import first_proof, frozen_gain, growing_place
 
 Array = npt.NDArray[np.float64]
 
@@ -34,8 +34,9 @@ class ReliftStatus(str, Enum):
     CERTIFIED
         The gain is proven.
     UNSTABLE
-        A sequence of slopes inside the box makes the error grow without bound in the model: there is no certificate for
-        this observer over this box. Take a smaller box, weaken the correction, or use another model.
+        Slopes that stay at a corner of the box, or in its middle, make the error grow without bound in the model: there
+        is no certificate for this observer over this box. Take a smaller box, weaken the correction, or use another
+        model.
     UNBOUNDED
         A lifted function may be arbitrarily steep. Name a box of states (and inputs) in which the observer works.
     NOT_FOUND
@@ -77,7 +78,7 @@ class ReliftCertificate:
     root : ndarray, shape (n_xi, n_xi)
         Upper triangular factor of the Lyapunov matrix, ``P = R'R``.
     multipliers : ndarray, shape (n_p,)
-        Of the slopes, where the proof uses them because there are too many corners; empty otherwise.
+        Of the slopes.
     channels : tuple of str
         Slopes that move.
 
@@ -209,7 +210,7 @@ def relift_certificate(
     except UnboundedSlopeError as error:
         return replace(result, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.")
     result = replace(result, channels=system.channels, start=np.zeros((0, 0)) if system.start is None else system.start)
-    if growing := growing_sequence(system):
+    if growing := growing_place(system):
         return replace(result, status=ReliftStatus.UNSTABLE, reason=growing)
     proof = first_proof(system)
     if proof is None:

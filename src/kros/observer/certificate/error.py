@@ -24,7 +24,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -119,11 +118,6 @@ class ErrorSystem:
     start: Array | None = None  # (n_xi, n_window): where the first error goes; the first states by default
 
     @property
-    def corner_count(self) -> int:
-        """Number of corners of the box."""
-        return int(2 ** self.L.shape[1])
-
-    @property
     def nested(self) -> Array:
         """E, shape (n_p, n_p)."""
         return np.zeros((self.L.shape[1], self.L.shape[1])) if self.E is None else self.E
@@ -137,10 +131,6 @@ class ErrorSystem:
         """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
         moved = self.L @ self.closed(d)
         return self.A + moved @ self.M, self.B + moved @ self.D
-
-    def corners(self) -> list[tuple[Array, Array]]:
-        """Return the pairs of all corners."""
-        return [self.corner(d) for d in product((-1.0, 1.0), repeat=self.L.shape[1])]
 
     def multiplied(self, multipliers: Array, gain: float) -> tuple[tuple[Array, Array], Array, Array]:
         """Return (A, B), C and D with p as input and q as output: a gain proven for it holds in the whole box."""

@@ -1,115 +1,262 @@
-r"""Proof of a gain, independent of whatever solver proposed it.
+r"""Proof of a gain: multipliers by cutting planes, a Lyapunov matrix by a Riccati equation, an exact decision.
 
-With a Lyapunov matrix ``P = R' R`` the gain gamma is proven when
+For slopes that move anywhere in their box the gain gamma is proven where ``T = diag(t) > 0`` and ``P = R' R > 0`` have
 
-    F = [[P, 0], [0, gamma^2 I]] - [A_c, B_c]' P [A_c, B_c] - [C, D]' [C, D] > 0
+    F = diag(P, T, gamma^2 I) - [A, L, B]' P [A, L, B] - [M, E, D]' T [M, E, D] - [C, 0, 0]' [C, 0, 0] > 0 .
 
-for every corner c. What is subtracted is convex in the slopes, so corners are enough. (D is zero but where multipliers
-stand in for corners: then p is an input and q an output.)
+By the Kalman-Yakubovich-Popov lemma such a P exists where, with ``H = [[G_qp, G_qw], [G_zp, G_zw]]``,
 
-The decision is exact: matrices of doubles are rational, so F is formed without rounding, and its positivity decided by
-a Cholesky factorisation in floating point of what is left without all that rounding can do; where that is not enough,
-by elimination of integers.
+    F_f(t, g) = diag(t, g I) - sum_j t_j h_fj' h_fj - H_z' H_z > 0          at every frequency f, g = gamma^2,
+
+linear in (t, g). For one slope nothing is lost against the corners of the box (S-lemma). The least g over a grid of
+frequencies is a linear program whose constraints ``v' F_f(t, g) v >= 0`` are found where they are needed; P solves the
+Riccati equation of ``[sqrt(T) q, z]`` by ``[p sqrt(T), gamma w]`` with a small extra output, which makes the inequality
+strict. What is returned was decided on its own: entries are rational numbers, and F is formed and found positive in
+integers.
 
 References
 ----------
-S. M. Rump, "Verification of positive definiteness", BIT Numerical Mathematics 46 (2006) 433-452.
+J. E. Kelley, "The cutting-plane method for solving convex programs", J. SIAM 8 (1960) 703-712.
 E. H. Bareiss, "Sylvester's identity and multistep integer-preserving Gaussian elimination", Mathematics of Computation
 22 (1968) 565-578.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...core.lti import StateSpace
+from ...core.norms import gramian, hinf_norm
+from .error import ErrorSystem
+
 Array = npt.NDArray[np.float64]
+Complex = npt.NDArray[Any]
 Integers = npt.NDArray[Any]
-Corners = Sequence[tuple[Array, Array]]
-_BITS = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted
-_ROUNDING = 8.0  # times what a factorisation may be off, with a factor of five to spare
 
 
-def proven(root: Array, corners: Corners, C: Array, gain: float, D: Array | None = None) -> bool:
-    """Tell whether the inequalities hold, in exact arithmetic on the numbers as they are stored."""
-    numbers = [root, C, np.array(gain), *(matrix for corner in corners for matrix in corner)]
-    if not all(np.isfinite(part).all() for part in numbers):
-        return False
-    D = np.zeros((len(C), corners[0][1].shape[1])) if D is None else D
-    out, level = _gram(_Exact.of(np.hstack([C, D]))), _gram(_Exact.of(np.array([[gain]])))
-    held = _gram(_Exact.of(root))
-    for A, B in corners:
-        n, width = A.shape[1], B.shape[1]
-        moved = _gram(_Exact.of(root) @ _Exact.of(np.hstack([A, B])))
-        shift = max(part.shift for part in (moved, held, out, level))
-        F = -moved.at(shift) - out.at(shift)
-        F[:n, :n] += held.at(shift)
-        F[range(n, n + width), range(n, n + width)] += level.at(shift)[0, 0]
-        if not _positive(F):
-            return False
-    return True
+@dataclass(frozen=True)
+class ProofSettings:
+    """How a proof is looked for; a gain that is proven is one whatever these are."""
+
+    frequencies: int = 200  # of the grid, beside those of the poles
+    accuracy: float = 5e-4  # of the least squared gain on the grid
+    rounds: int = 60  # of cutting planes
+    cuts: int = 30  # of a round
+    above: tuple[float, ...] = (1.001, 1.01, 1.1, 2.0)  # of the least gain on the grid: what is tried
+    spare: float = 0.25  # share of the distance to one that the extra output may take
+    corners: int = 64  # of a box, which are visited where slopes are frozen
+    bits: int = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted
+
+
+SETTINGS = ProofSettings()
 
 
 @dataclass(frozen=True, eq=False)
-class _Exact:
-    """A matrix of integers over a power of two."""
+class Proof:
+    """A gain with the Lyapunov factor ``P = R'R``, shape (n, n), and multipliers, shape (n_p,)."""
 
-    integers: Integers
-    shift: int
-
-    @classmethod
-    def of(cls, matrix: Array) -> _Exact:
-        mantissa, exponent = np.frexp(np.asarray(matrix, dtype=float))
-        whole, power = (mantissa * 2.0**53).astype(np.int64), exponent.astype(int) - 53
-        lowest = int(power[whole != 0].min()) if whole.any() else 0
-        integers = np.empty(matrix.shape, dtype=object)
-        for place in np.ndindex(*matrix.shape):
-            integers[place] = int(whole[place]) << int(power[place] - lowest) if whole[place] else 0
-        return cls(integers, -lowest)
-
-    def __matmul__(self, other: _Exact) -> _Exact:
-        return _Exact(self.integers @ other.integers, self.shift + other.shift)
-
-    def at(self, shift: int) -> Integers:
-        return np.asarray(self.integers * (1 << (shift - self.shift)), dtype=object)
+    gain: float
+    root: Array
+    multipliers: Array
 
 
-def _gram(matrix: _Exact) -> _Exact:
-    return _Exact(matrix.integers.T @ matrix.integers, 2 * matrix.shift)
+def first_proof(system: ErrorSystem) -> Proof | None:
+    """Return the first proposal that is proven; None where there is none."""
+    for proposal in proposals(system):
+        if proven(proposal.root, *system.multiplied(proposal.multipliers, proposal.gain), proposal.gain):
+            return proposal
+    return None
 
 
-def _positive(F: Integers) -> bool:
-    """Tell whether a symmetric matrix of integers is positive definite."""
+def proven_gain(system: ErrorSystem) -> float:
+    """Return a proven gain of a system, infinite where there is none."""
+    proof = first_proof(system)
+    return np.inf if proof is None else proof.gain
+
+
+def frozen_gain(system: ErrorSystem) -> float:
+    """Return the largest gain that slopes frozen at a corner or in the middle attain."""
+    return max(hinf_norm(system.frozen(place)) for place in _places(system))
+
+
+def growing_place(system: ErrorSystem) -> str:
+    """Return where frozen slopes let the error grow; empty where they do not."""
+    radius = max(system.frozen(place).spectral_radius() for place in _places(system))
+    return f"The error grows: frozen slopes multiply it by {radius:.6g} a step." if radius >= 1 else ""
+
+
+def _places(system: ErrorSystem) -> list[Array]:
+    """Return the middle of the box, and its corners where they are not too many."""
+    width = system.L.shape[1]
+    visited = width > 0 and 2**width <= SETTINGS.corners
+    return [np.zeros(width), *(np.array(c) for c in product((-1.0, 1.0), repeat=width) if visited)]
+
+
+def proposals(system: ErrorSystem) -> Iterator[Proof]:
+    """Yield proposals, best first; none where the frequency inequality has no solution."""
+    plain, width = system.frozen(np.zeros(system.L.shape[1])), system.L.shape[1]
+    if not plain.is_stable():
+        return
+    multipliers: Array | None = np.ones(width)
+    if width and np.any(system.C) and (np.any(system.B) or np.any(system.D)):
+        H = _responses(system)
+        multipliers = best_multipliers(H, width)
+        least = np.inf if multipliers is None else float(np.sqrt(gain_squared(H, multipliers)))
+    else:
+        least = hinf_norm(plain)
+    if multipliers is None or not np.isfinite(least):
+        return
+    size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
+    least = max(least, np.sqrt(np.finfo(float).eps) ** 1.5 * size, np.finfo(float).tiny)  # nothing arrives: any will do
+    for factor in SETTINGS.above:  # multipliers that grow with the gain leave room for what the grid did not see
+        R = lyapunov_factor(system, multipliers * factor, least * factor)
+        if R is not None:
+            yield Proof(least * factor, R, multipliers * factor)
+
+
+def best_multipliers(H: Complex, width: int) -> Array | None:
+    """Return multipliers, (n_p,), of nearly the least gain for responses (f, ., .); None where none prove stability."""
+    from scipy.optimize import linprog
+
+    unit, H = _scaled(H, width)
+    cuts, best, least, query, known = np.zeros((0, width + 2)), None, np.inf, np.ones(width), 0.0
+    for _ in range(SETTINGS.rounds):
+        level = gain_squared(H, query)
+        if level < least:
+            best, least = query, level
+        if least <= known * (1 + SETTINGS.accuracy):
+            break
+        cuts = np.vstack([cuts, _cuts(H, query, known)])
+        result = linprog([*np.zeros(width), 1.0], -cuts[:, :-1], -cuts[:, -1], bounds=(0, 1 / np.finfo(float).eps))
+        if result.status != 0:
+            break
+        known = float(result.x[-1])
+        query = result.x[:-1] if best is None else (result.x[:-1] + best) / 2
+    return None if best is None else best * unit
+
+
+def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
+    """Return units of the multipliers, and responses in which these and the squared gain are of size one."""
+    through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
+    by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
+    size = max(float(np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max()), float(by_slopes)) or 1.0
+    through = np.maximum(through, 1e-12 * size)
+    H = H / np.concatenate([through, np.full(H.shape[2] - width, size)])
+    H[:, :width] *= through[:, None]
+    return through**2, H
+
+
+def _cuts(H: Complex, t: Array, g: float) -> Array:
+    """Return rows (c, n_p + 2) of ``v' F_f(t, g) v = a t + b g - c`` for the eigenvectors of least value."""
+    width = len(t)
+    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
+    F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    values, vectors = np.linalg.eigh(F)
+    some = np.argsort(values[:, 0])[: SETTINGS.cuts]
+    v = vectors[some, :, 0]
+    moved = np.abs((H[some] @ v[..., None])[..., 0]) ** 2
+    size = np.abs(v) ** 2
+    return np.column_stack(
+        [size[:, :width] - moved[:, :width], size[:, width:].sum(axis=1), moved[:, width:].sum(axis=1)]
+    )
+
+
+def gain_squared(H: Complex, t: Array) -> float:
+    """Return the least g that multipliers allow on the grid, by a Schur complement, or infinity."""
+    width = len(t)
+    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
+    F = np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    rest = np.diag(t) - F[:, :width, :width]
+    if not np.linalg.eigvalsh(rest)[:, 0].min() > 0:
+        return np.inf
+    schur = F[:, width:, width:] + F[:, width:, :width] @ np.linalg.solve(rest, F[:, :width, width:])
+    return float(np.linalg.eigvalsh(schur)[:, -1].max())
+
+
+def _responses(system: ErrorSystem) -> Complex:
+    """H at many frequencies: those of the poles and a logarithmic grid; shape (f, n_p + n_z, n_p + n_w)."""
+    C, D = np.vstack([system.M, system.C]), np.hstack([system.nested, system.D])
+    D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
+    plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
+    poles = np.log(plant.poles().astype(complex) + np.finfo(float).tiny)
+    nyquist, angle, width = 0.5 / system.dt, np.abs(poles.imag), np.abs(poles.real)
+    beside = np.maximum(angle + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], width), 0.0).ravel()
+    marks = np.concatenate([angle, width, np.abs(poles), beside]) / (2 * np.pi * system.dt)
+    low = max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, 1e-9 * nyquist)
+    grid = np.geomspace(low, nyquist, SETTINGS.frequencies)
+    return plant.frequency_response(np.unique(np.concatenate([[0.0], grid, marks[marks <= nyquist]])))
+
+
+def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:
+    """Return the triangular factor of a Lyapunov matrix for a gain, or None without a solution."""
+    from scipy.linalg import solve_discrete_are
+
+    (A, inputs), outputs, feed = system.multiplied(multipliers, gain)
+    inputs, feed, n = inputs / gain, feed / gain, len(A)
+    T, back = reachable_coordinates(A, inputs, system.dt)
+    A, inputs, outputs = np.eye(n) + back @ (A - np.eye(n)) @ T, back @ inputs, outputs @ T
+    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), 1e-8) * (1 + 1e-8)) ** 2
+    if room <= 0:
+        return None
+    spread = hinf_norm(StateSpace(A, inputs, np.eye(n), np.zeros((n, inputs.shape[1])), system.dt), 1e-2)
+    extra = SETTINGS.spare * room / max(spread, np.finfo(float).tiny) ** 2
+    Q, W = outputs.T @ outputs + extra * np.eye(n), feed.T @ feed - np.eye(inputs.shape[1])
+    try:
+        R = np.linalg.cholesky(solve_discrete_are(A, inputs, Q, W, s=outputs.T @ feed)).T
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    return np.asarray(np.linalg.qr(R @ back, mode="r"))
+
+
+def reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
+    """Return T and its inverse, for coordinates in which a reachability Gramian is the identity."""
+    W = gramian(A, B, dt)
+    size = np.sqrt(np.maximum(np.diag(W), 0.0))
+    size[size == 0] = 1.0
+    values, vectors = np.linalg.eigh(W / np.outer(size, size))
+    root = np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    return size[:, None] * vectors * root, (vectors / root).T / size
+
+
+def proven(root: Array, inputs: tuple[Array, Array], C: Array, D: Array, gain: float) -> bool:
+    """Whether ``diag(R'R, gain^2 I) - [A, B]' R'R [A, B] - [C, D]' [C, D] > 0`` for the numbers as they are stored."""
+    parts = [root, np.hstack(inputs), np.hstack([C, D]), np.array([[gain]])]
+    if not all(np.isfinite(part).all() for part in parts):
+        return False
+    shift = max(53, *(53 - int(np.frexp(part)[1].min(initial=0)) for part in parts))
+    R, AB, CD, level = (_integers(part, shift) for part in parts)
+    moved, n = R @ AB, len(root)
+    F = -moved.T @ moved - ((CD.T @ CD) << (2 * shift))
+    F[:n, :n] += (R.T @ R) << (2 * shift)
+    rest = range(n, len(F))
+    F[rest, rest] += (level[0, 0] ** 2) << (2 * shift)
+    return positive(F)
+
+
+def _integers(matrix: Array, shift: int) -> Integers:
+    """Return ``2^shift`` times a matrix of doubles, as integers without rounding."""
+    mantissa, exponent = np.frexp(matrix)
+    whole = (mantissa * 2.0**53).astype(np.int64).astype(object)
+    return np.asarray(whole << (exponent - 53 + shift).astype(object), dtype=object)
+
+
+def positive(F: Integers) -> bool:
+    """Whether a symmetric matrix of integers is positive definite, by elimination without rounding."""
     n = len(F)
     if any(F[i, i] <= 0 for i in range(n)):
         return False
-    half = [-(int(F[i, i]).bit_length() // 2) for i in range(n)]
+    half = [int(F[i, i]).bit_length() // 2 for i in range(n)]
     M = np.empty((n, n), dtype=object)
-    for i, j in np.ndindex(n, n):
-        power = half[i] + half[j] + _BITS
-        M[i, j] = int(F[i, j]) << power if power >= 0 else int(F[i, j]) >> -power
+    for i, j in np.ndindex(n, n):  # diagonal entries of alike size, few bits
+        M[i, j] = (int(F[i, j]) << SETTINGS.bits) >> (half[i] + half[j])
     M[range(n), range(n)] -= n
-    return _clearly_positive(M) or _eliminated(M)
-
-
-def _clearly_positive(M: Integers) -> bool:
-    """Tell whether a matrix of integers is positive definite by more than rounding."""
-    try:
-        rounded = M.astype(float) * 2.0**-_BITS
-        spare = _ROUNDING * (len(M) + 4) * np.finfo(float).eps * float(np.trace(rounded))
-        np.linalg.cholesky(rounded - spare * np.eye(len(M)))
-    except (np.linalg.LinAlgError, OverflowError):  # entries beyond any float are beyond the diagonal
-        return False
-    return True
-
-
-def _eliminated(M: Integers) -> bool:
-    """Tell whether a matrix of integers is positive definite, by elimination without rounding."""
-    n, pivot = len(M), 1
+    pivot = 1
     for k in range(n):
         if M[k, k] <= 0:
             return False

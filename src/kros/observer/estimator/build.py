@@ -18,7 +18,7 @@ from ..runtime import Runtime
 from .bank import Bank
 from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
-from .gaps import with_gaps
+from .gaps import is_less, with_gaps
 from .reduction import Filters, reduced
 from .regression import Design, Readout, Recordings
 from .settings import EstimatorSettings
@@ -88,13 +88,19 @@ def identify_estimator(
     blind_channels = channels.without_measurements()
     blind_bank = Bank.of(blind_channels, recordings.length, settings)
     blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
-    filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
     first = first_estimate(channels, recordings)
     reach = settings.reach * recordings.size[list(measured)]
-    observer = assembled(
-        name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
-    )
-    observer = replace(observer, bank=with_gaps(observer, recordings, settings))
+
+    def observer_of(*readouts: Readout) -> tuple[Filters, Filters, Observer]:
+        filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in readouts)
+        own = name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
+        return filters, fallback, assembled(*own)
+
+    filters, fallback, observer = observer_of(readout, blind)
+    group, unseen = readout.left_out_group()
+    *_, trial = observer_of(readout.without(group), blind.without(group))
+    assert observer.bank is not None
+    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings))
     observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
@@ -152,10 +158,8 @@ def best_family(
 
 def is_better(one: Readout, other: Readout, states: Sequence[int], margin: float) -> bool:
     """Whether the left-out errors of one are smaller by so many paired standard errors over folds of units."""
-    difference = one.by_fold(states) - other.by_fold(states)
-    if len(difference) < 2:
-        return bool(difference.mean() < 0)
-    return bool(difference.mean() + margin * difference.std(ddof=1) / np.sqrt(len(difference)) < 0)
+    difference = one.by_fold(states), other.by_fold(states)
+    return is_less(*difference, margin)
 
 
 def errors_of(readout: Readout) -> Array:

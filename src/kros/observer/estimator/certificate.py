@@ -135,4 +135,4 @@ def left_out_bound(
     worst = np.array([worst_percent[name] for name in observer.recorded]) * sizes / 100
     bound = np.maximum(worst, errors.max(axis=0))
     each = np.repeat(bound[None], len(units), axis=0)
-    return SignalBound(observer.recorded, tuple(units), bound, each, errors, sizes)
+    return SignalBound(observer.recorded, tuple(units), each, errors, sizes)

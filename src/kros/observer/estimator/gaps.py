@@ -9,28 +9,30 @@ import numpy.typing as npt
 
 from ..filter_bank import FilterBank
 from ..observer import Observer
-from ..simulate import run_observer
+from ..simulate import Course
+from ..step import Parameters
 from .regression import Recordings
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 _NEVER = 1e12  # samples: an age that no gap has
+_ROWS = 1000  # samples at a time
 
 
-def training(
-    recordings: Recordings, settings: EstimatorSettings, count: int
-) -> tuple[Array, Array, Array, dict[str, Array]]:
+def training(recordings: Recordings, settings: EstimatorSettings) -> tuple[Array, Array, Array, dict[str, Array]]:
     """Return states, measurements, inputs and parameters of some episodes side by side, cut to one length."""
-    some = recordings.some(count)
+    some = recordings.some(settings.gap_episodes)
     length = min(min(some.lengths), settings.gap_samples)
     batches = [recordings.read(key) for key in some.keys]
+    again = np.arange(settings.gap_episodes) % len(batches)  # every episode is seen with several losses
     states, inputs = (
-        np.concatenate([getattr(b, what)[:length] for b in batches], axis=1) for what in ("states", "inputs")
+        np.concatenate([getattr(b, what)[:length] for b in batches], axis=1)[:, again] for what in ("states", "inputs")
     )
-    shown = np.concatenate([b.measurements(range(states.shape[-1]), arrived=False)[:length] for b in batches], axis=1)
+    arrived = [b.measurements(range(states.shape[-1]), arrived=False)[:length] for b in batches]
     names = batches[0].parameters
-    return states, shown, inputs, {k: np.concatenate([b.parameters[k] for b in batches]) for k in names}
+    parameters = {k: np.concatenate([b.parameters[k] for b in batches])[again] for k in names}
+    return states, np.concatenate(arrived, axis=1)[:, again], inputs, parameters
 
 
 def forgetting(apart: Array) -> Array:
@@ -49,42 +51,85 @@ def forgetting(apart: Array) -> Array:
 def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     """Return samples (n_samples, batch) that are missing: independently, or in gaps of log-uniform lengths."""
     missing = np.zeros((n_samples, batch), dtype=bool)
+    shares = np.linspace(0.1, 0.95, -(-batch // 2))
     for i in range(batch):
         if i % 2:
             lengths = np.exp(rng.uniform(0, np.log(max(2, n_samples / 2)), n_samples)).astype(int)
             missing[1:, i] = np.repeat(np.arange(n_samples) % 2 == 1, lengths)[: n_samples - 1]
         else:
-            missing[1:, i] = rng.random(n_samples - 1) < rng.uniform(0.1, 0.95)
+            missing[1:, i] = rng.random(n_samples - 1) < shares[i // 2]
     return missing
 
 
-def with_gaps(observer: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
-    """Return the filter bank with forgetting and ages of gaps that minimise errors under simulated losses."""
-    bank = observer.bank
-    assert bank is not None
-    states, shown, inputs, parameters = training(recordings, settings, settings.gap_episodes)
-    n, at = len(observer.recorded), list(observer.measured)
-    longest = settings.blocks(recordings.length)[-1]
+def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+    """Return a filter bank with forgetting and ages of gaps that minimise a trial's errors under simulated losses.
+
+    The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
+    side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
+    to be better by the margin.
+    """
+    states, shown, inputs, parameters = training(recordings, settings)
+    batch, n, at = states.shape[1], len(trial.recorded), list(trial.measured)
+    hidden = [i for i in range(n) if i not in at]
     missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
-    half = np.full(n, _NEVER)
-    half[at] = settings.half * longest
-    y, own = shown[..., at], observer.own(parameters)
-    forget = forgetting(states - run_observer(observer, y, inputs, own)[..., -n:])
-    recovery = np.exp(-1 / (longest * np.array(settings.recoveries)))
-    bank = replace(bank, forget=forget, half=half)
-    lost = np.where(missing[..., None], np.nan, y)
-    estimates = run_observer(replace(observer, bank=bank), lost, inputs, own)
-    T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(longest * np.array(settings.halves), recovery))
-    errors = blended_errors(states, estimates[..., :n], estimates[..., -n:], missing, forget, T, mu)
-    best = np.argmin(errors, axis=0)
-    half, recovery = np.where(half == _NEVER, T[best, 0], half), mu[best, 0]
-    return replace(bank, half=half, recovery=recovery)
+    y, own = shown[..., at], trial.own(parameters)
+    forget = forgetting(states - recorded_estimates(trial, y, inputs, own)[..., n:])
+    longest = settings.blocks(recordings.length)[-1]
+    halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
+    tried = halves[::2]
+    ages = np.full((len(tried), batch, n), _NEVER)
+    ages[..., at] = tried[:, None, None]
+    assert trial.bank is not None
+    side = replace(trial.bank, forget=forget, half=ages.reshape(-1, n), recovery=np.zeros(n))
+    lost, u = (np.tile(s, (1, len(tried), 1)) for s in (np.where(missing[..., None], np.nan, y), inputs))
+    several = {name: np.tile(values, len(tried)) for name, values in own.items()}
+    estimates = recorded_estimates(replace(trial, bank=side), lost, u, several)
+    T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
+    least, best = np.full(batch, np.inf), bank
+    for i, age in enumerate(tried):
+        x = estimates[:, i * batch : (i + 1) * batch]
+        errors = blended_errors(states, x[..., :n], x[..., n:], missing, forget, T, mu)
+        choice = earliest(errors, T[:, 0], settings.margin)
+        score = errors[choice, :, range(n)][hidden or at].mean(axis=0)
+        if i == 0 or is_less(score, least, settings.margin):
+            half, recovery = np.full(n, age), np.zeros(n)
+            half[hidden], recovery[hidden] = T[choice[hidden], 0], mu[choice[hidden], 0]
+            least, best = score, replace(bank, forget=forget, half=half, recovery=recovery)
+    return best
+
+
+def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Parameters) -> Array:
+    """Return the estimates and the fallback of recorded states, (n_samples, batch, 2 n), without the filters."""
+    course, n = Course(observer, y.shape[1], parameters), len(observer.recorded)
+    some = [*range(n), *range(-n, 0)]
+    starts = range(0, len(y), _ROWS)
+    return np.concatenate([course.take(y[k : k + _ROWS], u[k : k + _ROWS]).estimates[..., some] for k in starts])
+
+
+def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]:
+    """Return for every state, of errors (c, batch, n), the best candidate with the least half that is not worse.
+
+    Worse is by more than a margin of paired standard errors over patterns than the best of all.
+    """
+    mean = errors.mean(axis=1)
+    apart = errors - np.take_along_axis(errors, np.argmin(mean, axis=0)[None, None], axis=0)
+    error = apart.std(axis=1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else 0.0
+    alike = apart.mean(axis=1) <= margin * error
+    least = np.where(alike, half[:, None], np.inf).min(axis=0)
+    return np.asarray(np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0))
+
+
+def is_less(one: Array, other: Array, margin: float) -> bool:
+    """Whether one is less than the other by so many paired standard errors."""
+    difference = one - other
+    error = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else 0.0
+    return bool(difference.mean() + margin * error < 0)
 
 
 def blended_errors(
     states: Array, filtered: Array, from_inputs: Array, missing: Flags, forget: Array, half: Array, recovery: Array
 ) -> Array:
-    """Return mean log squared errors (c, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
+    """Return log squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
     x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
     for k, lost in enumerate(missing[:-1]):
@@ -94,4 +139,4 @@ def blended_errors(
         fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])
         squares += (x - states[k + 1]) ** 2
-    return np.log(squares / len(missing) + np.finfo(float).tiny).mean(axis=1)
+    return np.log(squares / len(missing) + np.finfo(float).tiny)

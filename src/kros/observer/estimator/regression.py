@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -94,8 +95,12 @@ class Recordings:
         """Return some episodes, spread over all."""
         if len(self.keys) <= count:
             return self
-        at = np.unique(np.linspace(0, len(self.keys) - 1, count).round().astype(int))
-        return replace(self, keys=tuple(self.keys[i] for i in at), lengths=tuple(self.lengths[i] for i in at))
+        at = np.linspace(0, len(self.keys) - 1, count).round().astype(int)
+        return self.only(np.isin(np.arange(len(self.keys)), at).tolist())
+
+    def only(self, which: Sequence[bool]) -> Recordings:
+        """Return the episodes that are flagged."""
+        return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
     def groups(self, folds: int, parts: int) -> list[Group]:
         """Return the group of every episode: those of one name are in one part, and a unit is in one fold."""
@@ -322,6 +327,17 @@ class Readout:
             moments.of_groups("fold"),
             {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
         )
+
+    def left_out_group(self) -> tuple[Group, Recordings]:
+        """Return a group, and the recordings of its fold and part: what `without` it does not know."""
+        groups, recordings = self.design.groups, self.design.recordings
+        first = groups[recordings.keys[0]]
+        same = [(groups[key].fold, groups[key].part) == (first.fold, first.part) for key in recordings.keys]
+        return first, recordings.only(same)
+
+    def without(self, group: Group) -> Readout:
+        """Return the readout that does not know a group."""
+        return replace(self, coefficients=self.others[group] * self.design.recordings.size)
 
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""

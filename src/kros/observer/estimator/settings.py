@@ -62,13 +62,8 @@ class EstimatorSettings(Settings):
         ge=1,
         description="ratio of the weights of hidden and measured states in the reduction",
     )
-    half: float = Field(
-        1.0,
-        gt=0,
-        description="age of a gap at which the reach of a measurement is halved, in longest delays",
-    )
     halves: tuple[float, ...] = Field(
-        (0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 100.0),
+        (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
         description="ages of a gap at which the fallback counts one half, in longest delays; training chooses",
     )
     recoveries: tuple[float, ...] = Field(
@@ -88,7 +83,7 @@ class EstimatorSettings(Settings):
     gap_samples: int = Field(
         20_000, ge=100, description="samples of an episode on which losses are simulated in training"
     )
-    gap_episodes: int = Field(12, ge=1, description="episodes on which losses are simulated")
+    gap_episodes: int = Field(12, ge=1, description="episodes, and patterns of losses that are simulated on them")
     seed: int = Field(0, ge=0, description="of the random features and of the simulated losses")
 
     def lags(self, length: float) -> tuple[float, ...]:

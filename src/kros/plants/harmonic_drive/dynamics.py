@@ -32,7 +32,6 @@ TWIST, W, WL, CURRENT, COMMAND, FM, FL = range(7)
 MEASURED = 2  # rows of p and v, in front of q and z
 RECORDED = MEASURED + 1 + COMMAND  # rows from p to i
 BLOCK_SAMPLES = 32  # recorded time-major, then turned into one row per trajectory
-CHUNK_TRAJECTORIES = 800  # keeps the working set of a step in cache
 _SIGNALS = (0, 1, MEASURED + 1 + CURRENT)  # recorded rows of position, velocity and current
 
 
@@ -67,21 +66,21 @@ class Physics:
         self.q[:] = q0
         for _ in range(20):
             self.z[TWIST] = self.moment * np.sin(self.q - self.z[TWIST]) / p.stiffness
-        self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + p.gearbox_current(self.q)
+        self.z[CURRENT] = self.z[COMMAND] = p.stiffness * self.z[TWIST] / p.torque_constant + self.disturbance(q0)
 
     def advance(self) -> None:
         """Move on by one sampling period with the command in `z[COMMAND]` held."""
         q, z = self.q, self.z
         for _ in range(SUBSTEPS):
             middle = q + z[W] * (0.5 * SUBSTEP_S)
-            z[FM] = self._disturbance(middle) * -self.p.torque_constant - self.p.dry_friction(z[W])
+            z[FM] = self.disturbance(middle) * -self.p.torque_constant - self.p.dry_friction(z[W])
             z[FL] = np.sin(middle - z[TWIST]) * -self.moment
             moved = np.einsum("ijn,jn->in", self.M, z)
             z[:4] = moved[:4]
             q += moved[4]
 
-    def _disturbance(self, q: Array) -> Array:
-        """(34): i_d is the imaginary part of sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
+    def disturbance(self, q: Array) -> Array:
+        """Return i_d of (34), a fraction of full scale: Im sum_h a_h exp(j phi_h) exp(j h r q), by Horner's rule."""
         angle = q * GEAR_RATIO
         e = np.cos(angle) + 1j * np.sin(angle)
         total = self.ripple[-1] * e
@@ -111,34 +110,15 @@ def simulate(
     p: DriveParameters, loaded: Array, reference: Array, targets: tuple[Array, Array], gains: Gains
 ) -> SimulatedSignals:
     """Simulate all trajectories; `targets` are position (rad) and velocity (rad/s), shape (n_references, n_samples)."""
-    n, n_samples = len(p), targets[0].shape[1]
+    n, n_samples, is_loaded = len(p), targets[0].shape[1], np.flatnonzero(loaded)
     states, velocity = np.empty((n, len(_SIGNALS), n_samples)), np.empty((n, 1, n_samples))
-    out = SimulatedSignals(states, velocity, np.empty((np.count_nonzero(loaded), n_samples), np.float32))
-    first_loaded = np.concatenate([[0], np.cumsum(loaded > 0)])
-    for start in range(0, n, CHUNK_TRAJECTORIES):
-        stop = min(start + CHUNK_TRAJECTORIES, n)
-        part = slice(start, stop)
-        torque = out.load_torque[first_loaded[start] : first_loaded[stop]]
-        chunk = SimulatedSignals(states[part], velocity[part], torque)
-        tracked = [(target, reference[part]) for target in targets]
-        _simulate_chunk(p.take(part), loaded[part], tracked, gains, chunk)
-    return out
-
-
-def _simulate_chunk(
-    p: DriveParameters, loaded: Array, tracked: list[tuple[Array, Array]], gains: Gains, out: SimulatedSignals
-) -> None:
-    """Simulate some trajectories into `out`; `tracked` holds targets and the one of every trajectory."""
-    n, n_samples = len(p), out.states.shape[-1]
-    position, rows = tracked[0]
-    physics = Physics(p, loaded, position[rows, 0])
-    drive = _Controller(physics, gains)
-    is_loaded = np.flatnonzero(loaded)
-    with_load = p.take(is_loaded)
+    out = SimulatedSignals(states, velocity, np.empty((len(is_loaded), n_samples), np.float32))
+    physics = Physics(p, loaded, targets[0][reference, 0])
+    drive, with_load = _Controller(physics, gains), p.take(is_loaded)
     recorded = np.empty((BLOCK_SAMPLES, RECORDED, n))
     for first in range(0, n_samples, BLOCK_SAMPLES):
         stop = min(first + BLOCK_SAMPLES, n_samples)
-        rp, rv = (np.ascontiguousarray(target[:, first:stop].T)[:, of] for target, of in tracked)
+        rp, rv = (np.ascontiguousarray(target[:, first:stop].T)[:, reference] for target in targets)
         for k in range(stop - first):
             drive.sample(rp[k], rv[k])
             recorded[k] = physics.rows[:RECORDED]
@@ -147,9 +127,9 @@ def _simulate_chunk(
         for row, signal in enumerate(_SIGNALS):
             out.states[:, row, first:stop] = block[:, signal].T
         out.velocity[:, 0, first:stop] = block[:, MEASURED + 1 + W].T
-        if len(is_loaded):
-            torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
-            out.load_torque[:, first:stop] = (torque / with_load.torque_constant).T
+        torque = load_torque(with_load, block[..., is_loaded].swapaxes(0, 1))
+        out.load_torque[:, first:stop] = (torque / with_load.torque_constant).T
+    return out
 
 
 class _Controller:

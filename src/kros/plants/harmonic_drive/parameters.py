@@ -21,11 +21,9 @@ Array = npt.NDArray[np.float64]
 
 GEAR_RATIO = 100
 SAMPLE_PERIOD_S = 1e-3
-ENCODER_COUNTS = 2**15  # per revolution of the motor
-COUNT_RAD = 2 * np.pi / (ENCODER_COUNTS * GEAR_RATIO)  # at the gearbox output
+COUNT_RAD = 2 * np.pi / (2**15 * GEAR_RATIO)  # of the encoder, whose counts are of a motor revolution, at the output
 VELOCITY_POLE = float(np.exp(-2 * np.pi * 150.0 * SAMPLE_PERIOD_S))  # first-order filter at 150 Hz
 CURRENT_NOISE = 2e-3  # standard deviation, fraction of full scale
-HARMONICS = 8
 SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
 UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
 
@@ -114,12 +112,6 @@ class DriveParameters:
         torque = self.breakaway_torque / fade + self.coulomb_torque
         return torque * velocity / np.sqrt(velocity**2 + SMOOTHING_VELOCITY**2)
 
-    def gearbox_current(self, position: Array) -> Array:
-        """Disturbance (34) of each unit at its own output angle, shape (n_units,), fraction of full scale."""
-        order = np.arange(1, self.ripple.shape[1] + 1)
-        angle = GEAR_RATIO * order * np.asarray(position, float)[..., None]
-        return np.sum(self.ripple * np.sin(angle + self.phase_rad), axis=-1)
-
 
 def draw_parameters(seed: int, n_units: int, spread: float, severity: float | None = None) -> DriveParameters:
     """Draw the drives of a batch, in front of them one with loose fasteners where there is a severity."""
@@ -137,6 +129,6 @@ def _draw(seed: int, stream: tuple[int, int], spread: float) -> dict[str, Any]:
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=stream))
     shares = {name: np.exp(spread * deviation * rng.standard_normal()) for name, (_, deviation) in NOMINAL.items()}
     values: dict[str, Any] = {name: nominal * shares[name] for name, (nominal, _) in NOMINAL.items()}
-    values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(HARMONICS))
-    values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, HARMONICS)
+    values["ripple"] = RIPPLE * np.exp(spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
+    values["phase_rad"] = rng.uniform(0.0, 2 * np.pi, len(RIPPLE))
     return values

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import ConfigError
+from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
 from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
 from ...data.steps import Offset, Trim
 from ..batch import BatchSettings, SimulatedEpisodes, SimulatedPopulation
 from .dynamics import simulate
-from .parameters import CURRENT_NOISE, GAINS, GEAR_RATIO, SAMPLE_PERIOD_S, Loop, draw_parameters
+from .parameters import CURRENT_NOISE, GAINS, GEAR_RATIO, SAMPLE_PERIOD_S, DriveParameters, Gains, Loop, draw_parameters
 from .reference import episode_reference
-from .truth import Truth
 
 Array = npt.NDArray[Any]
 
@@ -33,10 +33,38 @@ TRUTHS = (Channel("velocity_true", Role.TRUTH, "rad/s", of="velocity"),)
 REST_SAMPLES = 1000
 # As a reader of raw recordings prepares them; undoing the lag of the targets costs it the last sample.
 PREPARATION = (Offset("position", "target_position", 500, 1000), Trim(start=REST_SAMPLES, tail=1))
-OUTLIER_SERIAL = "000000"
-FIRST_SERIAL = 1001
 RECORDING_STREAM = 3  # first word of the spawn key of noise and offsets
 MAX_OFFSET_RAD = 0.02  # of the measured position, at the gearbox output
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """True parameters and signals of a simulated population."""
+
+    unit_ids: tuple[str, ...]  # order of the unit axis
+    parameters: DriveParameters
+    loop: Loop
+    gains: Gains
+    load_rows: Mapping[EpisodeKey, int]  # row of `load_signals` of each loaded episode
+    load_signals: Array  # shape (n_loaded, n_samples), float32, in step with the prepared episodes
+
+    @property
+    def phase_rad(self) -> Array:
+        """Phase `phi1` of (34), shape (n_units,), rad, in [0, 2 pi)."""
+        return self.parameters.phase_rad[:, 0]
+
+    def load_torque(self, key: EpisodeKey) -> Array:
+        """Return the torque that the load takes from the flange in an episode, inertia and gravity, (n_samples,)."""
+        if key not in self.load_rows:
+            raise DataError(f"Load torque of {key}: only the {len(self.load_rows)} loaded episodes have one.")
+        return self.load_signals[self.load_rows[key]]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything but the long signals, ready for JSON: one entry per unit."""
+        names = [f.name for f in fields(self.parameters)]
+        rows = enumerate(self.unit_ids)
+        units = {unit: {name: getattr(self.parameters, name)[row].tolist() for name in names} for row, unit in rows}
+        return {"plant": "harmonic-drive", "loop": self.loop.value, "gains": asdict(self.gains), "units": units}
 
 
 @dataclass(frozen=True)
@@ -91,8 +119,8 @@ class HarmonicDrivePopulation(BatchSettings):
         return SimulatedPopulation(prepare(raw, PREPARATION), raw, truth)
 
     def _units(self) -> tuple[Unit, ...]:
-        units = tuple(Unit(f"{FIRST_SERIAL + k:06d}", "population") for k in range(self.n_units))
-        return (Unit(OUTLIER_SERIAL, OUTLIERS), *units) if self.outlier else units
+        units = tuple(Unit(f"{1001 + k:06d}", "population") for k in range(self.n_units))
+        return (Unit("000000", OUTLIERS), *units) if self.outlier else units
 
     def _targets(self) -> Array:
         """Target position and velocity of every episode, shape (2, n_episodes, n_samples)."""

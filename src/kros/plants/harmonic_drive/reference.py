@@ -22,8 +22,7 @@ SECONDS_PER_CHECKPOINT = 2.0
 LEAST_IN_MOTION = 0.75  # share of the episode
 LEAST_HOLD_SAMPLES = 350  # at full speed, at least once in each direction
 REVOLUTION = 2 * np.pi
-_RAMPS = ACCELERATION_SAMPLES + JERK_SAMPLES
-SHORTEST_MOVE_SAMPLES = _RAMPS  # length at full speed: shorter moves would not reach it
+_RAMPS = ACCELERATION_SAMPLES + JERK_SAMPLES  # length of a move at full speed: shorter ones would not reach it
 _CANDIDATES = 64
 _TRIES = 1000
 
@@ -66,7 +65,7 @@ def _draw_checkpoints(rng: np.random.Generator, n_samples: int, period_s: float)
     seconds = n_samples * period_s
     n_moves = max(2, round(seconds / SECONDS_PER_CHECKPOINT))
     for _ in range(_TRIES):
-        drawn = _candidates(rng, n_moves, SHORTEST_MOVE_SAMPLES * MAX_SPEED * period_s)
+        drawn = _candidates(rng, n_moves, _RAMPS * MAX_SPEED * period_s)
         good = _fits(drawn, n_samples, period_s)
         if good.any():
             return drawn[np.argmax(good)]

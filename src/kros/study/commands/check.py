@@ -18,8 +18,9 @@ from ...data.checks import check_population
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
-from ...observer import Observer, sample_status
+from ...observer import Observer
 from ...observer.monitor import Monitor
+from ...observer.screen import screened
 from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
 from ...uncertainty.outliers.population import score_row
@@ -138,13 +139,13 @@ def monitored(recordings: FieldRecordings) -> Rows:
         counts, judged, samples = dict[str, int](), Judged(), 0
         for arrived in recordings.batches(keys):
             samples += int(arrived.batch.lengths.sum())
-            status = sample_status(observer, arrived.y, arrived.u)
+            status = screened(observer, arrived.y, arrived.u).status
             count_status(counts, np.where(np.arange(len(status))[:, None] < arrived.batch.lengths, status, 0))
             if monitor is not None:
                 values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
                 judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
-        level = highest_level(monitor, judged, condition)
+        level = highest_level(monitor, judged)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
         row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))
         row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
@@ -155,9 +156,9 @@ def monitored(recordings: FieldRecordings) -> Rows:
     return rows
 
 
-def highest_level(monitor: Monitor | None, innovations: Judged, condition: str) -> float | None:
-    """Return the highest level over the bound of a condition, dB; None where nothing is judged."""
+def highest_level(monitor: Monitor | None, innovations: Judged) -> float | None:
+    """Return the highest level over the bound, dB; None where nothing is judged."""
     if monitor is None or not any(judged.any() for _, judged in innovations):
         return None
     squares = np.concatenate(monitor.in_turn(innovations))
-    return float(monitor.level(squares, condition if condition in monitor.bounds else None).max())
+    return float(monitor.level(squares).max())

@@ -11,7 +11,8 @@ from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...core.store import digest_of
 from ...core.work import Progress
-from ...data import write_parquet, write_raw
+from ...data import write_parquet
+from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
 from ..engine.executors import open_executor

@@ -1,6 +1,6 @@
 """What the report says about the uncertainty beside its weights; later stages use nothing of it.
 
-models of resampled episodes    --> which share of the residuals finite recordings make    uncertainty/<model>/noise
+EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
 residuals of all units          --> beside the weights                                     uncertainty/<model>/units
 the most conspicuous unit       --> against the cover of all the others                    outliers/<models>/others
 """
@@ -18,7 +18,8 @@ import numpy as np
 
 from ...core.errors import KrosError
 from ...identify import ModelSet
-from ...uncertainty import Form, UncertainModel, VariationAndNoise, residual, variation_and_noise
+from ...uncertainty import Form, UncertainModel, residual
+from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
@@ -55,7 +56,7 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     tasks: list[Task] = [
         (folder / kind / "noise", noise)
         for kind, one in sets.items()
-        if one.nominal >= 0
+        if kind in models.edmd_kinds
         for noise in _noise(context, kind, one)
     ]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
@@ -75,7 +76,7 @@ def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
         return None
 
 
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], VariationAndNoise]]:
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], NoiseShare]]:
     """Compare variation and noise over some units, the nominal one among them; not with single episodes."""
     units = uncertain.unit_ids
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
@@ -86,20 +87,13 @@ def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[C
     except KrosError as error:
         log.info("%s: variation and noise are not separated: %s", name, error)
         return
-    nominal = chosen.index(uncertain.nominal_id)
-    yield partial(_compared, samples, models, uncertain.form, nominal)
+    yield partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
 
 
-def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> VariationAndNoise:
-    return variation_and_noise(
-        samples(),
-        freqs_hz=models.frequencies(DEFAULT.noise_points),
-        sample_period_s=models.sample_period_s,
-        form=form,
-        nominal=nominal,
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
-    )
+def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
+    scale = models.output_scale[:, None] / models.input_scale
+    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
+    return noise_share(samples(), scale, freqs, dt, form, nominal)
 
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:

@@ -23,7 +23,7 @@ from ...evaluate.disturb import Kind, disturbed_rows, standard_disturbances
 from ...evaluate.held_out import HeldOut, Outcome, Trial, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
-from ...observer.sensor import limits_of, sides
+from ...observer.sensor import sides
 from ..engine.context import Context
 from .load import run_load
 
@@ -106,7 +106,7 @@ def run_disturbed(
 def estimation(context: Context, episodes: HeldOut, trial: Trial | None = None) -> Pieces:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
     states = context.population.states
-    limits = sides(limits_of({}, context.facts.limits, states), states)
+    limits = sides(context.facts.limits, states)
     makers = baseline_makers(context, episodes)
     work: Pieces = {(name,): partial(of_baseline, episodes, make, limits, trial) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):

@@ -6,8 +6,7 @@ from ...core.artifacts import save_artifact
 from ...core.errors import ConfigError, DataError
 from ...data import Population, read
 from ...data.population import OUTLIERS
-from ...data.prepare import prepare
-from ...data.steps import parse_steps
+from ...data.prepare import parse_steps, prepare
 from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase

@@ -1,13 +1,12 @@
 """Models of resampled training episodes: which share of a residual finite recordings make.
 
 factors of every episode --> EDMD models of the episodes drawn
-refined models and their information --> one step from them, for the episodes drawn
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -15,20 +14,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ...identify import Factor, KoopmanMatrices, ModelSamples, ModelSet, bootstrap_edmd, episode_weights
-from ...identify.bootstrap import bootstrap_refined
+from ...identify import Factor, ModelSamples, ModelSet, bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
-from ...identify.refine import Refinement, RefineOptions
-from ...identify.refine.episodes import episode_normals
-from ...identify.refine.model import TrainingData
 from ..engine.context import Context
 
 
 def resampling(context: Context, name: str, units: list[str], draws: int = 60) -> Callable[[], ModelSamples]:
-    """Return work that computes models of resampled training episodes in the condition that feeds synthesis."""
+    """Return work that computes EDMD models of resampled training episodes in the condition that feeds synthesis."""
     models = context.identified.models(name)
-    if models.alpha is None:
-        return partial(_Refined.of(context, models).samples, [models.index(u) for u in units], draws)
     return partial(_edmd_samples, models, *episode_factor(context, models, units), units, draws)
 
 
@@ -61,37 +54,6 @@ def _by_unit(values: npt.NDArray[Any], places: list[list[int]]) -> npt.NDArray[A
     for row, rows in enumerate(places):
         padded[row, : len(rows)] = values[rows]
     return padded
-
-
-@dataclass(frozen=True, eq=False)
-class _Refined:
-    """Models that were refined together, and on what, in channels divided by their ranges."""
-
-    models: KoopmanMatrices
-    refinement: Refinement
-    data: TrainingData
-    ranges: Ranges
-    counts: list[int]
-
-    @classmethod
-    def of(cls, context: Context, models: ModelSet) -> _Refined:
-        """Return what the identify stage stored."""
-        units, facts, ranges = list(models.unit_ids), context.facts, models.ranges
-        factor, counts = episode_factor(context, models, units)
-        keys = {u: tuple(facts.keys("train", u, facts.identify_on)) for u in units}
-        pooled = np.array([u in facts.pooled for u in units])
-        recorded = context.population.select(units, [facts.identify_on])
-        data = TrainingData(recorded, keys, models.lifting, dict(models.parameters), factor, pooled).divided_by(ranges)
-        matrices = ranges.normalise(KoopmanMatrices(models.A, models.B))
-        return cls(matrices, context.identified.refined[models.name].divided_by(ranges), data, ranges, counts)
-
-    def samples(self, rows: list[int], draws: int) -> ModelSamples:
-        """Return samples of some of the units, in the recordings' units of measure."""
-        normal = episode_normals(self.models, self.refinement, self.data, RefineOptions())
-        weights, T, H = episode_weights(self.counts, draws, 0), self.refinement.whitening, self.refinement.information
-        drawn = _restored(bootstrap_refined(self.models, T, H, normal, weights, list(self.data.keys)), self.ranges)
-        estimate, samples = (KoopmanMatrices(m.A[rows], m.B[rows]) for m in (drawn.estimate, drawn.samples))
-        return replace(drawn, unit_ids=tuple(drawn.unit_ids[k] for k in rows), estimate=estimate, samples=samples)
 
 
 def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:

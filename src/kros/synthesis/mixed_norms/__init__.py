@@ -1,1 +1,1 @@
-"""Mixed H2/H-infinity synthesis: matrix inequalities and their solver, local improvement, lower bounds."""
+"""Mixed H2/H-infinity synthesis: matrix inequalities and their solver."""

@@ -1,6 +1,6 @@
 r"""Interior-point method for small dense matrix inequalities.
 
-It solves ``min c'x + x'Qx/2`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
+It solves ``min c'x`` subject to ``F_k(x) = F_k0 + sum_i x_i F_ki >= 0``.
 
 Conic solvers spend their time on one large sparse matrix for all cones. The problems of this package have few variables
 and small, dense matrices. There the Newton step of the logarithmic barrier
@@ -87,14 +87,12 @@ def minimise(
     blocks: Sequence[Block],
     start: Array,
     *,
-    Q: Array | None = None,
     rtol: float = 1e-5,
     time_limit_s: float = 20.0,
     box: float = 1e6,
 ) -> Outcome:
     """Minimise over the matrix inequalities."""
-    n, end = len(c), time.perf_counter() + time_limit_s
-    programme = _Programme(c, np.zeros((n, n)) if Q is None else Q, blocks, np.full(n, box), end)
+    programme = _Programme(c, blocks, np.full(len(c), box), time.perf_counter() + time_limit_s)
     if not programme.holds(start):
         feasible = _find_feasible(programme, start)
         if feasible.x is None:
@@ -113,9 +111,7 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     worst = max(-float(np.linalg.eigvalsh(block.at(start)).min()) for block in programme.blocks)
     inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
     point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
-    extended = _Programme(
-        goal, np.zeros((n + 1, n + 1)), lifted, np.append(programme.box, 10 * point[n]), programme.end
-    )
+    extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]), programme.end)
     outcome = _follow(extended, point, 1e-9, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
         return replace(outcome, x=outcome.x[:n])
@@ -135,9 +131,8 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
             ending = Ending.TIME
             break
         try:
-            slope = programme.c + programme.Q @ x
             gradient, hessian, roots = programme.derivatives(x)
-            gradient, hessian = slope / mu + gradient, programme.Q / mu + hessian
+            gradient = programme.c / mu + gradient
             direction = -_solve(hessian, gradient)
         except np.linalg.LinAlgError:
             break
@@ -150,8 +145,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         here, proven = programme.value(x), np.isfinite(stop_below) and lower > stop_below
         if proven or here - lower <= rtol * max(abs(here), 1e-12) or (here < stop_below - 1e-7 and decrement < 1):
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
-        curvature = float(direction @ programme.Q @ direction)
-        step = _line_search(float(slope @ direction) / mu, curvature / mu, eigenvalues)
+        step = _line_search(float(programme.c @ direction) / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
         if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
             break
@@ -162,10 +156,9 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
 
 @dataclass(frozen=True, eq=False)
 class _Programme:
-    """``min c'x + x'Qx/2`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
+    """``min c'x`` subject to the blocks and ``|x_i| <= box_i``, until a time of the performance counter."""
 
     c: Array
-    Q: Array
     blocks: Sequence[Block]
     box: Array
     end: float
@@ -177,7 +170,7 @@ class _Programme:
 
     def value(self, x: Array) -> float:
         """Objective."""
-        return float(self.c @ x + x @ self.Q @ x / 2)
+        return float(self.c @ x)
 
     def holds(self, x: Array) -> bool:
         """Whether a point satisfies all inequalities."""
@@ -220,14 +213,14 @@ def _solve(hessian: Array, gradient: Array) -> Array:
     return direction * scale
 
 
-def _line_search(slope: float, curvature: float, eigenvalues: Array) -> float:
-    """Minimise ``slope t + curvature t^2/2 - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
+def _line_search(slope: float, eigenvalues: Array) -> float:
+    """Minimise ``slope t - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
     lowest = float(eigenvalues.min(initial=0.0))
     limit = np.inf if lowest >= 0 else -1 / lowest
     low, high, t = 0.0, limit, min(1.0, 0.9 * limit)
     for _ in range(50):
         ratio = eigenvalues / (1 + t * eigenvalues)
-        first, second = slope + curvature * t - ratio.sum(), curvature + ratio @ ratio
+        first, second = slope - ratio.sum(), ratio @ ratio
         low, high = (low, t) if first > 0 else (t, high)
         step = t - first / second
         t_new = step if low < step < high else (low + min(high, 4 * low + 1)) / 2

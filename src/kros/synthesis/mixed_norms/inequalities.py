@@ -57,11 +57,6 @@ class Balanced:
     controls: Array
     measurements: Array
 
-    def inside(self, K: StateSpace) -> StateSpace:
-        """Return the controller of the balanced plant for one of the original."""
-        c, m = self.controls[:, None], self.measurements
-        return StateSpace(K.A, K.B * m, K.C / c, K.D * m / c, K.dt)
-
     def controller(self, K: StateSpace) -> StateSpace:
         """Return the controller of the original plant."""
         c, m = self.controls[:, None], self.measurements

@@ -4,11 +4,11 @@ Where the H2 optimum of channel 1 meets the constraint, it is the optimum. Elsew
 Lyapunov matrix for both channels give controllers. They bound ``||T11||_2`` from above, often by far. The scaling of
 channel 2, ``w2 -> a w2`` and ``z2 -> z2 / a``, leaves the problem as it is and changes that bound, so that several are
 tried: an impulse of w1 must not leave more energy in z2 than gamma squared, so a is a few times ``||T21||_2 / gamma``.
-The best controllers are improved locally, and a lower bound says how far the optimum can be.
+The H2 optimum without the constraint is a lower bound.
 
 *Observers* (37)-(39). In the paper's problem T11 does not depend on the uncertainty and T22 not on K: the exact optimum
 is "no correction". What makes the published gain useful is the common Lyapunov matrix, which adds the response to w2 to
-the cost. So nothing is improved here or searched over scalings, which would only remove the correction. The published
+the cost. So scalings are not searched here, which would only remove the correction. The published
 problem has ``W_R = W_u = 1``: channel 2 is scaled until the response from the inputs to z2, which K does not influence,
 has a gain of one.
 """
@@ -23,27 +23,26 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from ...core.errors import ConfigError, KrosError, SynthesisError
+from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
-from ...core.norms import h2_norm, hinf_norm
-from ..assumptions import require, require_plant
+from ...core.norms import gramian_root, h2_norm, hinf_norm
+from ..assumptions import h2_violations, require, require_plant
 from ..generalized_plant import GeneralizedPlant
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import mixed_plant
-from ..reduction import truncate
 from ..result import Status, Synthesis, enclosed
 from ..riccati.equations import absorb_feedthrough
 from ..riccati.h2 import h2
-from ..riccati.hinf import proven_bound
+from ..riccati.hinf import hinf
+from ..riccati.hinf_level import scale
+from ..riccati.parrott import frequency_bound
 from ..worst_case.certificate import certified
 from .barrier import Ending, minimise
-from .improvement import improved
 from .inequalities import MixedInequalities, balance
-from .lower_bounds import mixed_lower_bound
 
 _ACCURACY = 1e-4  # of the inequalities' optimum, relative
+_NEGLIGIBLE = 1e-10  # Hankel singular values below this share of the largest are rounding
 _SCALINGS = (2.0, 4.0, 8.0)  # of channel 2, times the least that the inequalities allow around the H2 optimum
-_IMPROVED = 2  # candidates that are improved
-_BOUND_S = 3.0  # at most for the lower bound
 
 
 def mixed(
@@ -99,7 +98,7 @@ def mixed(
 
 
 def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:
-    """Return the H2 optimum where it meets the constraint, else the best controller of inequalities and improvement."""
+    """Return the H2 optimum where it meets the constraint, else the best controller of the inequalities."""
     end = time.perf_counter() + time_limit_s
     require_plant(plant, "Mixed synthesis")
     if plant.dt == 0 or not plant.sizes[0]:
@@ -111,25 +110,25 @@ def _for_plant(plant: GeneralizedPlant, gamma: float, max_states: int, time_limi
         note = "The H2 optimum meets the constraint: it is the optimum of the mixed problem."
         return replace(free, method="mixed", hinf_norm=peak, notes=(note,))
     two = plant.uncertainty
-    least = proven_bound(two, max(peak, 2 * gamma)) if two.D11.size else 0.0
+    least = _least(two) if two.D11.size else 0.0
     if least >= gamma:
         raise _infeasible(gamma, least)
     bare = replace(plant, D22=np.zeros_like(plant.D22))
     cross = h2_norm(plant.channel(plant.rows(2), plant.columns(1)).close(free.controller)) / gamma or 1.0
     plants = [scaled(bare, scaling * cross) for scaling in _SCALINGS]
     candidates = _candidates(plants, gamma, max_states, end)
-    candidates += _improved(bare, candidates, gamma, end)
-    result = min(candidates, key=_cost)
-    proven, left = free.lower_bound or 0.0, end - time.perf_counter()
-    if _cost(result) > 1.01 * proven and left > 0:
-        proven = max(proven, mixed_lower_bound(bare, gamma, _cost(result), min(left, _BOUND_S)))
-    lower, gap, notes = enclosed(_cost(result), proven)
+    norms = [candidate.h2_norm or 0.0 for candidate in candidates]
+    result = candidates[int(np.argmin(norms))]
+    lower, gap, notes = enclosed(min(norms), free.lower_bound)
     controller = absorb_feedthrough(result.controller, plant.D22)
     return replace(result, controller=controller, lower_bound=lower, gap_percent=gap, notes=(*result.notes, *notes))
 
 
-def _cost(candidate: Synthesis) -> float:
-    return np.inf if candidate.h2_norm is None else candidate.h2_norm
+def _least(plant: GeneralizedPlant) -> float:
+    """Return an H-infinity norm that no controller is below; of a singular plant what single frequencies prove."""
+    if h2_violations(plant, proper=False):
+        return frequency_bound(scale(plant))
+    return hinf(plant).lower_bound or 0.0
 
 
 def _candidates(plants: list[GeneralizedPlant], gamma: float, max_states: int, end: float) -> list[Synthesis]:
@@ -143,23 +142,6 @@ def _candidates(plants: list[GeneralizedPlant], gamma: float, max_states: int, e
     if not results:
         raise SynthesisError(" ".join(dict.fromkeys(reasons)))
     return results
-
-
-def _improved(plant: GeneralizedPlant, candidates: list[Synthesis], gamma: float, end: float) -> list[Synthesis]:
-    """Best candidates after local improvement in balanced coordinates."""
-    balanced, better = balance(plant), []
-    for candidate in sorted(candidates, key=_cost)[:_IMPROVED]:
-        left = end - time.perf_counter()
-        if left <= 0:
-            break
-        K = improved(balanced.plant, balanced.inside(candidate.controller), gamma, left / 2)
-        try:
-            result = verify(plant, balanced.controller(K), gamma, "raise the time limit")
-        except SynthesisError:  # by rounding; the candidate itself stays
-            continue
-        notes = (*candidate.notes, "The controller was improved locally.")
-        better.append(replace(result, status=candidate.status, notes=notes))
-    return better
 
 
 def _for_observer(problem: ObserverProblem, gamma: float, max_states: int, time_limit_s: float) -> Synthesis:
@@ -242,6 +224,15 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
     states = f"Inequalities on {small.sizes[0]} of {plant.sizes[0]} states"
     note = f"{states} (discarded Hankel singular values sum to {tail:.2g} of the largest); verified on all."
     return small.transformed(y=np.diag(noise)), (note,)
+
+
+def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:
+    """Balanced truncation of a stable plant, and the sum of the discarded Hankel singular values over the largest."""
+    B, C = np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2])
+    roots = gramian_root(plant.A, B, plant.dt), gramian_root(plant.A.T, C.T, plant.dt)
+    left, right, values = balancing(*roots, _NEGLIGIBLE)
+    k = min(n_states, len(values))
+    return plant.transformed(x=(left[:k], right[:, :k])), float(values[k:].sum() / values[0])
 
 
 def _infeasible(gamma: float, least: float) -> SynthesisError:

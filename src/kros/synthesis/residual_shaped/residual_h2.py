@@ -15,7 +15,6 @@ mean spectrum it minimises the mean square error over the units.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -27,15 +26,12 @@ from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.filter_bound import predictor_bound
-from ..riccati.kalman import kalman
+from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
 
-# Of shaping filters that are tried, in samples: delays alone, and lags for disturbances that last up to 300 samples.
-BASES = (Basis(8), Basis(4, (0.8, 0.95, 0.98)), Basis(8, (0.95, 0.98)), Basis(8, (0.9, 0.97, 0.99, 0.997)))
 _NEGLIGIBLE = 1e-12
 
 
@@ -82,7 +78,7 @@ class ResidualProblem:
 
 def residual_h2(
     problem: ResidualProblem,
-    bases: Sequence[Basis] = BASES,
+    basis: Basis | None = None,
     tolerance_percent: float = 1.0,
     n_lifted: int | None = None,
     max_order: int | None = None,
@@ -92,9 +88,8 @@ def residual_h2(
     Parameters
     ----------
     problem : ResidualProblem
-    bases : sequence of Basis
-        Bases of the shaping filter that are tried: the one with the least error under the spectra as they were measured
-        is kept. A lag with a pole near one is a disturbance state, for loads.
+    basis : Basis, optional
+        Delays and lags of the shaping filter. A lag with a pole near one is a disturbance state, for loads.
     tolerance_percent : float
         What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not
         measured; 0 keeps every state of the filter.
@@ -127,7 +122,7 @@ def residual_h2(
     (True, True)
     """
     start = time.perf_counter()
-    shaped = min((problem.scaled(basis) for basis in bases), key=_Scaled.promise)
+    shaped = problem.scaled(basis or Basis())
     full = shaped.filter()
     K = shaped.correction(full)
     if not np.isfinite(shaped.norm(full, K)):
@@ -158,7 +153,7 @@ def residual_h2(
 
 def promised_errors(problem: ResidualProblem) -> Array:
     """Return the RMS error of every state, a share of its largest value, on the spectra as measured."""
-    shaped = problem.scaled(BASES[1])
+    shaped = problem.scaled(Basis())
     try:
         K = shaped.correction(shaped.filter())
     except SynthesisError:
@@ -186,13 +181,12 @@ class _Scaled:
         A = np.block([[self.A, shaping.C], [np.zeros((shaping.n_states, len(self.A))), shaping.A]])
         return A, np.vstack([shaping.D, shaping.B]), np.hstack([self.C, np.zeros((len(self.C), shaping.n_states))])
 
-    def lower_bound(self, shaping: StateSpace) -> float | None:
-        """Root mean square of the scaled error that no correction falls below; None where none is proven."""
+    def lower_bound(self, shaping: StateSpace) -> float:
+        """Root mean square of the scaled error that no correction falls below."""
         A, G, C = self.shaped(shaping)
         (n, k), q = G.shape, len(C)
         B, D = np.hstack([G, np.zeros((n, q))]), np.hstack([np.zeros((q, k)), np.diag(self.noise)])
-        squared = predictor_bound(A, B, C, D, np.eye(len(self.A), n))
-        return None if squared is None else float(np.sqrt(squared))
+        return float(np.sqrt(predictor_bound(A, B, C, D, np.eye(len(self.A), n))))
 
     def correction(self, shaping: StateSpace) -> StateSpace:
         """Kalman gains of plant and shaping filter as a correction filter."""
@@ -248,10 +242,6 @@ class _Scaled:
         drive, rest = response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real
         return np.asarray(driven + np.einsum("f,fia->i", weight, np.abs(rest) ** 2))
-
-    def promise(self) -> float:
-        """Sum of logarithms of the hidden states' mean square errors on the spectra as measured."""
-        return float(np.log(self.unit_errors(self.correction(self.filter())).mean(axis=0)[self.hidden]).sum())
 
     def reduced(self, shaping: StateSpace, K: StateSpace, tolerance_percent: float, most: int) -> StateSpace:
         """Correction filter of the lowest order within the tolerance, by bisection over balanced truncations."""

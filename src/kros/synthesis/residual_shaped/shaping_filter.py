@@ -38,7 +38,8 @@ class Basis:
     """Delays and first-order lags of every channel."""
 
     delays: int = 8
-    poles: tuple[float, ...] = ()  # Poles of the lags, inside the unit circle, each one once
+    # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
+    poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
 
     def __post_init__(self) -> None:
         if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):

@@ -23,11 +23,8 @@ K. Zhou, J. C. Doyle, K. Glover, *Robust and Optimal Control*, sections 14.5 and
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
@@ -36,8 +33,6 @@ from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis
 from .equations import absorb_feedthrough, solve_riccati
-
-Array = npt.NDArray[Any]
 
 _AGREEMENT, _ROUNDING = 1e-4, 1e-12  # of the norm with its promise, and of a sum with its terms
 
@@ -71,8 +66,8 @@ def h2(plant: GeneralizedPlant) -> Synthesis:
     """
     require(plant, "H2 synthesis")
     start = time.perf_counter()
-    gains = Gains.of(plant, "H2 synthesis")
-    K, (promised, rounding) = absorb_feedthrough(gains.controller(plant), plant.D22), gains.norm(plant)
+    K, promised, rounding = _optimum(plant)
+    K = absorb_feedthrough(K, plant.D22)
     elapsed = time.perf_counter() - start
     closed = plant.close(K)
     norm = h2_norm(closed)
@@ -96,44 +91,24 @@ def h2(plant: GeneralizedPlant) -> Synthesis:
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Gains:
-    """The optimal gains of a plant, D22 = 0, and what they are made from; see the symbols above."""
-
-    X: Array
-    Y: Array
-    R_b: Array
-    S_y: Array
-    F: Array
-    F0: Array
-    L: Array
-    L0: Array
-
-    @classmethod
-    def of(cls, p: GeneralizedPlant, method: str) -> Gains:
-        """Solve both Riccati equations."""
-        R, S = p.D12.T @ p.D12, p.D21 @ p.D21.T
-        X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, R, p.C1.T @ p.D12, p.dt, f"{method}, control")
-        Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, S, p.B1 @ p.D21.T, p.dt, f"{method}, filter")
-        if p.dt == 0:
-            F = -np.linalg.solve(R, p.B2.T @ X + p.D12.T @ p.C1)
-            L = np.linalg.solve(S, p.C2 @ Y + p.D21 @ p.B1.T).T
-            return cls(X, Y, R, S, F, np.zeros((len(R), p.sizes[1])), L, np.zeros((len(R), len(S))))
+def _optimum(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
+    """Return the optimal controller for D22 = 0, its norm by the Riccati solutions, and the rounding of that norm."""
+    R, S = p.D12.T @ p.D12, p.D21 @ p.D21.T
+    X = solve_riccati(p.A, p.B2, p.C1.T @ p.C1, R, p.C1.T @ p.D12, p.dt, "H2 synthesis, control")
+    Y = solve_riccati(p.A.T, p.C2.T, p.B1 @ p.B1.T, S, p.B1 @ p.D21.T, p.dt, "H2 synthesis, filter")
+    if p.dt == 0:
+        F = -np.linalg.solve(R, p.B2.T @ X + p.D12.T @ p.C1)
+        L = np.linalg.solve(S, p.C2 @ Y + p.D21 @ p.B1.T).T
+        F0, L0 = np.zeros((len(R), p.sizes[1])), np.zeros((len(R), len(S)))
+    else:
         R, S = R + p.B2.T @ X @ p.B2, S + p.C2 @ Y @ p.C2.T
         F = -np.linalg.solve(R, p.B2.T @ X @ p.A + p.D12.T @ p.C1)
         F0 = -np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
         L = np.linalg.solve(S, p.C2 @ Y @ p.A.T + p.D21 @ p.B1.T).T
-        return cls(X, Y, R, S, F, F0, L, np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T)
-
-    def controller(self, p: GeneralizedPlant) -> StateSpace:
-        """Return the optimal controller for D22 = 0."""
-        C = self.F - self.L0 @ p.C2
-        return StateSpace(p.A - self.L @ p.C2 + p.B2 @ C, self.L + p.B2 @ self.L0, C, self.L0, p.dt)
-
-    def norm(self, p: GeneralizedPlant) -> tuple[float, float]:
-        """Return the norm that the solutions promise, and how far rounding may be from it: the terms may cancel."""
-        F, F0, R = self.F, self.F0, self.R_b
-        terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ self.X @ p.B1), -np.trace(F0.T @ R @ F0)]  # of full information
-        terms += [np.trace(R @ (F @ self.Y @ F.T + F0 @ F0.T)), -np.trace(R @ self.L0 @ self.S_y @ self.L0.T)]
-        squared, rounding = sum(terms), _ROUNDING * sum(abs(term) for term in terms)
-        return float(np.sqrt(max(squared, 0.0))), float(np.sqrt(rounding))
+        L0 = np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
+    C = F - L0 @ p.C2
+    K = StateSpace(p.A - L @ p.C2 + p.B2 @ C, L + p.B2 @ L0, C, L0, p.dt)
+    terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1), -np.trace(F0.T @ R @ F0)]  # of full information
+    terms += [np.trace(R @ (F @ Y @ F.T + F0 @ F0.T)), -np.trace(R @ L0 @ S @ L0.T)]
+    rounding = _ROUNDING * sum(abs(term) for term in terms)  # the terms may cancel
+    return K, float(np.sqrt(max(sum(terms), 0.0))), float(np.sqrt(rounding))

@@ -1,12 +1,13 @@
-r"""H-infinity synthesis: one search over levels, each with a controller, a proof that it is out of reach, or both.
+r"""H-infinity synthesis: one search over levels, each with a controller or the condition that fails.
 
-    plant --> frame --> level --> two Hamiltonian matrices --> central controller --> closed loop --> upper end
+    plant --> frame --> level --> two Riccati equations --> central controller --> closed loop --> upper end
                           ^                 |
-                          |                 +--> signals without influence of a controller ---------> lower end
-                          +-------------------------------- next level <------------------------------+
+                          |                 +--> conditions clearly fail ---------------------------> lower end
+                          +----------------------------- next level <---------------------------------+
 
-What is attained is always a norm that was computed from a closed loop, what is out of reach is proven by signals on
-which no controller has an influence. A level for which the equations give no controller proves nothing.
+What is attained is always a norm that was computed from a closed loop. Out of reach is what signals of one frequency
+prove (`parrott`), or a level whose necessary conditions fail by more than rounding. A level for which the equations
+have no solution proves nothing.
 
 Symbols
 -------
@@ -17,26 +18,20 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
-from ..assumptions import h2_violations, require
+from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
-from ..result import Status, Synthesis
-from .h2 import h2
-from .hinf_bound import level_bound, pointwise_bound
-from .hinf_level import Frame, scale
+from ..result import Status, Synthesis, enclosed
+from .hinf_level import Frame
+from .parrott import frequency_bound
 
-_STEPS = 60
-_ROUNDING = 1e-5
-_NEGLIGIBLE = 1e-9  # share of the norm without control below which the optimum is zero
-_BOUNDARY = 1e-9  # distance from the stability boundary, relative, that rounding decides
+_ROUNDING = 1e-9  # relative: of a norm beside that without control, and of a pole's distance from the boundary
 
 
 def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
@@ -56,9 +51,9 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     Returns
     -------
     Synthesis
-        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level that was proven to be out
-        of reach of every controller, by a proof that tolerates rounding, and ``gap_percent`` the distance. The status
-        is OPTIMAL when they agree within the tolerance, otherwise CERTIFIED: a better controller may exist.
+        ``hinf_norm`` is recomputed from the closed loop; ``lower_bound`` is the largest level whose necessary
+        conditions fail by more than rounding, and ``gap_percent`` the distance. The status is OPTIMAL when they agree
+        within the tolerance, otherwise CERTIFIED: a better controller may exist.
 
     Raises
     ------
@@ -81,7 +76,7 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
     idle = _closed(plant, gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt))
-    negligible = _NEGLIGIBLE * idle.norm if np.isfinite(idle.norm) else 0.0
+    negligible = _ROUNDING * idle.norm if np.isfinite(idle.norm) else 0.0
     trivial = 0 in plant.sizes[2::2]
     best, lower = (idle, idle.norm) if trivial else _search(Frame.of(plant), idle, tolerance, negligible)
     lower = 0.0 if best.norm <= negligible else lower
@@ -99,98 +94,62 @@ class _Loop:
 
 def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
     """Close the loop; what a controller is worth is its norm, whatever the equations promise."""
+    if K is None:
+        return _Loop(None)
     try:
-        if K is None:
-            return _Loop(None)
         closed = plant.close(K)
-        limit = 1.0 if closed.dt > 0 else 0.0
-        size = 1.0 if closed.dt > 0 else float(np.abs(closed.poles()).max(initial=1.0))
-        stable = closed.largest_pole() < limit - _BOUNDARY * size
-        return _Loop(K, hinf_norm(closed)) if stable else _Loop(None)
+        limit, size = (1.0, 1.0) if closed.dt > 0 else (0.0, float(np.abs(closed.poles()).max(initial=1.0)))
+        return _Loop(K, hinf_norm(closed)) if closed.largest_pole() < limit - _ROUNDING * size else _Loop(None)
     except (KrosError, np.linalg.LinAlgError):
         return _Loop(None)
 
 
-def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float) -> tuple[_Loop, float]:
-    """Return the best loop and the largest level that is proven to be out of reach."""
-    best = min(idle, _closed(frame.given, _h2_controller(frame.given)), key=lambda loop: loop.norm)
-    lower = low = pointwise_bound(frame.scaled)
-    level = best.norm * (1 - tolerance / 2) if np.isfinite(best.norm) else 2 * max(lower, 1e-3)
-    for _ in range(_STEPS):
-        trial, proven = _attempt(frame, level)
-        lower = max(lower, proven)
-        # A norm below what is proven to be out of reach is that of a loop whose rounding is larger than the tolerance.
-        if lower <= trial.norm * (1 + _ROUNDING):
-            best = min(best, trial, key=lambda loop: loop.norm)
-        low = max(low, lower, level if level < (1 - tolerance) * best.norm and level * (1 + 1e-6) < trial.norm else 0.0)
-        if best.norm <= max(lower * (1 + tolerance), low * (1 + tolerance / 4), negligible):
+def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float, steps: int = 60) -> tuple[_Loop, float]:
+    """Return the best loop and the largest level that is out of reach, by bisection of the levels between them."""
+    best, proven = idle, frequency_bound(frame.scaled)
+    lower = low = proven
+    level, high = max(2 * proven, 1.0), best.norm
+    for _ in range(steps):
+        if best.norm <= max(lower * (1 + tolerance), negligible) or high <= low * (1 + tolerance / 8):
             break
-        # Where the bound is tight this level ends the search, with a calmer controller than that of the optimum.
-        level = lower * (1 + 0.9 * tolerance) if np.isfinite(best.norm) else 4 * level
-        if low >= level:
-            bottom = max(low, _NEGLIGIBLE * best.norm)
-            level = float(np.sqrt(bottom * best.norm)) if best.norm > 2 * bottom else (bottom + best.norm) / 2
-    return best, lower
-
-
-def _attempt(frame: Frame, level: float) -> tuple[_Loop, float]:
-    """Return the closed loop of the level's central controller, and what its signals prove to be out of reach."""
-    try:
-        halves = frame.halves(level)
-    except (np.linalg.LinAlgError, ValueError):
-        return _Loop(None), 0.0
-    return _closed(frame.given, frame.controller(*halves, level)), level_bound(frame, halves)
-
-
-def proven_bound(plant: GeneralizedPlant, level: float) -> float:
-    """Return a norm that no stable loop is below, tight for a regular plant and a level just above the optimum."""
-    best = pointwise_bound(scale(plant))
-    if h2_violations(plant, proper=False):
-        return best
-    frame = Frame.of(plant)
-    return max(best, level_bound(frame, frame.halves(level)))
+        if np.isfinite(high):
+            level = float(np.sqrt(max(low, _ROUNDING * high) * high))
+        K, failed = frame.solve(level)
+        trial = _closed(frame.given, K)
+        best = min(best, trial, key=lambda loop: loop.norm)
+        low, high = (low, min(best.norm, level)) if np.isfinite(trial.norm) else (level, min(high, best.norm))
+        lower = level if failed else lower
+        level *= 4
+    return best, lower if lower <= best.norm else proven  # rounding had its say where levels and norms disagree
 
 
 def _result(plant: GeneralizedPlant, best: _Loop, lower: float, optimal: bool, elapsed: float) -> Synthesis:
     """Recompute the rest; the gap follows from the norm and the bound."""
     if best.K is None:
-        raise SynthesisError(
-            "H-infinity synthesis: no level was attained; scale states, inputs and outputs to similar size, or raise "
-            "noise and penalty."
-        )
-    if lower > best.norm * (1 + _ROUNDING):
-        raise SynthesisError(
-            f"H-infinity synthesis: internal error, the bound {lower:.9g} lies above the norm {best.norm:.9g} that "
-            "is attained; please report the plant."
-        )
-    lower = min(lower, best.norm)
+        remedy = "scale states, inputs and outputs to similar size, or raise noise and penalty"
+        raise SynthesisError(f"H-infinity synthesis: no level was attained; {remedy}.")
+    lower_bound, gap, notes = enclosed(best.norm, lower)
     closed = plant.close(best.K)
     return Synthesis(
         method="hinf",
         controller=best.K,
         status=Status.OPTIMAL if optimal else Status.CERTIFIED,
-        h2_norm=_strict(h2_norm, closed),
+        h2_norm=_h2_norm(closed),
         hinf_norm=best.norm,
-        lower_bound=lower,
-        gap_percent=100 * (best.norm / lower - 1) if lower > 0 else None,
+        lower_bound=lower_bound,
+        gap_percent=gap,
         spectral_radius=closed.largest_pole(),
         solve_s=elapsed,
         solver="riccati",
+        notes=notes,
     )
 
 
-def _h2_controller(plant: GeneralizedPlant) -> StateSpace | None:
-    """H2-optimal controller, for the first upper bound; in continuous time as if D11 were zero."""
-    direct = np.zeros_like(plant.D11) if plant.dt == 0 else plant.D11
-    optimum = _strict(h2, replace(plant, D11=direct))
-    return None if optimum is None else optimum.controller
-
-
-def _strict(function: Callable[[Any], Any], argument: Any) -> Any:
-    """Return a result; None where rounding leaves it without digits, for poles close to the stability boundary."""
+def _h2_norm(closed: StateSpace) -> float | None:
+    """Return the H2 norm; None where rounding leaves it without digits, for poles close to the stability boundary."""
     with warnings.catch_warnings():
         warnings.simplefilter("error", RuntimeWarning)
         try:
-            return function(argument)
-        except (SynthesisError, RuntimeWarning):
+            return h2_norm(closed)
+        except RuntimeWarning:
             return None

@@ -99,3 +99,15 @@ def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> 
     """Gain and covariance of the one-step predictor for noise covariances Q, R and cross covariance S (n, q)."""
     P = solve_riccati(A.T, C.T, Q, R, S, 1.0, method)
     return -discrete_gain(A.T, C.T, R, S, P).T, P
+
+
+def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float:
+    """Return the least ``E |Z (x - x_hat)|^2`` of a predictor of ``x+ = A x + B nu``, ``y = C x + D nu``.
+
+    Zero, which is a bound too, where its Riccati equation has no solution that can be computed.
+    """
+    try:
+        _, P = predictor(A, C, B @ B.T, D @ D.T, B @ D.T, "Lower bound")
+    except SynthesisError:
+        return 0.0
+    return max(float(np.trace(Z @ P @ Z.T)), 0.0)

@@ -6,12 +6,6 @@ resolvent gives for every row
 .. math:: \|c_i^T (R - R_0) B\| \le h \|c_i^T R_0^2 B\| + h^2 \frac{\|c_i^T R_0^2\| \|R_0 B\|}{1 - h \|R_0\|},
           \qquad h \|R_0\| < 1.
 
-One term more is a straight line in z, from which the arc itself departs by ``h^2 / 2`` at most: what is left is of
-second order,
-
-.. math:: \|c_i^T (R - R_0 + (z - z_0) R_0^2) b_j\| \le h^2 |c_i^T R_0^3 b_j|
-          + h^3 \frac{\|c_i^T R_0^2\| \|R_0^2 b_j\|}{1 - h \|R_0\|} .
-
 It holds in all coordinates of the state; those in which white noise gives every state the same size and no correlation
 keep ``R_0`` small. Arcs on which the enclosure is not good enough are halved: no frequency is left out, and no decision
 is made at a point.
@@ -38,7 +32,6 @@ Ratio = Callable[[Array, Array], tuple[Array, Array]]
 _CORRELATED = 1e-10  # regularises the coordinates, in which everything holds whatever they are
 _ROUNDING = 1e-7  # of responses, relative
 _RESOLVENT = 1e-14  # of resolvents, relative, for every state: what counts near a pole
-_ROUNDS = 60
 
 
 class Enclosure:
@@ -67,22 +60,6 @@ class Enclosure:
         distance = h * _size(CR @ RB, -1) + h**2 * tail + lost + _ROUNDING * size
         return response, np.where(reach < 1, distance, np.inf)
 
-    def segments(self, theta: Array, half: Array) -> tuple[Array, Array]:
-        """Return two ends, (k, 2, p, m), and how far every entry is from the segment between them, (k, p, m)."""
-        R = self._resolvent(theta)
-        CR, RB = self._C @ R, R @ self._B
-        middle, slope = CR @ self._B + self.system.D, -CR @ RB
-        z = np.exp(1j * theta)[:, None]
-        ends = middle[:, None] + (z * np.expm1(1j * half[:, None] * [-1, 1]))[..., None, None] * slope[:, None]
-        h, reach = half[:, None, None], (half * _size(R, (-2, -1)))[:, None, None]
-        CR2, R2B = CR @ R, R @ RB
-        bend = np.abs(CR2 @ RB)
-        tail = _size(CR2, -1)[..., None] * _size(R2B, -2)[:, None] / np.where(reach < 1, 1 - reach, 1.0)
-        moved, left = np.abs(slope), (_size(CR, -1) + half[:, None] * _size(CR2, -1))[..., None]
-        lost = self.system.n_states * _RESOLVENT * left * _size(RB, -2)[:, None]
-        distance = h**2 * (moved / 2 + bend + h * tail) + lost + _ROUNDING * (np.abs(middle) + h * moved)
-        return ends, np.where(reach < 1, distance, np.inf)
-
     def _resolvent(self, theta: Array) -> Array:
         return np.linalg.inv(np.expm1(1j * theta)[:, None, None] * np.eye(self.system.n_states) - self._A)
 
@@ -101,14 +78,14 @@ def _even_coordinates(system: StateSpace) -> Array:
     return np.asarray(size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0) + _CORRELATED))
 
 
-def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000) -> Array:
+def least_ratio(ratio: Ratio, edges: Array, rtol: float = 3e-3, max_arcs: int = 20000, rounds: int = 60) -> Array:
     """Return what a ratio of responses nowhere falls below, for every channel."""
     theta, half = (edges[1:] + edges[:-1]) / 2, np.diff(edges) / 2
     proven, seen = ratio(theta, half)
     least = seen.min(axis=0)
     done = np.full_like(least, np.inf)
     tried = len(theta)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         least = np.minimum(least, seen.min(axis=0, initial=np.inf))
         loose = (proven < (1 - rtol) * least).any(axis=1)
         done = np.minimum(done, proven[~loose].min(axis=0, initial=np.inf))

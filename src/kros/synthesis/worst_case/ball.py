@@ -134,10 +134,6 @@ def polar(matrix: Array) -> Array:
     return U @ Vh
 
 
-_SWEEPS = 10
-_STEPS = 4
-
-
 def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     """Upper bound of ``max ||a + P Theta Q||_F`` over contractions, shape (f,)."""
     U, s, _ = np.linalg.svd(P, full_matrices=False)
@@ -167,7 +163,7 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
     return g[..., :rows], np.maximum(s**2 * q**2 - g, 0.0)[..., :columns]
 
 
-def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array, Array]:
+def _descended(c: Array, d: Array, g: Array, multipliers: Array, sweeps: int = 10) -> tuple[Array, Array]:
     """Return better multipliers of rows and columns, by turns.
 
     With frequencies last, where sums over few entries are those of long vectors.
@@ -175,18 +171,18 @@ def _descended(c: Array, d: Array, g: Array, multipliers: Array) -> tuple[Array,
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
-    for _ in range(_SWEEPS):
+    for _ in range(sweeps):
         rows = _best_rows(c, columns - d)
         columns = _best_rows(c_columns, rows - d_columns)
     return np.moveaxis(rows, 0, -1), np.moveaxis(columns, 0, -1)
 
 
-def _best_rows(c: Array, shift: Array) -> Array:
+def _best_rows(c: Array, shift: Array, steps: int = 4) -> Array:
     """Minimise ``x + sum_j c_ij / (x + shift_ij)`` over ``x >= 0``, ``x + shift_ij >= 0``, for every row i."""
     least = np.maximum(np.max(-shift, axis=1), 0.0)
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
-    for _ in range(_STEPS):
+    for _ in range(steps):
         inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
         terms = c * inverse * inverse
         h = np.maximum(terms.sum(axis=1), 1e-300)

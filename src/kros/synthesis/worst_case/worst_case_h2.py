@@ -20,7 +20,7 @@ input injection, the H2 controller of the whole plant is taken.
 worst element, at all frequencies
 (`everywhere`), gives an error that no observer beats: state injection contains input injection (``K_state = B
 K_input``), and an observer's ``W_p x_hat`` is one of the causal estimates of ``W_p x`` over which a predictor is the
-best. It is proven by `riccati.filter_bound`.
+best. It is the optimum of a Riccati equation.
 """
 
 from __future__ import annotations
@@ -38,9 +38,8 @@ from ...core.lti import StateSpace, gain
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import penalise, shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.filter_bound import predictor_bound
 from ..riccati.h2 import h2
-from ..riccati.kalman import predictor
+from ..riccati.kalman import predictor, predictor_bound
 from .certificate import certified
 from .disturbance import Channels, Fit, Shaping, design_grid, symmetric
 from .everywhere import Everywhere
@@ -61,7 +60,7 @@ def worst_case_h2(
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
     fit : callable, optional
-        ``fit(freqs_hz, magnitude, dt, order=, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
+        ``fit(freqs_hz, magnitude, dt, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
         default `kros.uncertainty.fit_magnitude`.
     bounded : bool
         False: only the design, neither certified nor bounded from below, for those who design many and compare them on
@@ -95,7 +94,7 @@ def worst_case_h2(
 
         fit = fit_magnitude
     channels = Channels(problem, design_grid(problem))
-    order = {"order": None, "max_order": max_order, "tolerance_db": tolerance_db}
+    order = {"max_order": max_order, "tolerance_db": tolerance_db}
     shaping = channels.shaping(channels.average(), partial(fit, **order), "above")
     start = time.perf_counter()
     controller = design(problem, shaping)
@@ -147,8 +146,10 @@ def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
     orders, bounds = sorted({min(order, max_order) for order in _BOUND_ORDERS}), []
     for order, spectrum in product(orders, spectra):
-        shaping = proofs.lowered(apart.shaping(spectrum, partial(fit, order=order), "below"), spectrum)
+        shaping = proofs.lowered(
+            apart.shaping(spectrum, partial(fit, max_order=order, tolerance_db=0.0), "below"), spectrum
+        )
         plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
-        squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1) or 0.0
+        squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1)
         bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))
     return [bound for bound in bounds if bound > 0]

@@ -3,8 +3,8 @@
 responses (unit, frequency, p, m) --residuals from every nominal--> scaled to typical entries of one --sigma_max,
 smoothed--> levels in dB
 
-Entries are scaled by their typical size over all pairs (Sinkhorn scaling of the median squared magnitudes), so that
-every row and column of the residual counts alike, at every frequency by itself.
+Entries are scaled by their typical size over all pairs, frequency by frequency (Sinkhorn scaling of the median squared
+magnitudes), so that every row and column of the residual counts alike.
 """
 
 from __future__ import annotations
@@ -40,26 +40,26 @@ class Distances:
 
 def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     """Return the distances of all units, shape (unit, frequency, p, m), in scaled coordinates."""
-    G = responses
-    nominals = _nominals(G)
-    own = nominals[:, None] == np.arange(len(G))
-    step = max(1, OUTLIER.at_once // (len(nominals) * len(G) * max(G.shape[2:]) ** 2))
-    sigma, left, right = [], [], []
-    for start in range(0, G.shape[1], step):
-        part = G[:, start : start + step]
-        E = np.stack([residual(form, part[k], part) for k in nominals])  # (nominal, unit, frequency, p', m')
-        E[_same(part, nominals)] = 0.0
-        squares = squared(E[~own])
-        middle = np.median(squares, axis=0)
-        equal = middle.max(axis=(1, 2)) == 0  # most pairs are
-        middle[equal] = squares[:, equal].mean(axis=0)
-        scales = typical(middle)
-        sigma.append(sigma_max_first(entries_first(E / scales[0][:, :, None] / scales[1][:, None, :])))
-        left.append(scales[0])
-        right.append(scales[1])
+    nominals = _nominals(responses)
+    itself = nominals[:, None] == np.arange(len(responses))
+    step = max(1, OUTLIER.at_once // (itself.size * max(responses.shape[2:]) ** 2))
+    parts = [responses[:, k : k + step] for k in range(0, responses.shape[1], step)]
+    sigma, left, right = zip(*(_scaled(form, part, nominals, itself) for part in parts), strict=True)
     level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), OUTLIER.least)), freqs_hz)
-    level[own] = np.nan
-    return Distances(nominals, level.max(axis=2), _median(level, own), np.concatenate(left), np.concatenate(right))
+    level[itself] = np.nan
+    return Distances(nominals, level.max(axis=2), _median(level, itself), np.concatenate(left), np.concatenate(right))
+
+
+def _scaled(form: Form, G: Array, nominals: Array, itself: Array) -> tuple[Array, Array, Array]:
+    """Return singular values (nominal, unit, frequency) of residuals in units of their typical entries, and these."""
+    E = np.stack([residual(form, G[k], G) for k in nominals])  # (nominal, unit, frequency, p', m')
+    E[_same(G, nominals)] = 0.0
+    squares = squared(E[~itself])
+    middle = np.median(squares, axis=0)
+    equal = middle.max(axis=(1, 2)) == 0  # most pairs are
+    middle[equal] = squares[:, equal].mean(axis=0)
+    left, right = typical(middle)
+    return sigma_max_first(entries_first(E / left[:, :, None] / right[:, None, :])), left, right
 
 
 def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances, freqs_hz: Array) -> Array:
@@ -68,22 +68,12 @@ def scaled_levels(form: Form, nominal: Array, perturbed: Array, found: Distances
     return _smooth(20 * np.log10(np.maximum(sigma_max_first(entries_first(E)), OUTLIER.least)), freqs_hz)
 
 
-def largest_entries(form: Form, responses: Array, found: Distances, units: Array, rows: Array) -> list[tuple[int, int]]:
-    """Return the entries of units' residuals that are largest for their typical size, each at its own frequency."""
-    nominal, perturbed = responses[found.nominals[:, None], rows], responses[units, rows]
-    size = np.abs(residual(form, nominal, perturbed[None]))
-    scaled = size / found.left[rows][:, :, None] / found.right[rows][:, None, :]
-    middle = _median(scaled, found.nominals[:, None] == units)
-    entries = [np.unravel_index(int(np.argmax(m)), m.shape) for m in middle]
-    return [(int(i), int(j)) for i, j in entries]
-
-
 def typical(squares: Array) -> tuple[Array, Array]:
     """Return left and right scales that bring squared entries to equal row and column sums."""
     row = squares.max(axis=2, keepdims=True)
-    row[row <= 0] = 1.0
+    row = np.where(row > 0, row, 1.0)
     column = (squares / row).max(axis=1, keepdims=True)
-    column[column <= 0] = 1.0
+    column = np.where(column > 0, column, 1.0)
     weights = np.maximum(squares / row / column, OUTLIER.smallest)
     left, right = np.ones(weights.shape[:2]), np.ones((weights.shape[0], weights.shape[2]))
     for _ in range(OUTLIER.balancings):
@@ -111,16 +101,17 @@ def _nominals(G: Array) -> Array:
 def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
-    return np.stack([np.abs(G - G[k]).max(axis=(2, 3)) <= OUTLIER.equal * np.maximum(size, size[k]) for k in nominals])
+    return np.stack(
+        [np.abs(G - G[k]).max(axis=(2, 3)) <= OUTLIER.smallest * np.maximum(size, size[k]) for k in nominals]
+    )
 
 
-def _median(values: Array, own: npt.NDArray[np.bool_]) -> Array:
-    """Median over the nominals, shape (unit, ...), a unit's own left out."""
-    ordered = values.copy()
-    ordered[own] = np.inf
+def _median(values: Array, itself: Array) -> Array:
+    """Median over the nominals, shape (unit, ...), the unit itself left out."""
+    ordered = np.where(itself[..., None], np.inf, values)
     ordered.sort(axis=0)
-    last = len(own) - own.sum(axis=0)  # number of nominals of each unit
-    units = np.arange(own.shape[1])
+    last = len(itself) - itself.sum(axis=0)  # number of nominals of each unit
+    units = np.arange(itself.shape[1])
     return np.asarray((ordered[(last - 1) // 2, units] + ordered[last // 2, units]) / 2)
 
 

@@ -8,16 +8,14 @@ the largest of the others:
     level_i(f) = smooth median_(k != i) sigma_max(D_l^-1 E(G_k, G_i) D_r^-1)
     excess_i   = max_f level_i(f) - max_(k != i) max_f level_k(f),    dB
 
-No single nominal decides, and the nominal of the study has a score like any other unit. Beside it the excess is
-computed with every unit as the only nominal, as the paper states its criterion: the range over the nominals, and the
-share of them under which the unit is conspicuous.
+No single nominal decides; beside the excess stands its range over every unit as the only nominal, as the paper states
+its criterion.
 
 Some unit always exceeds the others, and without a model no threshold can hold a rate below 1 / (N + 1). The threshold
 rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
-extrapolation, and labelled as such. Units are taken out one at a time while they are beyond (`separation`), up to a
-third of the units. Fewer than eight units flag nothing and decide nothing; two units are refused. All this compares
-estimates that are equally good: units that were recorded for too little are told apart before (`recorded`). What a
-score would have shown stands beside it (`scoring`, `score`).
+extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
+units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
+recorded for too little are left open before (`recorded`). What a score would have shown stands beside it (`score`).
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,13 +34,14 @@ from ...core.errors import ConfigError, DataError, DimensionError
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
 from ..settings import OUTLIER
-from .distances import Distances, balance, distances, largest_entries, scaled_levels
-from .score import OutlierScore, Status
-from .tail import Flags, excesses, margins, separate
+from .distances import Distances, balance, distances, scaled_levels
+from .score import Comparison, OutlierScore, Status
+from .tail import LEAST_SCORES, margins, separate
 
 Array = npt.NDArray[Any]
 
 _ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
+_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate", "extrapolated")
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +70,9 @@ class OutlierModel:
     --------
     >>> import numpy as np
     >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> model = score_outliers(responses[:, :, None, None], freqs_hz)
-    >>> model.score("new", 1.5 * responses[0][:, None, None]).outlier
+    >>> gains = 1 + 0.02 * np.random.default_rng(0).normal(size=(20, 1, 1, 1))
+    >>> responses = gains / (1 + 1j * np.geomspace(0.1, 40, 20)[:, None, None])
+    >>> score_outliers(responses, np.geomspace(0.1, 40, 20)).score("new", 1.5 * responses[0]).outlier
     True
     """
 
@@ -93,30 +90,13 @@ class OutlierModel:
     def score(
         self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
     ) -> OutlierScore:
-        """Score a new unit.
+        """Score a new unit by its response (frequency, p, m) at `freqs_hz`, in physical units.
 
-        Parameters
-        ----------
-        unit : str
-        response : array_like, shape (frequency, p, m), complex
-            At `freqs_hz`, in physical units.
-        without : collection of str
-            Inliers that are not compared with, such as the unit itself.
-        motion_db : ndarray, shape (frequency,), dB, optional
-            Level by which responses of one unit differ between motions (`motion_levels`), where the unit was moved
-            otherwise than the inliers: it is taken from the unit's levels, in amplitude, and a unit that is beyond its
-            bound without this alone has the status ``other motions``.
-
-        Returns
-        -------
-        OutlierScore
-
-        Raises
-        ------
-        DimensionError
-            When the response does not have the shape of the population's.
-        DataError
-            When it is not finite, or fewer than two inliers are left.
+        Inliers that are named in `without`, such as the unit itself, are not compared with. Where the unit was moved
+        otherwise than the inliers, the level by which responses of one unit differ between motions, `motion_levels`, is
+        taken from the unit's levels, in amplitude: a unit that is beyond its bound without this alone has the status
+        ``other motions``. Raises a `DimensionError` or `DataError` for a response that is not finite or not like the
+        population's, and where fewer than two inliers are left.
         """
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < 2:
@@ -170,14 +150,8 @@ class OutlierModel:
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``outlier_model.json``."""
-        content = {
-            "form": self.form,
-            "unit_ids": self.unit_ids,
-            "threshold_db": self.threshold_db,
-            "false_alarm_rate": self.false_alarm_rate,
-            "extrapolated": self.extrapolated,
-            "scores": [{**vars(s), "threshold_db": None} for s in self.scores],
-        }
+        content = {name: getattr(self, name) for name in _FACTS}
+        content |= {"scores": [{**vars(s), "threshold_db": None} for s in self.scores]}
         save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
@@ -188,16 +162,9 @@ class OutlierModel:
         axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
-        scores = tuple(OutlierScore.from_content(s, threshold) for s in content["scores"])
-        return cls(
-            form=Form(content["form"]),
-            unit_ids=tuple(content["unit_ids"]),
-            scores=scores,
-            threshold_db=threshold,
-            false_alarm_rate=content["false_alarm_rate"],
-            extrapolated=content["extrapolated"],
-            **{name: arrays[name] for name in _ARRAYS},
-        )
+        facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
+        facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"]), "threshold_db": threshold}
+        return cls(scores=tuple(OutlierScore.from_content(s, threshold) for s in content["scores"]), **facts)
 
 
 def score_outliers(
@@ -244,10 +211,10 @@ def score_outliers(
     --------
     >>> import numpy as np
     >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = np.append(1 + 0.02 * rng.normal(size=20), 1.5), 5 + 0.2 * rng.normal(size=21)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> [score.unit for score in score_outliers(responses[:, :, None, None], freqs_hz).scores if score.outlier]
+    >>> gains, freqs_hz = np.random.default_rng(0).normal(1, 0.02, size=(21, 1, 1, 1)), np.geomspace(0.1, 40, 20)
+    >>> gains[20] = 1.5
+    >>> model = score_outliers(gains / (1 + 1j * freqs_hz[:, None, None]), freqs_hz)
+    >>> [score.unit for score in model.scores if score.outlier]
     ['20']
     """
     G, ids, freqs = _population(responses, unit_ids, freqs_hz)
@@ -283,93 +250,20 @@ def scored_rows(count: int) -> Array:
     return np.unique(np.linspace(0, count - 1, OUTLIER.frequencies).round().astype(int))
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Units and their distances; units are scored against the inliers among them.
-
-    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
-    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
-    first order, so what it takes to reach the bound follows in percent.
-    """
-
-    form: Form
-    responses: Array  # (unit, frequency, p, m), scaled
-    freqs_hz: Array
-    distances: Distances
-    inliers: Flags
-
-    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
-        """Return scores of the units with margins, whose names are given."""
-        units = np.array(list(margin_db))
-        rows = self.distances.levels[units].argmax(axis=1)
-        entries = largest_entries(self.form, self.responses, self.distances, units, rows)
-        excess = excesses(self.distances.levels.max(axis=1), self.inliers)
-        by_nominal = excesses(self.distances.peaks, self.inliers)[:, units]
-        lowest, highest, scores = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0), []
-        for k, (unit, margin) in enumerate(margin_db.items()):
-            value, known = float(excess[unit]), bool(np.isfinite(threshold) and np.isfinite(margin))
-            score = OutlierScore(
-                unit=ids[k],
-                score_db=threshold + margin if known else value,
-                threshold_db=threshold,
-                outlier=known and margin > 0,
-                freq_hz=float(self.freqs_hz[rows[k]]),
-                entry=entries[k],
-                excess_db=value,
-                lowest_db=float(lowest[k]),
-                highest_db=float(highest[k]),
-            )
-            scores.append(self._detectable(score, unit, value - margin) if known else score)
-        return tuple(scores)
-
-    def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
-        """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
-        cover = float(self.distances.levels[unit].max()) - score.excess_db
-        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
-        i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
-        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
-        if score.outlier:
-            status = Status.OUTLIER
-        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
-            status = Status.OK
-        return replace(
-            score,
-            status=status,
-            detectable_db=bound_db,
-            detectable_percent=smallest,
-            detectable_hz=float(self.freqs_hz[row]),
-            detectable_entry=(i, j),
-        )
-
-    @cached_property
-    def _changes(self) -> Array:
-        """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
-        G = self.responses[self.inliers]
-        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
-        levels = np.empty((*G.shape[2:], G.shape[1]))
-        for i, j in np.ndindex(*G.shape[2:]):
-            changed = G.copy()
-            changed[:, :, i, j] *= 1 + OUTLIER.percent / 100
-            shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
-            levels[i, j] = np.median(shifted, axis=0)
-        return levels
-
-
 def _population(
-    responses: npt.ArrayLike | Sequence[npt.ArrayLike], unit_ids: tuple[str, ...] | None, freqs_hz: npt.ArrayLike
+    responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Checked responses, names and frequencies."""
-    listed: Any = responses if isinstance(responses, np.ndarray) else [np.asarray(r) for r in cast(Any, responses)]
+    listed, freqs = [np.asarray(one) for one in responses], np.asarray(freqs_hz, float)
     ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
-    freqs, shapes = np.asarray(freqs_hz, float), [one.shape for one in listed]
-    other = next((k for k, shape in enumerate(shapes[: len(ids)]) if shape != shapes[0]), None)
-    if other is not None:
-        raise DimensionError(
-            f"Outlier scores: unit {ids[other]} has a response of shape {shapes[other]}, unit {ids[0]} one of shape "
-            f"{shapes[0]}; bring all units to the same frequencies and channels."
-        )
+    for unit, one in zip(ids, listed, strict=False):
+        if one.shape != listed[0].shape:
+            raise DimensionError(
+                f"Outlier scores: unit {unit} has a response of shape {one.shape}, unit {ids[0]} one of shape "
+                f"{listed[0].shape}; bring all units to the same frequencies and channels."
+            )
     G = check_responses(np.asarray(listed))
-    if len(G) < 3 or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
+    if len(G) < LEAST_SCORES or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
         problem = "Outlier scores: need at least three units, one id each, and one frequency for each response"
         raise DataError(f"{problem}; found {len(G)} units, {len(ids)} ids, {freqs.size} frequencies for {G.shape[1]}.")
     if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:

@@ -7,8 +7,6 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from ...core.work import Work
 from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors, IdentifiedModels
@@ -27,19 +25,20 @@ def score_population(
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
-    for condition, own in known.items():
-        if len(own.unit_ids) < 3:
-            log.info("%s: outlier scores need at least three units, found %d", condition, len(own.unit_ids))
-    scored = {condition: own for condition, own in known.items() if len(own.unit_ids) >= 3}
-    tasks = [partial(score_condition, models.factors[condition], own, settings) for condition, own in scored.items()]
+    scored = {
+        condition: identified for condition, identified in known.items() if len(identified.unit_ids) >= LEAST_SCORES
+    }
+    for condition in sorted(known.keys() - scored.keys()):
+        log.info("%s: outlier scores need at least three units", condition)
+    tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
     rows: list[dict[str, Any]] = []
     found: dict[str, OutlierModel] = {}
     for condition, (outliers, samples) in zip(scored, (work or Work()).run("score outliers", tasks), strict=True):
         found[places[condition]] = outliers
-        for score, count in zip(outliers.scores, samples, strict=True):
+        for score, n_samples in zip(outliers.scores, samples, strict=True):
             keys, used = (models.facts.keys(part, score.unit, condition) for part in ("test", "train"))
             held_out = 1 + len(keys) / len(used)  # episodes that are held out are as long as the others
-            seconds = count * scored[condition].sample_period_s * held_out
+            seconds = n_samples * scored[condition].sample_period_s * held_out
             rows.append(score_row(score, condition, len(keys) + len(used), seconds))
     return found, rows
 
@@ -72,9 +71,7 @@ def score_condition(
 
 def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: float) -> dict[str, Any]:
     """Return a score as a row of metrics, with what was recorded and what is needed."""
+    same = ("outlier", "freq_hz", "excess_db", "lowest_db", "highest_db", "status", "detectable_hz")
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db}
-    same = ("outlier", "freq_hz", "entry", "excess_db", "lowest_db", "highest_db", "status")
     row |= {key: getattr(score, key) for key in same} | {"detectable": score.detectable_percent}
-    row |= {key: getattr(score, key) for key in ("detectable_db", "detectable_hz", "detectable_entry")}
-    needed = {"needed_episodes": int(np.ceil(episodes * score.more_data)), "needed_s": recorded_s * score.more_data}
-    return row | {"episodes": episodes, "recorded_s": recorded_s} | needed
+    return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}

@@ -2,10 +2,9 @@
 
     factors of episodes --brought to one number of samples--> EDMD --> response of a unit
 
-Tikhonov's alpha stands against a Gram matrix that grows with the recording: at one alpha a unit that was recorded less
-is drawn further towards zero, which looks like another machine. For scores every unit counts as recorded as long as the
-middle one of the study. A shorter recording scatters more, too: of a unit recorded for less than half as long nothing
-is said.
+At one alpha of Tikhonov a unit that was recorded less is drawn further towards zero, which looks like another machine.
+For scores every unit counts as recorded as long as the middle one of the study; of a unit recorded for less than half
+as long nothing is said, because shorter recordings scatter more.
 """
 
 from __future__ import annotations
@@ -94,8 +93,13 @@ class Recorded:
     def same_motions(self, factor: Factor) -> bool:
         """Tell whether a unit was moved by inputs of the study alone."""
         first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
-        own = {mark for e in self.units.values() for mark in _marks(e.factor, first, len(self.models.input_scale))}
-        return set(_marks(factor, first, len(self.models.input_scale))) <= own
+        inputs = slice(first, first + len(self.models.input_scale))
+        return _marks(factor, inputs) <= set().union(*(_marks(e.factor, inputs) for e in self.units.values()))
+
+    def same_recordings(self, factor: Factor) -> set[str]:
+        """Return units of the study that have an episode in common with some, by their factors."""
+        marks = _marks(factor)
+        return {unit for unit, e in self.units.items() if marks & _marks(e.factor)}
 
     def suffices(self, evidence: Evidence) -> bool:
         """Tell whether a unit was recorded for long enough to be compared with those of the study."""
@@ -108,21 +112,8 @@ class Recorded:
         score_db, more = min(score.score_db, score.threshold_db), OUTLIER.recorded * self.usual / evidence.n_samples
         return replace(score, score_db=score_db, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
 
-    def same_recordings(self, factor: Factor) -> set[str]:
-        """Return units of the study that have an episode in common with some, by their factors."""
-        rows = range(len(factor.R))
-        return {unit for unit, e in self.units.items() if any(_alike(e.factor, factor, k) for k in rows)}
 
-
-def _marks(factor: Factor, first: int, count: int) -> list[tuple[float, ...]]:
-    """Return the number of samples and the norms of the inputs of every episode, to eight digits."""
-    norms = np.linalg.norm(factor.R[..., first : first + count], axis=-2)
-    return [(int(n), *(float(f"{v:.8g}") for v in row)) for n, row in zip(factor.n_samples, norms, strict=True)]
-
-
-def _alike(stored: Factor, found: Factor, row: int) -> bool:
-    """Tell whether an episode is among stored ones: equal length and equal Gram matrix, but for rounding."""
-    candidates = np.flatnonzero(stored.n_samples == found.n_samples[row])
-    gram = found.R[row].T @ found.R[row]
-    size = np.sqrt(np.diag(gram))
-    return any((np.abs(R.T @ R - gram) <= OUTLIER.same * np.outer(size, size)).all() for R in stored.R[candidates])
+def _marks(factor: Factor, columns: slice = slice(None)) -> set[tuple[float, ...]]:
+    """Return the number of samples and the norms of some columns, to eight digits, of every episode."""
+    norms = np.linalg.norm(factor.R[..., columns], axis=-2)
+    return {(int(n), *(float(f"{v:.8g}") for v in row)) for n, row in zip(factor.n_samples, norms, strict=True)}

@@ -1,17 +1,26 @@
 """What is said about one unit: how far it exceeds the others, and what would have been seen had it differed.
 
-A score below the threshold means little by itself. Beside it stands what the unit would have to differ by to be
-flagged; where that is more than anybody would call a defect, nothing is said about the unit instead of "ok".
+Beside a score stands what the unit would have to differ by to be flagged; where that is more than a defect would be,
+nothing is said about the unit instead of "ok".
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
+from functools import cached_property
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
+from ..forms import Form
 from ..settings import OUTLIER
+from .distances import Distances, scaled_levels
+from .tail import Flags, excesses
+
+Array = npt.NDArray[Any]
 
 # below, the verdict on a unit is left open: of studies of five up to a third of the good units were beyond a bound
 FEWEST_UNITS = OUTLIER.fewest
@@ -37,68 +46,98 @@ class Status(StrEnum):
 class OutlierScore:
     """How far one unit exceeds the others.
 
-    Parameters
-    ----------
-    unit : str
-    score_db : float, dB
-        The excess, referred to the threshold: the thresholds of units that went out earlier in the search differ, and
-        the difference is added to their excess, so that one threshold serves all units.
-    threshold_db : float, dB
-    outlier : bool
-    freq_hz : float, Hz
-        Where the unit's level is largest.
-    entry : tuple of int
-        Row and column of the residual's largest entry there, relative to its typical size.
-    excess_db : float, dB
-        What the unit's largest level has beyond the largest of the other inliers; negative for all units but one
-        inlier.
-    lowest_db, highest_db : float, dB
-        Range of the excess over all choices of one nominal unit.
-    status : Status
-    detectable_db : float, dB
-        What the excess would have to be for the unit to be flagged; infinite where nothing could be.
-    detectable_percent : float
-        Smallest change of gain of one entry of the response that is an excess of that size somewhere, to first order.
-    detectable_hz : float, Hz, or None
-        Where that is; None where `detectable_percent` is infinite.
-    detectable_entry : tuple of int
-        Output and input of the entry.
-    more_data : float
-        How many times as long the unit would have to be recorded; one where the recordings suffice.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import score_outliers
-    >>> rng, freqs_hz = np.random.default_rng(0), np.geomspace(0.1, 40, 20)
-    >>> gains, corners_hz = 1 + 0.02 * rng.normal(size=20), 5 + 0.2 * rng.normal(size=20)
-    >>> responses = gains[:, None] / (1 + 1j * freqs_hz / corners_hz[:, None])
-    >>> score = score_outliers(responses[:, :, None, None], freqs_hz).scores[0]
-    >>> score.unit, score.score_db < score.threshold_db, score.outlier
-    ('0', True, False)
+    The thresholds of units that went out earlier in the search differ; the difference is added to their excess, so that
+    one threshold serves all units.
     """
 
     unit: str
-    score_db: float
+    score_db: float  # the excess, referred to the threshold
     threshold_db: float
     outlier: bool
-    freq_hz: float
-    entry: tuple[int, int]
-    excess_db: float
-    lowest_db: float
+    freq_hz: float  # where the unit's level is largest
+    excess_db: float  # of the largest level over that of the other inliers; negative for all units but one inlier
+    lowest_db: float  # range of the excess over all choices of one nominal unit
     highest_db: float
     status: Status = Status.CANNOT_TELL
-    detectable_db: float = float("inf")
-    detectable_percent: float = float("inf")
-    detectable_hz: float | None = None
-    detectable_entry: tuple[int, int] = (0, 0)
-    more_data: float = 1.0
+    detectable_percent: float = float("inf")  # smallest change of gain of one entry that would be flagged, first order
+    detectable_hz: float | None = None  # where that is; None where nothing could be flagged
+    detectable_entry: tuple[int, int] = (0, 0)  # output and input
+    more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
 
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
-        """Return a score as it was before it became JSON, which knows neither infinity nor tuples."""
+        """Return a score as it was before it became JSON, which has neither infinity nor tuples."""
         values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
-        unknown = [name for name, value in values.items() if value is None and name != "detectable_hz"]
-        values |= dict.fromkeys(unknown, float("inf"))
-        values |= {name: tuple(content[name]) for name in ("entry", "detectable_entry")}
-        return cls(**values | {"threshold_db": threshold_db, "status": Status(content["status"])})
+        if values["detectable_percent"] is None:
+            values["detectable_percent"] = float("inf")
+        entry, status = tuple(values["detectable_entry"]), Status(values["status"])
+        return cls(**values | {"threshold_db": threshold_db, "status": status, "detectable_entry": entry})
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Units and their distances; units are scored against the inliers among them.
+
+    Beside a score stands the smallest change of a unit that it would have shown. One entry of a unit's response,
+    changed by one percent, is a residual of some level at every frequency; a level is proportional to the change to
+    first order, so what it takes to reach the bound follows in percent.
+    """
+
+    form: Form
+    responses: Array  # (unit, frequency, p, m), scaled
+    freqs_hz: Array
+    distances: Distances
+    inliers: Flags
+
+    def scores(self, ids: tuple[str, ...], threshold: float, margin_db: dict[int, float]) -> tuple[OutlierScore, ...]:
+        """Return scores of the units with margins, whose names are given."""
+        levels, units = self.distances.levels, np.array(list(margin_db))
+        excess, by_nominal = (excesses(v, self.inliers) for v in (levels.max(axis=1), self.distances.peaks))
+        lowest, highest = np.nanmin(by_nominal, axis=0), np.nanmax(by_nominal, axis=0)
+        freqs, scores = self.freqs_hz[levels.argmax(axis=1)], []
+        for unit, name in zip(units, ids, strict=True):
+            value, margin = float(excess[unit]), margin_db[int(unit)]
+            known = bool(np.isfinite(threshold) and np.isfinite(margin))
+            score = OutlierScore(
+                unit=name,
+                score_db=threshold + margin if known else value,
+                threshold_db=threshold,
+                outlier=known and margin > 0,
+                freq_hz=float(freqs[unit]),
+                excess_db=value,
+                lowest_db=float(lowest[unit]),
+                highest_db=float(highest[unit]),
+            )
+            scores.append(self._detectable(score, int(unit), value - margin) if known else score)
+        return tuple(scores)
+
+    def _detectable(self, score: OutlierScore, unit: int, bound_db: float) -> OutlierScore:
+        """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
+        cover = float(self.distances.levels[unit].max()) - score.excess_db
+        percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
+        i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
+        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
+        if score.outlier:
+            status = Status.OUTLIER
+        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
+            status = Status.OK
+        return replace(
+            score,
+            status=status,
+            detectable_percent=smallest,
+            detectable_hz=float(self.freqs_hz[row]),
+            detectable_entry=(i, j),
+        )
+
+    @cached_property
+    def _changes(self) -> Array:
+        """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
+        G = self.responses[self.inliers]
+        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
+        levels = np.empty((*G.shape[2:], G.shape[1]))
+        for i, j in np.ndindex(*G.shape[2:]):
+            changed = G.copy()
+            changed[:, :, i, j] *= 1 + OUTLIER.percent / 100
+            shifted = scaled_levels(self.form, G, changed, self.distances, self.freqs_hz)
+            levels[i, j] = np.median(shifted, axis=0)
+        return levels

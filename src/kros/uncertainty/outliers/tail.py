@@ -18,8 +18,7 @@ Levels of lighter tails (normal, bounded, of two suppliers) exceed this less oft
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -82,8 +81,7 @@ def margins(levels: Array, inliers: Flags, rate: float) -> tuple[Array, Array]:
     return value, value - np.maximum(bound, OUTLIER.rounding_db)
 
 
-@dataclass(frozen=True, eq=False)
-class Separation:
+class Separation(NamedTuple):
     """Inliers and outliers."""
 
     inliers: Flags  # (unit,)

@@ -9,17 +9,17 @@ f: nothing is sampled. The period T is that of the map and of nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
+from ...core.frequency import check_grid
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..settings import SET
-from .residuals import Residuals
+from ..settings import MAGNITUDE, SET
 
 Array = npt.NDArray[Any]
 
@@ -29,37 +29,15 @@ class BilinearAxis:
     """Map between a continuous and a discrete frequency axis."""
 
     period_s: float  # s: period T of the map
-    # Hz: end of the grid, from which on residuals count as constant: numerically a strictly proper plant has no
-    # pseudo-inverse there, and an additive residual vanishes faster than a weight with a stable inverse may
-    last_hz: float
 
     @classmethod
     def over(cls, freqs_hz: Array) -> BilinearAxis:
-        """Return the map for a grid, to whose end it gives tau = 10, the highest knot of the fit."""
-        top = float(freqs_hz[-1])
-        return cls(float(np.sqrt(10.0)) / (np.pi * top), top)
+        """Return the map for a grid, whose end becomes the highest knot of the fit."""
+        return cls(float(np.sqrt(MAGNITUDE.highest) / (np.pi * freqs_hz[-1])))
 
     def discrete_hz(self, freqs_hz: npt.ArrayLike) -> Array:
         """Return the frequencies on the discrete axis."""
         return np.asarray(np.arctan(np.pi * self.period_s * np.asarray(freqs_hz, float)) / (np.pi * self.period_s))
-
-    def continuous_hz(self, freqs_hz: npt.ArrayLike) -> Array:
-        """Return the frequencies on the continuous axis, at most `last_hz`."""
-        angle = np.pi * self.period_s * np.asarray(freqs_hz, float)
-        return np.asarray(np.minimum(np.tan(np.minimum(angle, np.pi / 2)) / (np.pi * self.period_s), self.last_hz))
-
-    def mapped(self, residuals: Residuals) -> Residuals:
-        """Return residuals at mapped frequencies, constant from `last_hz` on."""
-
-        def units(freqs_hz: Array, rows: Array) -> Array:
-            return residuals.units(self.continuous_hz(freqs_hz), rows)
-
-        def nominal(freqs_hz: Array) -> Array:
-            return residuals.nominal(self.continuous_hz(freqs_hz))
-
-        base, others = residuals.systems or (None, None)
-        systems = None if base is None or others is None else (self.discrete(base), self.discrete(others))
-        return replace(residuals, nominal=nominal, units=units, systems=systems, proven=False)
 
     def continuous(self, system: StateSpace) -> StateSpace:
         """Return the continuous system with the same response at mapped frequencies."""
@@ -76,16 +54,12 @@ class BilinearAxis:
         return StateSpace(A, B, C, system.D + through, self.period_s)
 
 
-def beyond(freqs_hz: Array) -> Array:
-    """Return the frequencies, and more of them up to ten times the last."""
-    top = freqs_hz[-1]
-    return np.concatenate([freqs_hz, np.geomspace(top, SET.beyond * top, SET.points_beyond + 1)[1:]])
-
-
-def continuous_grid(system: StateSpace) -> Array:
-    """Return 1000 logarithmic points from a hundredth of the slowest to ten times the fastest pole, Hz."""
-    sizes = np.abs(system.poles()) / (2 * np.pi)
-    sizes = sizes[sizes > 0]
-    if not sizes.size:
-        raise ConfigError("Frequency grid: static continuous models have no band of their own; give freqs_hz.")
-    return np.geomspace(sizes.min() / 100, sizes.max() * 10, SET.points)
+def continuous_grid(system: StateSpace, freqs_hz: npt.ArrayLike | None) -> Array:
+    """Return frequencies, by default a hundredth of the slowest to ten times the fastest pole, and some beyond, Hz."""
+    if freqs_hz is None:
+        sizes = np.abs(system.poles()) / (2 * np.pi)
+        if not sizes.any():
+            raise ConfigError("Frequency grid: static continuous models have no band of their own; give freqs_hz.")
+        freqs_hz = np.geomspace(sizes[sizes > 0].min() / 100, sizes.max() * 10, SET.points)
+    freqs = check_grid(freqs_hz, None)
+    return np.concatenate([freqs, np.geomspace(freqs[-1], 10 * freqs[-1], SET.points_beyond + 1)[1:]])

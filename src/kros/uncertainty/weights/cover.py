@@ -24,33 +24,20 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
-from ..settings import COVER
+from ..settings import FIT, PROOF
 
 Array = npt.NDArray[Any]
 
 _TINY = np.finfo(float).tiny
+_STEP = np.cbrt(np.finfo(float).eps)  # nepers, of differences
 
 
 @dataclass(frozen=True, eq=False)
 class Cover:
-    """Magnitudes of a cover.
+    """Magnitudes of a cover; one right entry is one at every frequency: the scale between left and right is free."""
 
-    Parameters
-    ----------
-    left : ndarray, shape (frequency, p')
-    right : ndarray, shape (frequency, m')
-        One entry is one at every frequency: the scale between left and right is free.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import Cover
-    >>> Cover(left=np.array([[0.2]]), right=np.array([[1.0]])).entries().ravel().tolist()
-    [0.2]
-    """
-
-    left: Array
-    right: Array
+    left: Array  # (frequency, p')
+    right: Array  # (frequency, m')
 
     def at(self, rows: Array) -> Cover:
         """Return the cover at some frequencies."""
@@ -64,45 +51,38 @@ class Cover:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
 
+    def ratio(self, E: Array) -> Array:
+        """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
+        left, right = (1 / np.maximum(v.T, _TINY) for v in (self.left, self.right))
+        return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
+
 
 def optimal_cover(E: Array) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
-    first = entries_first(E)
-    p = first.shape[0]
-    x = _descend(first, sigma_max_first(first).max(axis=0), p)
+    p = E.shape[2]
+    x = _descend(entries_first(E), p)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
-    return Cover(_scaled_left(first, np.exp(x[:p]).T, right), right)
+    shape = Cover(np.exp(x[:p]).T, right)
+    return Cover(shape.left * shape.ratio(E).max(axis=0)[:, None], right)
 
 
-def cover_ratio(E: Array, left: Array, right: Array) -> Array:
-    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), for magnitudes of the frequencies."""
-    first = entries_first(E)
-    l_inv, r_inv = (1 / np.maximum(v, _TINY) for v in (left.T, right.T))
-    return sigma_max_first(first * l_inv[:, None, None, :] * r_inv[None, :, None, :])
-
-
-def _scaled_left(first: Array, left: Array, right: Array) -> Array:
-    """Scale left magnitudes so that the cover touches."""
-    return left * sigma_max_first(first / left.T[:, None, None, :] / right.T[None, :, None, :]).max(axis=0)[:, None]
-
-
-def _descend(first: Array, size: Array, p: int) -> Array:
+def _descend(first: Array, p: int) -> Array:
     """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
+    size = sigma_max_first(first).max(axis=0)
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
     if not alive.size:
         return np.zeros((n, len(size)))
-    count = max(COVER.frequencies, COVER.entries // (first.shape[0] * first.shape[1]))
-    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, count).round().astype(int))]
+    chosen = alive[np.unique(np.linspace(0, len(alive) - 1, FIT.covered).round().astype(int))]
     E = first[..., chosen] / size[chosen]
-    leading = np.argsort(-sigma_max_first(E), axis=0)[: COVER.units]  # all others are covered by the scale
+    leading = np.argsort(-sigma_max_first(E), axis=0)[: FIT.units]  # all others are covered by the scale
     E = E[:, :, np.unique(leading)]
     x = np.zeros((n, len(chosen)))
-    for power in COVER.squarings:
-        for _ in range(COVER.newton):
-            x, moved = _newton(_Smooth(E, p, power), x)
-            if moved < COVER.settled:
+    for squarings in FIT.squarings:
+        for _ in range(FIT.steps):
+            before, x = x, _newton(_Smooth(E, p, squarings), x)
+            if np.abs(x - before).max() < PROOF.rounding:
                 break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
 
@@ -129,33 +109,27 @@ class _Smooth:
         Y = multiply(power, M) if wide else multiply(M, power)
         marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
         total = marginal.sum(axis=(0, 1))
-        q = 2**self.squarings + 1
-        pull = COVER.pull / 2 * (x**2).sum(axis=0)
-        cost = x[:p].mean(axis=0) + np.log(top) + np.log(total) / (2 * q) + pull + x[p:].mean(axis=0)
+        log_s = np.log(top) + np.log(total) / (2 * (2**self.squarings + 1))
+        cost = x[:p].mean(axis=0) + x[p:].mean(axis=0) + log_s + FIT.pull / 2 * (x**2).sum(axis=0)
         gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
-        return cost, gradient + COVER.pull * x
+        return cost, gradient + FIT.pull * x
 
 
-def _newton(smooth: _Smooth, x: Array) -> tuple[Array, float]:
-    """One damped Newton step; the Hessian from differences of the gradient."""
+def _newton(smooth: _Smooth, x: Array) -> Array:
+    """Take one Newton step, shortened where the cost does not fall; the Hessian from differences of the gradient."""
     cost, gradient = smooth.cost(x)
-    hessian = np.empty((x.shape[1], len(x), len(x)))
-    for i in range(len(x)):
-        ahead = x.copy()
-        ahead[i] += COVER.difference
-        hessian[:, :, i] = ((smooth.cost(ahead)[1] - gradient) / COVER.difference).T
-    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + 1e-6 * np.eye(len(x))
+    ahead = (x + _STEP * unit[:, None] for unit in np.eye(len(x)))
+    hessian = np.stack([(smooth.cost(other)[1] - gradient).T / _STEP for other in ahead], axis=-1)
+    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + FIT.pull / 1000 * np.eye(len(x))
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
-    step *= np.minimum(1.0, COVER.reach / np.maximum(np.abs(step).max(axis=0), _TINY))
+    step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), _TINY))
     slope = (gradient * step).sum(axis=0)
     best, length = x, np.ones(x.shape[1])
     pending = np.ones(x.shape[1], bool)
-    for _ in range(8):
+    while pending.any() and length.min() > 1e-4:
         trial = x + length * step
-        better = pending & (smooth.cost(trial)[0] <= cost + 0.1 * length * slope)
+        better = pending & (smooth.cost(trial)[0] <= cost + length * slope / 10)
         best = np.where(better, trial, best)
         pending &= ~better
-        if not pending.any():
-            break
         length = np.where(pending, length / 3, length)
-    return best, float(np.abs(best - x).max(initial=0.0))
+    return best

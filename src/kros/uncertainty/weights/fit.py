@@ -2,13 +2,12 @@ r"""Weights from residuals: a fit at few frequencies, a check at many, a proof a
 
 All magnitudes of a diagonal weight are fitted together (`joint`). The fit is checked on a grid ten times denser, with
 DC, Nyquist and the modes of units and weights; frequencies and units that it misses join it. What counts is the proof
-for the systems as returned (`certificate`); at last the left weight is scaled until it touches.
+for the systems as returned (`proof`); at last the left weight is scaled until it touches.
 """
 
 from __future__ import annotations
 
-import logging
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -17,16 +16,14 @@ import numpy.typing as npt
 
 from ...core.frequency import bilinear_squared, dense_grid
 from ...core.lti import block_diagonal, gain
-from ..settings import PROOF, FitSettings
-from .certificate import Certificate, Method, certify
-from .cover import Cover, cover_ratio, optimal_cover
+from ..settings import FIT, PROOF
+from .cover import Cover, optimal_cover
 from .joint import JointFit, JointProblem, fit_jointly, refit
+from .proof import Method, certify
 from .residuals import Residuals
 from .weight import Weight
 
 Array = npt.NDArray[Any]
-
-_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -36,59 +33,55 @@ class Target:
     sample_period_s: float
     max_order: int = 4
     tolerance_db: float = 1.0
-    settings: FitSettings = field(default_factory=FitSettings)
 
 
 def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[Weight, Cover]:
     """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`."""
-    settings, dt = target.settings, target.sample_period_s
-    few = residuals.of(residuals.deciding(freqs_hz, settings.block))
-    grid = checking_grid(freqs_hz, dt, settings.density)
-    fit = _Fit(few, freqs_hz, joined(grid, few.modes_hz(grid)), target)
+    few, grid = residuals.deciding(freqs_hz), checking_grid(freqs_hz, target.sample_period_s)
+    fit = _Fit(few, residuals, freqs_hz, few.modes_hz(grid), target)
     weight = fit.start()
-    for _ in range(settings.rounds):
-        missed = fit.missed(weight)
-        if not missed.size:
-            proof = _proven(residuals, weight, fit.checked_hz, settings.block)
-            if proof.bound <= settings.deficit:
-                break
-            _LOG.debug("Weight: the proof found a ratio of %.4f", proof.bound)
-            missed = proof.missed_hz
-        weight = fit.again(missed, residuals)
+    proof = _proven(residuals, weight, fit.checked_hz)
+    for _ in range(FIT.rounds):
+        if proof.bound <= FIT.deficit:
+            break
+        weight = fit.again(proof.missed_hz)
+        proof = _proven(residuals, weight, fit.checked_hz)
     else:
-        proof = _proven(residuals, weight, fit.checked_hz, settings.block)
-    cover = _raised(fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz)), residuals, freqs_hz, settings.block)
-    return _lifted(weight, proof).measured(freqs_hz, cover, target.tolerance_db), cover
+        weight = weight.scaled(proof.bound)
+        proof = _proven(residuals, weight, fit.checked_hz)
+    cover = _raised(fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz)), residuals, freqs_hz)
+    return _lifted(weight, proof).measured(freqs_hz, cover), cover
 
 
-def checking_grid(freqs_hz: Array, sample_period_s: float, density: int) -> Array:
+def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
     """Return a dense grid from DC to Nyquist: a fit is free to bend wherever nothing is checked."""
-    dense = dense_grid(freqs_hz, sample_period_s, density)
+    dense = dense_grid(freqs_hz, sample_period_s, PROOF.density)
     tau = bilinear_squared(dense, sample_period_s)
     inner = np.log10(tau[(tau > 0) & (tau < np.inf)]) if ((tau > 0) & (tau < np.inf)).any() else np.zeros(1)
     low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades
     logs = np.logspace(low, high, 1 + int(PROOF.a_decade * (high - low)))
-    even = np.linspace(0.0, dense[-1], PROOF.even)
-    return joined(dense, np.append(np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s), even))
+    return joined(dense, np.arctan(np.sqrt(logs)) / (np.pi * sample_period_s))
 
 
 def joined(freqs_hz: Array, others_hz: Array) -> Array:
-    """Return both in increasing order, without those of the others that are nearly there."""
+    """Return both in increasing order, without those of the others that are nearly there, or nearly one."""
     others = np.unique(others_hz)
+    others = others[np.diff(others, prepend=-1.0) > PROOF.rounding * others]
     at = np.searchsorted(freqs_hz, others)
     below, above = freqs_hz[np.maximum(at - 1, 0)], freqs_hz[np.minimum(at, len(freqs_hz) - 1)]
     near = np.minimum(np.abs(others - below), np.abs(others - above))
-    return np.sort(np.concatenate([freqs_hz, others[near > PROOF.same * others]]))
+    return np.sort(np.concatenate([freqs_hz, others[near > PROOF.rounding * others]]))
 
 
 class _Fit:
-    """One fit, and again with frequencies that it missed, of the units that decide."""
+    """One fit of the units that decide, and again with frequencies and units that it missed."""
 
-    def __init__(self, residuals: Residuals, freqs_hz: Array, checked_hz: Array, target: Target) -> None:
-        self.residuals, self.checked_hz, self.target = residuals, checked_hz, target
-        modes = np.setdiff1d(checked_hz, checking_grid(freqs_hz, target.sample_period_s, target.settings.density))
-        self.band = freqs_hz[0], freqs_hz[-1]
-        self.freqs_hz = joined(freqs_hz, modes[(modes >= self.band[0]) & (modes <= self.band[1])])
+    def __init__(
+        self, residuals: Residuals, everyone: Residuals, freqs_hz: Array, modes_hz: Array, target: Target
+    ) -> None:
+        self.residuals, self.everyone, self.target, self.band = residuals, everyone, target, freqs_hz[[0, -1]]
+        self.checked_hz = joined(checking_grid(freqs_hz, target.sample_period_s), modes_hz)
+        self.freqs_hz = joined(freqs_hz, modes_hz[(modes_hz >= self.band[0]) & (modes_hz <= self.band[1])])
         self.shape = residuals.at(freqs_hz).shape[2:]
 
     @cached_property
@@ -98,32 +91,19 @@ class _Fit:
 
     def start(self) -> Weight:
         """Fit at evenly chosen frequencies, and at fewer beyond the band."""
-        settings, dt, (p, m) = self.target.settings, self.target.sample_period_s, self.shape
+        dt, (p, m) = self.target.sample_period_s, self.shape
         if not self.residuals.at(self.freqs_hz).any():
-            sides = gain(np.zeros((p, p)), dt), gain(np.eye(m), dt)
-            return Weight(*sides, (0,) * p, (0,) * m, np.nan, np.nan)
-        even = np.unique(np.linspace(0, len(self.freqs_hz) - 1, settings.points).round().astype(int))
+            return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m, np.nan, np.nan)
+        even = np.unique(np.linspace(0, len(self.freqs_hz) - 1, FIT.points).round().astype(int))
         beyond = self.checked_hz[(self.checked_hz < self.band[0]) | (self.checked_hz > self.band[1])][::4]
         self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)), self.residuals)
-        self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db, settings)
+        self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db)
         return self._weight(self.fitted)
 
-    def missed(self, weight: Weight) -> Array:
-        """Return the frequencies, Hz, at which the weight is exceeded or costs more than it should."""
-        if not weight.left.D.any():
-            return np.zeros(0)
-        settings = self.target.settings
-        bends = np.arctan(np.exp(self.fitted.sections.corner / 2)) / (np.pi * self.target.sample_period_s)
-        where = joined(self.checked_hz, bends)
-        exceeded = _ratio(self.residuals, weight, where).max(axis=0)
-        cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
-        excess = 10 ** ((np.nan_to_num(cost, posinf=0.0) - settings.missed_db) / 20)
-        return np.append(where[_peaks(exceeded / settings.deficit)], self.freqs_hz[_peaks(excess)])
-
-    def again(self, missed_hz: Array, everyone: Residuals) -> Weight:
+    def again(self, missed_hz: Array) -> Weight:
         """Fit again, with the largest residuals of all units at further frequencies."""
-        self.problem = self.problem.joined(self._problem(np.unique(missed_hz), everyone)[0])
-        self.fitted = refit(self.problem, self.fitted.sections, self.target.settings)
+        self.problem = self.problem.joined(self._problem(np.unique(missed_hz), self.everyone)[0])
+        self.fitted = refit(self.problem, self.fitted.sections)
         return self._weight(self.fitted)
 
     def _weight(self, fitted: JointFit) -> Weight:
@@ -135,9 +115,8 @@ class _Fit:
         """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
         best, E = self.optimal, residuals.at(freqs_hz)
         known = np.flatnonzero(best.left.min(axis=1) > 0)
-        near = known[np.searchsorted(self.freqs_hz[known], freqs_hz).clip(0, len(known) - 1)]
-        cover = best.at(near)
-        leading = np.argsort(-cover_ratio(E, cover.left, cover.right), axis=0)[: self.target.settings.units]
+        cover = best.at(known[np.searchsorted(self.freqs_hz[known], freqs_hz).clip(0, len(known) - 1)])
+        leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
         some = np.flatnonzero(np.abs(E).max(axis=(0, 2, 3), initial=0.0) > 0)
         cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
         inside = (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
@@ -148,59 +127,47 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Proof:
-    """The certificate with the largest bound over blocks of units, the largest ratio on their grids."""
+    """What all blocks of units are within."""
 
-    certificate: Certificate
-    on_grid: float
+    method: Method
+    bound: float  # largest ratio
+    on_grid: float  # of those, largest one on the grids
     missed_hz: Array  # where units are beyond the weight
 
-    @property
-    def bound(self) -> float:
-        """Largest ratio."""
-        return max(self.certificate.bound, self.on_grid)
 
-
-def _proven(residuals: Residuals, weight: Weight, grid: Array, block: int) -> _Proof:
+def _proven(residuals: Residuals, weight: Weight, grid: Array) -> _Proof:
     """Certify a weight for all units, in blocks, so that memory does not grow with their number."""
-    proofs = []
-    for rows in residuals.blocks(block):
-        some = residuals if len(rows) == len(residuals) else residuals.of(rows)
-        claimed = joined(grid, some.modes_hz(grid))
-        known = _ratio(some, weight, claimed)
+    proofs, on_grid, missed = [], [], []
+    for some in map(residuals.of, residuals.blocks()):
+        claimed, realised = joined(grid, some.modes_hz(grid)), some.realised if some.proven else None
 
         def ratio(freqs_hz: Array, some: Residuals = some) -> Array:
-            return _ratio(some, weight, freqs_hz)
+            return weight.magnitudes(freqs_hz).ratio(some.at(freqs_hz))
 
-        certificate = certify(ratio, claimed, known, weight.left, weight.right, some.realised if some.proven else None)
-        missed = np.append(claimed[_peaks(known.max(axis=0))], certificate.freq_hz)
-        proofs.append(_Proof(certificate, float(known.max()), missed))
-    worst = max(proofs, key=lambda proof: proof.certificate.bound).certificate
-    if any(proof.certificate.method is Method.GRID for proof in proofs):
-        worst = replace(worst, method=Method.GRID, peak=worst.bound)
-    return _Proof(worst, max(p.on_grid for p in proofs), np.concatenate([p.missed_hz for p in proofs]))
-
-
-def _ratio(residuals: Residuals, weight: Weight, freqs_hz: Array) -> Array:
-    """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency)."""
-    used = weight.magnitudes(freqs_hz)
-    return cover_ratio(residuals.at(freqs_hz), used.left, used.right)
+        known = ratio(claimed)
+        sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
+        pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
+        proofs.append(certify(ratio, claimed, known, pencils, weight.left.dt))
+        on_grid.append(float(known.max()))
+        missed.append(np.append(claimed[_peaks(known.max(axis=0))], proofs[-1].freq_hz))
+    method = Method.GRID if any(proof.method is Method.GRID for proof in proofs) else Method.LEVEL_SETS
+    return _Proof(method, max(*(p.bound for p in proofs), *on_grid), max(on_grid), np.concatenate(missed))
 
 
-def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array, block: int) -> Cover:
+def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array) -> Cover:
     """Return a cover raised at the frequencies at which units of a large population are beyond it."""
-    if len(residuals) <= block:
+    if len(residuals) <= FIT.block:
         return cover
-    ratios = (residuals.of(rows).at(freqs_hz) for rows in residuals.blocks(block))
-    largest = np.max([cover_ratio(E, cover.left, cover.right).max(axis=0) for E in ratios], axis=0)
+    largest = np.max([cover.ratio(residuals.of(rows).at(freqs_hz)).max(axis=0) for rows in residuals.blocks()], axis=0)
     return Cover(cover.left * np.maximum(largest, 1.0)[:, None], cover.right)
 
 
 def _lifted(weight: Weight, proof: _Proof) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift, method = proof.bound * (1 + PROOF.rounding), proof.certificate.method
+    lift = proof.bound * (1 + PROOF.rounding)
     if not lift > 0:
-        return replace(weight, cover_max=0.0, method=method)
-    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=method)
+        return replace(weight, cover_max=0.0, method=proof.method)
+    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=proof.method)
 
 
 def _peaks(ratio: Array) -> Array:

@@ -10,21 +10,22 @@ one brings an inverse form close to an ill-posed set. The start x_0 are the best
 entry, which linear programs find (`magnitude`). Whole families of weights are within a fraction of a decibel of the
 optimum; the last term makes it unique, so that it follows the residuals continuously, and not their rounding.
 
-Every maximum is smoothed, `T log sum exp(. / T)`, with a falling temperature T; steps are those of Gauss and Newton,
-damped, with the spread of the gradients, `(sum w g g^T - (sum w g)(sum w g)^T) / T`. Singular values move along their
+Every maximum is smoothed, `T log sum exp(. / T)`, with a falling temperature T, and minimised in a trust region with
+the spread of the gradients, `(sum w g g^T - (sum w g)(sum w g)^T) / T`, as Hessian. Singular values move along their
 vectors, `d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..settings import FitSettings
+from ..settings import FIT
 from .cover import Cover
 from .magnitude import Bound, rising_bounds
 from .sections import Sections
@@ -55,16 +56,11 @@ class JointProblem:
         residuals = np.concatenate([self.residuals, other.residuals])
         return JointProblem(tau, optimal, residuals, np.append(self.at, other.at + len(self.tau)))
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Left and right entries."""
-        return int(self.residuals.shape[1]), int(self.residuals.shape[2])
-
     @cached_property
     def ends(self) -> tuple[float, float]:
         """Least and largest log corner: three decades of tau beyond what is between DC and Nyquist."""
         inner = np.log(self.tau[(self.tau > 0) & (self.tau < np.finfo(float).max)])
-        decades = np.log(10.0) * 3
+        decades = np.log(1000.0)
         return float(inner.min(initial=0.0)) - decades, float(inner.max(initial=-decades)) + decades
 
 
@@ -76,39 +72,42 @@ class JointFit:
     excess_db: float
 
 
-def fit_jointly(
-    problem: JointProblem, cover: Cover, max_order: int, tolerance_db: float, settings: FitSettings
-) -> JointFit:
+def fit_jointly(problem: JointProblem, cover: Cover, max_order: int, tolerance_db: float) -> JointFit:
     """Return diagonal magnitudes, left ones first, of the smallest order within the tolerance, or of the largest."""
     sides = np.hstack([cover.left, cover.right]).T
-    entries = [list(rising_bounds(problem.tau, values, max_order)) for values in sides]
-    for order in range(max_order + 1):
-        start = Sections.stacked([_simplest(bounds, order, tolerance_db, settings.gain) for bounds in entries])
-        fitted = refit(problem, start, settings)
-        if fitted.excess_db <= settings.enough * tolerance_db:
+    entries = [(rising_bounds(problem.tau, values, max_order), list[Bound]()) for values in sides]
+    for _ in range(max_order + 1):
+        for bounds, known in entries:
+            known += islice(bounds, 1)
+        fitted = refit(problem, Sections.stacked([_simplest(known, tolerance_db) for _, known in entries]))
+        if fitted.excess_db <= tolerance_db:
             break
     return fitted
 
 
-def _simplest(bounds: list[Bound], order: int, tolerance_db: float, gain: float) -> Sections:
-    """Return the fit of the lowest order that is good enough, or as good as the best one but for a small gain."""
-    known = [bound for bound in bounds if bound.order <= order]
-    enough = max(tolerance_db / 2, known[-1].excess_db + gain * tolerance_db)
+def _simplest(known: list[Bound], tolerance_db: float) -> Sections:
+    """Return the fit of the lowest order that is good enough, or as good as the best one but for a tenth."""
+    enough = max(tolerance_db / 2, known[-1].excess_db + tolerance_db / 10)
     return next(bound.sections for bound in known if bound.excess_db <= enough)
 
 
-def refit(problem: JointProblem, start: Sections, settings: FitSettings) -> JointFit:
+def refit(problem: JointProblem, start: Sections) -> JointFit:
     """Return the best sections of the same orders near a start, raised to be sound."""
-    start = start.moved(np.zeros_like(start.parameters), problem.ends)
-    state = _State(problem, start, start.parameters, settings)
-    for temperature in settings.temperatures:
-        damping = settings.damping
-        for _ in range(settings.steps):
-            better = state.step(temperature, damping)
-            if better is None:
-                break
-            state, damping = better
-    return state.fitted()
+    from scipy.optimize import minimize
+
+    first = start.at(start.parameters, problem.ends).parameters
+    state = lru_cache(maxsize=2)(lambda x: _State(problem, start.at(np.frombuffer(x), problem.ends), first))
+    x = first
+    for temperature in FIT.temperatures:
+        x = minimize(
+            lambda x, T=temperature: state(x.tobytes()).value(T),
+            x,
+            jac=True,
+            hess=lambda x, T=temperature: state(x.tobytes()).hessian(T),
+            method="trust-exact",
+            options={"maxiter": FIT.steps, "initial_trust_radius": 3.0},
+        ).x
+    return state(x.tobytes()).fitted()
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,18 +119,15 @@ class _Terms:
     shares: Array  # (n, entry)
     price: float
 
-    def smoothed(self, temperature: float) -> float:
+    def smoothed(self, temperature: float) -> tuple[float, Array]:
+        """Return the smoothed maximum, and its derivative by every value."""
         top = float(self.values.max())
-        return self.price * (top + temperature * float(np.log(np.exp((self.values - top) / temperature).sum())))
+        weight = np.exp((self.values - top) / temperature)
+        return self.price * (top + temperature * float(np.log(weight.sum()))), weight / weight.sum()
 
-    def derivatives(self, temperature: float, slopes: Array, owner: Array) -> tuple[Array, Array]:
-        """Return gradient and Gauss-Newton Hessian."""
-        weight = np.exp((self.values - self.values.max()) / temperature)
-        weight /= weight.sum()
-        rows = self.shares[:, owner].T * slopes[:, self.at]
-        scaled = rows * weight
-        gradient = scaled.sum(axis=1)
-        return self.price * gradient, self.price / temperature * (scaled @ rows.T - np.outer(gradient, gradient))
+    def rows(self, sections: Sections, slopes: Array) -> Array:
+        """Return the derivatives of the values, shape (parameter, n)."""
+        return self.shares[:, sections.owner].T * slopes[:, self.at]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,12 +137,11 @@ class _State:
     problem: JointProblem
     sections: Sections
     start: Array  # parameters
-    settings: FitSettings
 
     @cached_property
     def terms(self) -> tuple[_Terms, ...]:
         """Cost, soundness, and the peak of square weights."""
-        problem, (p, m) = self.problem, self.problem.shape
+        problem, (p, m) = self.problem, self.problem.residuals.shape[1:]
         logs, count = self.sections.logs(problem.tau), len(problem.tau)
         left, right = logs[:p], logs[p:]
         scaled = problem.residuals * np.exp(-left.T[problem.at][:, :, None] - right.T[problem.at][:, None])
@@ -154,7 +149,7 @@ class _State:
         excess = left.mean(axis=0) + right.mean(axis=0) - problem.optimal
         inside = np.flatnonzero(np.isfinite(excess))
         mean = np.broadcast_to(np.repeat([1 / p, 1 / m], [p, m]), (len(inside), p + m))
-        price = self.settings.peak_price if p == m else 0.0
+        price = FIT.peak_price if p == m else 0.0
         cost = _Terms(excess[inside], inside, mean, 1.0)
         sound = _Terms(sigma.ravel(), np.repeat(problem.at, sigma.shape[1]), -shares.reshape(-1, p + m), 1.0 + price)
         if not price:
@@ -162,31 +157,33 @@ class _State:
         both = np.repeat(np.tile(np.eye(p), 2), count, axis=0)
         return cost, sound, _Terms((left + right).ravel(), np.tile(np.arange(count), p), both, price)
 
-    def value(self, temperature: float) -> float:
-        """Return what is minimised, nepers."""
-        away = self.sections.parameters - self.start
-        return sum(t.smoothed(temperature) for t in self.terms) + self.settings.pull / 2 * float(away @ away)
+    @cached_property
+    def _rows(self) -> list[Array]:
+        slopes = self.sections.slopes(self.problem.tau)
+        return [terms.rows(self.sections, slopes) for terms in self.terms]
 
-    def step(self, temperature: float, damping: float) -> tuple[_State, float] | None:
-        """Return the state after one damped step and the damping of the next; None where no step is better."""
-        slopes, owner = self.sections.slopes(self.problem.tau), self.sections.owner
-        parts, pull = [t.derivatives(temperature, slopes, owner) for t in self.terms], self.settings.pull
-        gradient = sum(p[0] for p in parts) + pull * (self.sections.parameters - self.start)
-        hessian = sum(p[1] for p in parts) + pull * np.eye(len(gradient))
-        before = self.value(temperature)
-        for _ in range(self.settings.trials):
-            move = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
-            move *= min(1.0, self.settings.farthest / max(float(np.abs(move).max()), _TINY))
-            trial = _State(self.problem, self.sections.moved(move, self.problem.ends), self.start, self.settings)
-            if trial.value(temperature) < before:
-                return trial, max(damping / 4, 1e-6)
-            damping *= 8
-        return None
+    def value(self, temperature: float) -> tuple[float, Array]:
+        """Return what is minimised, nepers, and its gradient."""
+        away = self.sections.parameters - self.start
+        smoothed = [terms.smoothed(temperature) for terms in self.terms]
+        gradient = FIT.pull * away
+        for terms, rows, (_, weight) in zip(self.terms, self._rows, smoothed, strict=True):
+            gradient += terms.price * (rows @ weight)
+        return sum(value for value, _ in smoothed) + FIT.pull / 2 * float(away @ away), gradient
+
+    def hessian(self, temperature: float) -> Array:
+        """Return the spread of the gradients."""
+        total = FIT.pull * np.eye(len(self.start))
+        for terms, rows in zip(self.terms, self._rows, strict=True):
+            weight = terms.smoothed(temperature)[1]
+            mean = rows @ weight
+            total += terms.price / temperature * ((rows * weight) @ rows.T - np.outer(mean, mean))
+        return total
 
     def fitted(self) -> JointFit:
         """Return the sections, raised to be sound."""
         excess, deficit = (float(terms.values.max()) for terms in self.terms[:2])
-        lifted = self.sections.lifted(slice(0, self.problem.shape[0]), deficit)
+        lifted = self.sections.lifted(slice(0, self.problem.residuals.shape[1]), deficit)
         return JointFit(lifted, (excess + deficit) * NEPER_DB)
 
 

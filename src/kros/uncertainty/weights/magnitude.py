@@ -1,9 +1,18 @@
 r"""Log-Chebyshev fit of one magnitude by a stable, minimum-phase system from above.
 
 Of all squared magnitudes `n / d` of one order with `m^2 <= n / d <= gamma m^2` on the grid, the one with the smallest
-`gamma` is found: a quasi-convex problem, solved by a handful of linear programs (`programs`). After every program the
-true ratios are recomputed, `n` is lifted by the deficit, and both are proven positive on the whole axis by the location
-of their roots. In `tau = tan^2(theta / 2)` the fit holds its precision over six decades and more (`rational`).
+`gamma` is found: a quasi-convex problem in the coefficients a and b of n and d (`rational`). Dinkelbach's iteration
+solves it by linear programs, with `e` the denominator of the step before and mean(d / e) = 1:
+
+    minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i
+
+It converges superlinearly to the global optimum, from any denominator. Rows are relative to the denominator, columns to
+their largest entry, because programs are solved to absolute tolerances. After every program the true ratios are
+recomputed, `n` is lifted by the deficit, and both are proven positive on the whole axis by the location of their roots.
+
+References
+----------
+W. Dinkelbach, "On nonlinear fractional programming", Management Science 13 (1967) 492-498.
 """
 
 from __future__ import annotations
@@ -21,8 +30,7 @@ from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from ..settings import MAGNITUDE
-from .programs import Grid
-from .rational import RationalMagnitude
+from .rational import RationalMagnitude, basis
 from .sections import Sections
 
 Array = npt.NDArray[Any]
@@ -32,38 +40,21 @@ _LOG = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class FittedMagnitude:
-    """A system whose magnitude bounds data.
+    """A system whose magnitude bounds data."""
 
-    Parameters
-    ----------
-    system : StateSpace
-        One input, one output, stable and minimum phase.
-    order : int
-    overbound_db : float, dB
-        Largest distance between the system's magnitude and the data; the smallest is zero.
-    within_tolerance : bool
-        Whether `overbound_db` is within the tolerance.
+    system: StateSpace  # one input, one output, stable and minimum phase
+    overbound_db: float  # largest distance between the system's magnitude and the data; the smallest is zero
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.uncertainty import fit_magnitude
-    >>> freqs_hz = np.geomspace(0.1, 50, 30)
-    >>> fit_magnitude(freqs_hz, 1 / (1 + freqs_hz / 5), 0.01, max_order=2).within_tolerance
-    True
-    """
-
-    system: StateSpace
-    order: int
-    overbound_db: float
-    within_tolerance: bool
+    @property
+    def order(self) -> int:
+        """Number of states."""
+        return self.system.n_states
 
 
 def fit_magnitude(
     freqs_hz: npt.ArrayLike,
     magnitude: npt.ArrayLike,
     sample_period_s: float,
-    order: int | None = None,
     *,
     max_order: int = 4,
     tolerance_db: float = 1.0,
@@ -77,16 +68,16 @@ def fit_magnitude(
     magnitude : array_like, shape (n_freqs,)
         Non-negative. Values below 1e-8 of the largest count as that; all zero gives the zero system.
     sample_period_s : float, s
-    order : int, optional
-        Best fit of at most this order; by default the smallest order within the tolerance, or the best up to
-        `max_order`.
     max_order : int
+        The smallest order within the tolerance is taken, or the best up to this one.
     tolerance_db : float, dB
         Distance at which a lower order is good enough.
 
     Returns
     -------
     FittedMagnitude
+        With ``system``, ``order`` and ``overbound_db``. The bound holds at the given frequencies, for the system as
+        returned; between them the fit is smooth, and positive.
 
     Raises
     ------
@@ -96,10 +87,6 @@ def fit_magnitude(
         A negative order, or frequencies that are no grid.
     KrosError
         When no program of any order could be solved.
-
-    Notes
-    -----
-    The bound holds at the given frequencies, for the system as returned. Between them the fit is smooth, and positive.
 
     Examples
     --------
@@ -111,72 +98,66 @@ def fit_magnitude(
     >>> bool(np.all(gain_at_freqs >= 1 / np.hypot(1.0, freqs / 3.0) + 0.01))
     True
     """
-    freqs = check_grid(freqs_hz, sample_period_s)
+    freqs, dt, best = check_grid(freqs_hz, sample_period_s), sample_period_s, None
     values = _check_magnitude(magnitude, freqs)
-    highest = max_order if order is None else order
-    if highest < 0:
-        raise ConfigError(f"Magnitude fit: orders should not be negative, found order {order}, max_order {max_order}.")
+    if max_order < 0:
+        raise ConfigError(f"Magnitude fit: max_order should not be negative, found {max_order}.")
     if not values.any():
-        return FittedMagnitude(gain([[0.0]], sample_period_s), 0, 0.0, True)
-    tau, best = bilinear_squared(freqs, sample_period_s), None
-    for bound in rising_bounds(tau, values, highest):
-        fitted = _touching(bound, freqs, values, sample_period_s, tolerance_db)
-        if best is None or fitted.overbound_db < best.overbound_db:
-            best = fitted
-        if order is None and best.within_tolerance:
+        return FittedMagnitude(gain([[0.0]], dt), 0.0)
+    for bound in rising_bounds(bilinear_squared(freqs, dt), values, max_order):
+        fitted = _touching(bound, freqs, values, dt)
+        best = fitted if best is None or fitted.overbound_db < best.overbound_db else best
+        if best.overbound_db <= tolerance_db:
             break
     if best is None:
-        problem = f"Magnitude fit: no system of order up to {highest} fits {len(freqs)} points"
-        raise KrosError(f"{problem}; raise the order or smooth the data.")
+        raise KrosError("Magnitude fit: no program of any order was solved; look at the magnitudes.")
     return best
 
 
 @dataclass(frozen=True, eq=False)
 class Bound:
-    """A bound of magnitudes on a grid, and how far above them it is at most, dB."""
+    """Best bound of one order."""
 
     order: int
-    sections: Sections
+    sections: Sections  # above the data
     excess_db: float
 
 
 def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Bound]:
-    """Yield the tightest bounds of positive magnitudes at increasing tau, each better than those before."""
+    """Yield the tightest bounds of positive magnitudes at increasing tau, order by order, or a better lower one."""
     values = np.maximum(magnitude, MAGNITUDE.floor * magnitude.max())
     unit = float(np.exp(np.mean(np.log(values))))
-    targets, lower = (values / unit) ** 2, None
+    targets = (values / unit) ** 2
+    best, ratio, bound = RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0)), np.inf, None
     for order in range(max_order + 1):
-        best = _best(tau, targets, order, lower)
-        if best is None:
-            continue
-        lower, ratio = best, float((best(tau) / targets).max())
-        try:
-            sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
-        except KrosError as error:
-            _LOG.debug("Magnitude fit: %s", error)
-            continue
-        yield Bound(order, sections, 10 * float(np.log10(ratio)))
+        better = best if not order else _best(tau, targets, order, ratio)
+        if better is not None:
+            best, ratio = better, float((better(tau) / targets).max())
+            try:
+                sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
+                bound = Bound(order, sections, 10 * float(np.log10(ratio)))
+            except KrosError as error:
+                _LOG.debug("Magnitude fit: %s", error)
+        if bound is not None:
+            yield bound
         if ratio < MAGNITUDE.exact:
             break
 
 
-def _touching(bound: Bound, freqs: Array, values: Array, dt: float, tolerance_db: float) -> FittedMagnitude:
+def _touching(bound: Bound, freqs: Array, values: Array, dt: float) -> FittedMagnitude:
     """Return the system of a bound, scaled until it touches the values as evaluated."""
     (system,) = bound.sections.systems(dt)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
-    touch, overbound_db = (1 + 1e-12) / ratio.min(), float(20 * np.log10(ratio.max() / ratio.min()))
+    touch = (1 + 4 * np.finfo(float).eps) / ratio.min()
     lifted = StateSpace(system.A, system.B, system.C * touch, system.D * touch, dt)
-    return FittedMagnitude(lifted, system.n_states, overbound_db, overbound_db <= tolerance_db)
+    return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
 
 
-def _best(tau: Array, targets: Array, order: int, lower: RationalMagnitude | None) -> RationalMagnitude | None:
-    """Return the best n / d of one order above the targets, positive on the whole axis, better than a lower one."""
-    if lower is None:
-        return RationalMagnitude(np.array([targets.max()]), np.ones(1), np.zeros(0))
+def _best(tau: Array, targets: Array, order: int, gamma: float) -> RationalMagnitude | None:
+    """Return the best n / d of one order above the targets, positive on the whole axis, of a ratio below gamma."""
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
-    gamma = float((lower(tau) / targets).max())
     for _ in range(MAGNITUDE.rounds):
-        best = Grid.of(tau, targets, knots, cuts).best(targets**-0.5, gamma)  # n and d share the slope
+        best = _Grid.of(tau, targets, knots, cuts).best(gamma)
         try:
             zeros = best.not_positive() if best is not None else []
         except KrosError as error:  # multiple roots
@@ -189,16 +170,78 @@ def _best(tau: Array, targets: Array, order: int, lower: RationalMagnitude | Non
 
 
 def _bends(tau: Array, log: Array, count: int) -> Array:
-    """Return log tau, shape (count,), as dense as log magnitudes bend over log tau, plus a share evenly spaced."""
+    """Return log tau, shape (count,), half as dense as log magnitudes bend over log tau, half evenly spaced."""
     inside = (tau > 0) & (tau < MAGNITUDE.highest)
     if inside.sum() < 3:
         return np.linspace(-MAGNITUDE.highest, 0.0, count + 2)[1:-1]
     x = np.log(tau[inside])
     middle = (x[1:] + x[:-1]) / 2
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
-    bend = bend / bend[-1] if bend[-1] > 0 else bend
-    share = (1 - MAGNITUDE.even) * bend + MAGNITUDE.even * (middle - middle[0]) / (middle[-1] - middle[0])
+    share = bend / max(bend[-1], np.finfo(float).tiny) + (middle - middle[0]) / (middle[-1] - middle[0])
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Squared magnitudes f to stay above, with the basis evaluated there."""
+
+    targets: Array  # (n_points,)
+    knots: Array  # (order,)
+    phi: Array  # (n_points, order + 1)
+    edge: Array  # (n_edges, order + 1): rows that keep n and d from falling at DC, Nyquist and cuts
+    nearest: Array  # (n_edges,): grid points next to these
+
+    @classmethod
+    def of(cls, tau: Array, targets: Array, knots: Array, cuts: Array) -> _Grid:
+        """Evaluate the basis on a grid."""
+        phi = basis(tau, knots)
+        nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
+        edge = MAGNITUDE.edge * phi[nearest] - basis(np.concatenate([[0.0], cuts, [np.inf]]), knots)
+        return cls(targets, knots, phi, edge, nearest)
+
+    def best(self, gamma: float) -> RationalMagnitude | None:
+        """Return the bound of the smallest ratio; None where none is below gamma."""
+        best, scale, settled = None, self.targets**-0.5, False  # n and d share the slope
+        while not settled:
+            solution = self._solved(scale, gamma)
+            if solution is None:
+                break
+            n, d = self.phi @ solution[0], self.phi @ solution[1]
+            if not ((d > 0) & (n > 0)).all():
+                break
+            ratio = n / (self.targets * d)
+            spread = float(ratio.max() / ratio.min())
+            if spread >= gamma * MAGNITUDE.settled:
+                break
+            best, settled = (
+                RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots),
+                spread < MAGNITUDE.exact,
+            )
+            gamma, scale = spread, d
+        return best
+
+    def _solved(self, scale: Array, gamma: float) -> tuple[Array, Array] | None:
+        """Minimise t over (a, b, t); return a and b."""
+        from scipy.optimize import linprog
+
+        d = self.phi / scale[:, None]
+        n = d / self.targets[:, None]
+        edge, size = self.edge / scale[self.nearest, None], self.phi.shape[1]
+        one, none = np.ones((len(n), 1)), np.zeros_like(edge)
+        rows = [np.hstack([n / gamma, -d, -one]), np.hstack([-n, d, 0 * one])]
+        rows.append(np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]))
+        rows.append(np.hstack([none, edge, none[:, :1]]))
+        with np.errstate(all="ignore"):
+            unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
+            table = np.vstack(rows) * unit
+            table /= np.abs(table).max(axis=1, keepdims=True)
+        if not np.isfinite(table).all():  # a basis function that is zero on the grid
+            return None
+        norm = np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]]) * unit
+        cost, zero = np.eye(2 * size + 1)[-1], np.zeros(len(table))
+        exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+        solved = linprog(cost, table, zero, norm[None], [1.0], (None, None), "highs-ds", options=exact)
+        return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
 
 
 def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:

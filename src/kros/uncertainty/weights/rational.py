@@ -25,6 +25,8 @@ from .sections import Sections
 
 Array = npt.NDArray[Any]
 
+_ROUNDING = 4096 * np.finfo(float).eps
+
 
 @dataclass(frozen=True, eq=False)
 class RationalMagnitude:
@@ -42,7 +44,7 @@ class RationalMagnitude:
     def not_positive(self) -> list[float]:
         """Return the tau >= 0 at which numerator or denominator vanish."""
         sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
-        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= MAGNITUDE.real * abs(r))
+        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
 
     def factor(self) -> Sections:
         """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
@@ -56,7 +58,7 @@ class RationalMagnitude:
         sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
         zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in sides)
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
-        if not (distance > MAGNITUDE.inside).all():
+        if not (distance > _ROUNDING / 10).all():
             raise KrosError(
                 f"Spectral factor: a pole or zero is {distance.min():.1e} from the unit circle, which double precision "
                 "does not hold; try another order."

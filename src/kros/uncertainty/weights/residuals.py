@@ -13,8 +13,8 @@ import numpy.typing as npt
 from ...core.lti import StateSpace
 from ...core.small_matrices import sigma_max
 from ..forms import Form, completion, residual
-from ..settings import SET
-from .pencils import ResidualSystems
+from ..settings import FIT, SET
+from .proof import ResidualSystems
 
 Array = npt.NDArray[Any]
 
@@ -38,8 +38,9 @@ class Residuals:
         """Return those of some units."""
         return self if len(rows) == len(self) else replace(self, rows=self.rows[rows])
 
-    def blocks(self, size: int) -> Iterator[Array]:
+    def blocks(self, size: int | None = None) -> Iterator[Array]:
         """Yield positions of units, so many at a time."""
+        size = size or FIT.block
         return (np.arange(start, min(start + size, len(self))) for start in range(0, len(self), size))
 
     @cached_property
@@ -63,24 +64,21 @@ class Residuals:
         """The systems behind these residuals."""
         if self.systems is None:
             return None
-        nominal, units = self.systems
-        return ResidualSystems(self.form, nominal, units[self.rows], self.remainder)
+        return ResidualSystems(self.form, self.systems[0], self.systems[1][self.rows], self.remainder)
 
     def modes_hz(self, grid_hz: Array) -> Array:
-        """Return frequencies around modes that a grid from DC to Nyquist passes over; none of responses alone."""
-        if self.realised is None:
-            return np.zeros(0)
-        return replace(self.realised, remainder=False).modes_hz(grid_hz)
+        """Return frequencies of modes that a grid from DC to Nyquist passes over; none of responses alone."""
+        return np.zeros(0) if self.realised is None else replace(self.realised, remainder=False).modes_hz(grid_hz)
 
-    def deciding(self, freqs_hz: Array, block: int) -> Array:
-        """Return the units that are the largest at some frequency, by singular value or by an entry; all if few."""
-        if len(self) <= block:
-            return np.arange(len(self))
+    def deciding(self, freqs_hz: Array) -> Residuals:
+        """Return those of units that are the largest at some frequency, by singular value or by an entry."""
+        if len(self) <= FIT.block:
+            return self
         largest, who = [], []
-        for rows in self.blocks(block):
+        for rows in self.blocks():
             E = self.of(rows).at(freqs_hz)
             entries = np.moveaxis(np.abs(E).reshape(*E.shape[:2], -1), 2, 0)
             sizes = np.concatenate([sigma_max(E)[None], entries])
             largest.append(sizes.max(axis=1))
             who.append(rows[sizes.argmax(axis=1)])
-        return np.unique(np.take_along_axis(np.array(who), np.argmax(largest, axis=0)[None], axis=0))
+        return self.of(np.unique(np.take_along_axis(np.array(who), np.argmax(largest, axis=0)[None], axis=0)))

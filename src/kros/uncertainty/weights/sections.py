@@ -25,7 +25,7 @@ from ..settings import MAGNITUDE
 
 Array = npt.NDArray[Any]
 
-_TINY = np.finfo(float).tiny
+_FLOAT = np.finfo(float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,13 +88,12 @@ class Sections:
         by_width = (extra * v / q)[self.pair]
         return np.vstack([np.ones((len(self.level), len(tau))), -half * by_corner, half[self.pair] * by_width])
 
-    def moved(self, step: Array, ends: tuple[float, float]) -> Sections:
-        """Return sections with all parameters moved, corners kept within ends."""
-        n, k = len(self.level), len(self.corner)
+    def at(self, parameters: Array, ends: tuple[float, float]) -> Sections:
+        """Return sections of other parameters, corners kept within ends."""
+        level, corner, pairs = np.split(parameters, [len(self.level), len(self.level) + len(self.corner)])
         width = self.width.copy()
-        width[self.pair] = np.clip(width[self.pair] + step[n + k :], np.log(4 * MAGNITUDE.damping**2), MAGNITUDE.widest)
-        corner = np.clip(self.corner + step[n : n + k], *ends)
-        return replace(self, level=self.level + step[:n], corner=corner, width=width)
+        width[self.pair] = np.clip(pairs, np.log(4 * MAGNITUDE.damping**2), MAGNITUDE.widest)
+        return replace(self, level=level, corner=np.clip(corner, *ends), width=width)
 
     def lifted(self, entries: slice, by: float) -> Sections:
         """Return sections with the levels of some entries raised."""
@@ -109,63 +108,49 @@ class Sections:
     def _system(self, entry: int, dt: float) -> StateSpace:
         """Return `factor * prod (w - q) / prod (w - p)` as a cascade, poles beside the zeros next to them in size."""
         constant = (np.where(self.pair, 1.0, 0.5) * self.corner * self.sign)[self.entry == entry].sum()
-        total, sections = np.exp(self.level[entry] - constant), []
+        system = gain([[np.exp(self.level[entry] - constant)]], dt)
         for q, p in zip(self._roots(entry, 1.0), self._roots(entry, -1.0), strict=True):
-            total *= float(np.real(np.prod([1 - x for x in q]) / np.prod([1 - x for x in p])))
-            sections.append(_section([_to_zeta(x) for x in q], [_to_zeta(x) for x in p], dt))
-        system = gain([[total]], dt)
-        for section in sections:
-            system = section @ system
+            factor = float(np.real(np.prod(1 - q) / np.prod(1 - p)))
+            system = _section(2 * q / (1 - q), 2 * p / (1 - p), factor, dt) @ system  # from w to zeta, nothing cancels
         return system
 
-    def _roots(self, entry: int, sign: float) -> list[list[complex]]:
+    def _roots(self, entry: int, sign: float) -> list[Array]:
         """Return the roots in w of every section, pairs first."""
         rows = np.flatnonzero((self.entry == entry) & (self.sign == sign))
-        roots: list[list[complex]] = []
+        roots = []
         for k in rows[np.lexsort((self.corner[rows], ~self.pair[rows]))]:
             size, half = np.exp(self.corner[k] / 2), np.exp(self.width[k] / 2) / 2
-            if not self.pair[k]:
-                roots.append([complex(-size)])
-            elif half < 1:
-                root = size * complex(-half, np.sqrt((1 - half) * (1 + half)))
-                roots.append([root, root.conjugate()])
-            else:
-                large = half + np.sqrt((half - 1) * (half + 1))
-                roots.append([complex(-size * large), complex(-size / large)])
+            apart = np.sqrt(complex((half - 1) * (half + 1)))
+            large = half + apart
+            roots.append(-size * np.array([large, 1 / large] if self.pair[k] else [1.0 + 0j]))
         return roots
 
     def _variables(self, tau: Array) -> tuple[Array, Array]:
-        u = np.minimum(tau, MAGNITUDE.far) * np.exp(-self.corner)[:, None]
-        return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _TINY)
+        u = np.minimum(tau, np.cbrt(_FLOAT.max)) * np.exp(-self.corner)[:, None]
+        return u, np.maximum(1 + (np.exp(self.width)[:, None] - 4) * u / (1 + u) ** 2, _FLOAT.tiny)
 
 
 def _paired(roots: Sequence[complex]) -> list[tuple[bool, float, float]]:
     """Return sections (pair, x, y) of roots: complex pairs, real ones with their neighbours."""
-    real = sorted(-r.real for r in roots if abs(r.imag) <= MAGNITUDE.real_section * abs(r))
-    upper = [r for r in roots if r.imag > MAGNITUDE.real_section * abs(r)]
-    rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _TINY)) for r in upper]
+    real = sorted(-r.real for r in roots if abs(r.imag) <= np.sqrt(_FLOAT.eps) * abs(r))
+    upper = [r for r in roots if r.imag > np.sqrt(_FLOAT.eps) * abs(r)]
+    rows = [(True, 2 * np.log(abs(r)), np.log(4 * (r.real / abs(r)) ** 2 + _FLOAT.tiny)) for r in upper]
     if len(real) % 2:
         rows.append((False, 2 * np.log(real.pop(len(real) // 2)), 0.0))
     pairs = zip(real[::2], real[1::2], strict=True)
     return rows + [(True, np.log(a * b), np.log((a + b) ** 2 / (a * b))) for a, b in pairs]
 
 
-def _to_zeta(w: complex) -> complex:
-    """From w to zeta = z - 1, without a subtraction near one."""
-    return 2 * w / (1 - w)
-
-
-def _section(q: list[complex], p: list[complex], dt: float) -> StateSpace:
-    """Section `(zeta - q) / (zeta - p)` of first or second order, with unit feedthrough."""
+def _section(q: Array, p: Array, factor: float, dt: float) -> StateSpace:
+    """Section `factor (zeta - q) / (zeta - p)` of first or second order."""
     if len(p) == 1:
-        step = p[0].real - q[0].real
+        step = float(np.real(p[0] - q[0]))
         size = np.sqrt(abs(step))
         A, B, C = np.array([[1 + p[0].real]]), np.array([[size]]), np.array([[np.copysign(size, step)]])
-        return StateSpace(A, B, C, np.ones((1, 1)), dt)
-    # Numerator minus denominator: b1 zeta + b0.
-    b1, b0 = np.real(p[0] + p[1] - q[0] - q[1]), np.real(q[0] * q[1] - p[0] * p[1])
-    kappa, slow = np.sqrt(np.real(p[0] * p[1])), -p[0].real
+        return StateSpace(A, B, factor * C, np.array([[factor]]), dt)
+    b1, b0 = np.real(p.sum() - q.sum()), np.real(q.prod() - p.prod())  # numerator minus denominator: b1 zeta + b0
+    kappa, slow = np.sqrt(np.real(p.prod())), -p[0].real
     A = np.array([[1 - slow, kappa], [-(p[0].imag ** 2) / kappa, 1 + p[1].real]])
     C = np.array([[(b0 - b1 * slow) / kappa, b1]])
-    size = np.sqrt(max(float(np.abs(C).max()), np.finfo(float).tiny))
-    return StateSpace(A, np.array([[0.0], [size]]), C / size, np.ones((1, 1)), dt)
+    size = np.sqrt(max(float(np.abs(C).max()), _FLOAT.tiny))
+    return StateSpace(A, np.array([[0.0], [size]]), factor * C / size, np.array([[factor]]), dt)

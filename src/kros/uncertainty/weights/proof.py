@@ -1,0 +1,286 @@
+r"""What a weight promises between grid points: the largest `sigma_max(W_L^-1 E_k W_R^-1)` over all frequencies.
+
+**Level sets**: where units and nominal are systems, so is every `M_k = W_L^-1 E_k W_R^-1`, and a singular value of it
+equals gamma exactly where a pencil is singular for an imaginary s. The gain is evaluated at and between its eigenvalues
+until no level higher by more than the margin is met by any unit. Eigenvalues are rounded: the pencil is tried first at
+a level below the peak, where the grid has all crossings, and when it misses one the proof is refused. **Grid**:
+responses alone, continuous systems and refused proofs have the peaks of a dense grid, which proves nothing between its
+points.
+
+Residuals, what forms leave out, and their ratios to weights are descriptor systems, `s F x = A x + B u, y = C x + D u`
+with `s = (z - 1) / (z + 1)`. Sums, products and inverses of descriptors are descriptors, and so is a pseudo-inverse,
+with P~ the adjoint system: for a tall P, `x = P^+ d` is `P~ (d - P x) = 0`, and for a wide one it is transposed.
+
+References
+----------
+N. A. Bruinsma and M. Steinbuch, "A fast algorithm to compute the H-infinity norm of a transfer function matrix",
+Systems & Control Letters 14 (1990) 287-293.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ...core.frequency import nyquist_hz
+from ...core.lti import StateSpace
+from ...core.norms import to_continuous
+from ..forms import Form
+from ..settings import PROOF
+
+Array = npt.NDArray[Any]
+Ratio = Callable[[Array], Array]
+
+_LOG = logging.getLogger(__name__)
+_OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+
+
+class Method(str, Enum):
+    """How the bound between grid points is known."""
+
+    GRID = "grid"
+    LEVEL_SETS = "level sets"
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Largest ratio over all frequencies, attained at `freq_hz`."""
+
+    method: Method
+    peak: float
+    freq_hz: float
+
+    @property
+    def bound(self) -> float:
+        """What no ratio exceeds, by level sets; the largest one that was evaluated, on a grid."""
+        return self.peak * (1 + PROOF.margin) if self.method is Method.LEVEL_SETS else self.peak
+
+
+def certify(ratio: Ratio, freqs_hz: Array, known: Array, pencils: list[Descriptor], dt: float) -> Certificate:
+    """Return the largest ratio (unit, n) from DC to Nyquist, from a dense grid, Hz, by level sets if possible."""
+    freq, peak = _sharpened(ratio, freqs_hz, known.max(axis=0))
+    if not pencils or peak <= 0 or not _trusted(pencils, freqs_hz, known, dt):
+        return Certificate(Method.GRID, peak, freq)
+    for _ in range(PROOF.levels):
+        points = np.unique(np.concatenate([_candidates(p, peak * (1 + PROOF.margin), dt) for p in pencils]))
+        values = ratio(points).max(axis=0)
+        top = int(values.argmax())
+        if values[top] <= peak * (1 + PROOF.margin):
+            return Certificate(Method.LEVEL_SETS, peak, freq)
+        peak, freq = float(values[top]), float(points[top])
+    return Certificate(Method.GRID, peak, freq)
+
+
+def _sharpened(ratio: Ratio, freqs_hz: Array, known: Array) -> tuple[float, float]:
+    """Return frequency and height of the highest peak, searched for between its neighbours."""
+    from scipy.optimize import minimize_scalar
+
+    top = int(known.argmax())
+    ends = freqs_hz[max(top - 1, 0)], freqs_hz[min(top + 1, len(freqs_hz) - 1)]
+    best = minimize_scalar(lambda f: -ratio(np.array([f])).max(), bounds=ends, method="bounded")
+    return max((float(freqs_hz[top]), float(known[top])), (float(best.x), -float(best.fun)), key=lambda peak: peak[1])
+
+
+def _crossings_hz(pencil: Descriptor, gamma: float, dt: float) -> Array:
+    """Return the frequencies, Hz, at which a singular value may equal gamma."""
+    s = pencil.crossings(gamma)
+    near = s[(np.abs(s.real) <= PROOF.near * np.abs(s)) & (s.imag > 0)].imag
+    return np.unique(np.arctan(near) / (np.pi * dt))
+
+
+def _candidates(pencil: Descriptor, gamma: float, dt: float) -> Array:
+    """Return the crossings of a level and points between them."""
+    points = _crossings_hz(pencil, gamma, dt)
+    ends = np.concatenate([[0.0], points, [nyquist_hz(dt)]])
+    return np.concatenate([ends, (ends[1:] + ends[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])
+
+
+def _trusted(pencils: list[Descriptor], freqs_hz: Array, known: Array, dt: float) -> bool:
+    """Tell whether the pencil of the worst unit has an eigenvalue at every crossing that the grid shows."""
+    unit = int(known.max(axis=1).argmax())
+    level = PROOF.probe * float(known[unit].max())
+    above = known[unit] > level
+    crossing = np.flatnonzero(above[1:] != above[:-1])
+    at = _crossings_hz(pencils[unit], level, dt)
+    low, high = freqs_hz[crossing] * (1 - PROOF.near), freqs_hz[crossing + 1] * (1 + PROOF.near)
+    seen = np.searchsorted(at, high, side="right") > np.searchsorted(at, low)
+    if not seen.all():
+        _LOG.debug("Certificate: %d of %d crossings have no eigenvalue; the grid decides", (~seen).sum(), len(seen))
+    return bool(seen.all())
+
+
+@dataclass(frozen=True, eq=False)
+class Descriptor:
+    """`s F x = A x + B u, y = C x + D u`."""
+
+    F: Array
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+    @classmethod
+    def of(cls, system: StateSpace) -> Descriptor:
+        """Return a discrete system."""
+        mapped = to_continuous(system)
+        return cls(np.eye(mapped.n_states), mapped.A, mapped.B, mapped.C, mapped.D)
+
+    @classmethod
+    def identity(cls, size: int) -> Descriptor:
+        """Return ones."""
+        none = np.zeros((0, 0))
+        return cls(none, none, np.zeros((0, size)), np.zeros((size, 0)), np.eye(size))
+
+    def __matmul__(self, first: Descriptor) -> Descriptor:
+        """Return the series connection, the other one first."""
+        A = _diagonal(first.A, self.A)
+        A[len(first.A) :, : len(first.A)] = self.B @ first.C
+        B, C = np.vstack([first.B, self.B @ first.D]), np.hstack([self.D @ first.C, self.C])
+        return Descriptor(_diagonal(first.F, self.F), A, B, C, self.D @ first.D)
+
+    def __sub__(self, other: Descriptor) -> Descriptor:
+        """Return the difference of two systems with the same input."""
+        F, A = _diagonal(self.F, other.F), _diagonal(self.A, other.A)
+        return Descriptor(F, A, np.vstack([self.B, other.B]), np.hstack([self.C, -other.C]), self.D - other.D)
+
+    @property
+    def transposed(self) -> Descriptor:
+        """The system with the transposed response."""
+        return Descriptor(self.F.T, self.A.T, self.C.T, self.B.T, self.D.T)
+
+    def inverse(self) -> Descriptor:
+        """Return the inverse of a square system: its input is one more unknown, `C x + D u = y`."""
+        n, m = self.B.shape
+        A = np.block([[self.A, self.B], [self.C, self.D]])
+        B, C = np.vstack([np.zeros((n, m)), -np.eye(m)]), np.hstack([np.zeros((m, n)), np.eye(m)])
+        return Descriptor(_diagonal(self.F, np.zeros((m, m))), A, B, C, np.zeros((m, m)))
+
+    def pseudo_inverse(self) -> Descriptor:
+        """Return the least-squares or least-norm inverse of a system with F = 1, by its adjoint system."""
+        n, (p, m) = len(self.A), self.D.shape
+        if p < m:
+            return self.transposed.pseudo_inverse().transposed
+        r = np.hstack([-self.C, np.zeros((p, n)), -self.D])  # of unknowns: states, adjoint states, x; P~ r = 0
+        A = np.block([[self.A, np.zeros((n, n)), self.B], [-self.C.T @ r], [self.D.T @ r]])
+        A[n : 2 * n, n : 2 * n] -= self.A.T
+        A[2 * n :, n : 2 * n] += self.B.T
+        B = np.vstack([np.zeros((n, p)), -self.C.T, self.D.T])
+        C = np.hstack([np.zeros((m, 2 * n)), np.eye(m)])
+        return Descriptor(np.diag(np.repeat([1.0, 0.0], [2 * n, m])), A, B, C, np.zeros((m, p)))
+
+    def crossings(self, gamma: float) -> Array:
+        r"""Return the s at which a singular value may equal gamma.
+
+        They are the finite eigenvalues of
+
+        [ A - s F     0                B                ]
+        [ -C^T C      -A^T - s F^T     -C^T D           ]
+        [ D^T C       B^T              D^T D - gamma^2  ]
+        """
+        n, m = self.B.shape
+        C, D = self.C, self.D
+        below = [[-C.T @ C, -self.A.T, -C.T @ D], [D.T @ C, self.B.T, D.T @ D - gamma**2 * np.eye(m)]]
+        left = np.block([[self.A, np.zeros((n, n)), self.B], *below])
+        return _eigenvalues(left, _diagonal(self.F, self.F.T, np.zeros((m, m))))
+
+    def poles(self) -> Array:
+        """Return the finite eigenvalues of the pencil."""
+        return _eigenvalues(self.A, self.F)
+
+
+def _diagonal(*blocks: Array) -> Array:
+    from scipy.linalg import block_diag
+
+    return np.asarray(block_diag(*blocks), float)
+
+
+def _eigenvalues(left: Array, right: Array) -> Array:
+    """Return the finite eigenvalues of a pencil whose rows and columns are brought to sizes near one."""
+    from scipy.linalg import eigvals
+
+    if not len(left):
+        return np.zeros(0)
+    for axis in (0, 1) * 6:
+        size = np.maximum(np.abs(left).max(axis=axis, keepdims=True), np.abs(right).max(axis=axis, keepdims=True))
+        scale = 2.0 ** -np.round(np.log2(np.where(size > 0, size, 1.0)) / 2)
+        left, right = left * scale, right * scale
+    with np.errstate(all="ignore"):
+        values = eigvals(left, right)
+    return np.asarray(values[np.isfinite(values)])
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualSystems:
+    """The discrete systems behind residuals, scaled as these are; units with the unit axis first."""
+
+    form: Form
+    nominal: StateSpace
+    units: StateSpace
+    remainder: bool = False  # what the form leaves out is bounded in place of the residual
+
+    def __iter__(self) -> Iterator[Descriptor]:
+        G = Descriptor.of(self.nominal)
+        for k in range(self.units.batch_shape[0]):
+            Gp = Descriptor.of(self.units[k])
+            yield _remainder(self.form, G, Gp) if self.remainder else _residual(self.form, G, Gp)
+
+    def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
+        """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""
+        if self.remainder and leaves_nothing(self.form, self.nominal.n_outputs, self.nominal.n_inputs):
+            return []
+        before, after = (Descriptor.of(invert(w)) for w in (right, left))
+        parts = [after @ part @ before for part in self]
+        return parts if 2 * len(parts[0].A) + parts[0].B.shape[1] <= PROOF.rows else []
+
+    def modes_hz(self, grid_hz: Array) -> Array:
+        """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
+        dt = self.nominal.dt
+        plants = (self.nominal, *(self.units[k] for k in range(self.units.batch_shape[0])))
+        modes = np.concatenate([s.poles() for s in (*self, *map(Descriptor.of, plants))]).astype(complex)
+        omega = modes.imag[modes.imag > 0]
+        half = np.abs(modes.real[modes.imag > 0])
+        at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)
+        narrow = (width_hz < np.interp(at_hz, grid_hz, np.gradient(grid_hz))) & (at_hz <= grid_hz[-1])
+        around = omega[narrow] + half[narrow] * np.array([[-1.0], [0.0], [1.0]])
+        return np.unique(np.arctan(around[around > 0]) / (np.pi * dt)).clip(max=grid_hz[-1])
+
+
+def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
+    """Tell whether a form rebuilds every regular unit of a shape exactly."""
+    if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
+        return form is Form.ADDITIVE or n_outputs == n_inputs
+    return n_outputs >= n_inputs if form in _OUTPUT_SIDE else n_outputs <= n_inputs
+
+
+def _residual(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
+    """Return the residual of a form, as in `forms.residual`."""
+    difference = Gp - G
+    if form is Form.ADDITIVE:
+        return difference
+    inverse = (Gp if form.inverse else G).pseudo_inverse()
+    if form in _OUTPUT_SIDE:
+        return difference @ inverse
+    return inverse @ difference @ G.pseudo_inverse() if form is Form.INVERSE_ADDITIVE else inverse @ difference
+
+
+def _remainder(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
+    """Return the remainder of a form: the unit minus what `forms.rebuild` makes of the residual."""
+    E = _residual(form, G, Gp)
+    if not form.inverse:
+        return (Gp - G) - (E @ G if form in _OUTPUT_SIDE else G @ E)
+    loop = E @ G if form is Form.INVERSE_ADDITIVE else E
+    inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
+    return Gp - (inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse)
+
+
+def invert(system: StateSpace) -> StateSpace:
+    """Return the inverse of a square system with a regular feedthrough."""
+    D = np.linalg.inv(system.D)
+    B = system.B @ D
+    return StateSpace(system.A - B @ system.C, B, -D @ system.C, D, system.dt)

@@ -152,7 +152,6 @@ def test_the_deployed_observer_is_exported(kros, demo, tmp_path, command):
     result = kros("export", command, demo, out)
     assert result.exit_code == 0, result.output
     assert out.exists()
-    assert command == "fmu" or "numerical error on" in result.output
     assert kros("export", command, demo, tmp_path / "other.fmu", "--observer", "nobody").exit_code == 2
     assert not (tmp_path / "other.fmu").exists()
 

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from kros.core.store import describe, read_manifest, write_manifest
 from kros.data import Channel, Population, Role, from_arrays, write_parquet
 from kros.plants import PLANTS
 
@@ -69,8 +70,11 @@ def lifted(demo: Path, tmp_path_factory) -> Path:
     """The demo's run as if its observer with parameters had been chosen."""
     run = tmp_path_factory.mktemp("lifted") / "run"
     shutil.copytree(demo, run)
-    (run / "observers" / "deployed.json").unlink()
-    shutil.copyfile(run / "observers" / "koopman" / "estimator.json", run / "observers" / "deployed.json")
+    deployed, manifest = run / "observers" / "deployed.json", read_manifest(run)
+    deployed.unlink()
+    shutil.copyfile(run / "observers" / "koopman" / "estimator.json", deployed)
+    manifest["synthesize"].files["observers/deployed.json"] = describe(deployed)
+    write_manifest(run, manifest)
     return run
 
 

@@ -25,7 +25,8 @@ from problems import DT, QUADRATIC
 
 from kros.core import StateSpace, h2_norm, hinf_norm
 from kros.core.frequency import log_grid
-from kros.data import read, write_raw
+from kros.data import read
+from kros.data.readers.motor_drive_raw import write_raw
 from kros.identify import edmd, free_run
 from kros.identify.factors import reduce_episode
 from kros.observer import run_observer

@@ -101,8 +101,8 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
     from kros.identify.presets import resolve_lifting, resolve_phase
     from kros.identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
     from kros.uncertainty.outliers.population import score_population
-    from kros.uncertainty.quantify import choose_unit, quantify_kind
-    from kros.uncertainty.settings import UncertaintySettings
+    from kros.uncertainty.quantify import choose_unit
+    from kros.uncertainty.settings import QuantifySettings
 
     times: Times = {}
     memory: Times = {}
@@ -120,7 +120,7 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
             flush=True,
         )
 
-    settings = UncertaintySettings.of({"n_freqs": POINTS, "max_order": ORDER}, "fleet")
+    settings = QuantifySettings.of({"n_freqs": POINTS, "max_order": ORDER}, "fleet")
     with stage("open"):
         population = kros.read(recordings)
     lifting = resolve_lifting(LiftingSettings(), CalibrationSettings(), population)
@@ -139,7 +139,8 @@ def measured(recordings: Path, units: int, refine: bool) -> dict[str, Any]:
         first = models.models()
         nominal = choose_unit(first, list(first.unit_ids), settings)
     with stage("weights"):
-        found = quantify_kind(first, list(first.unit_ids), settings, nominal)
+        units_of = {"unit_ids": list(first.unit_ids), "nominal": nominal, "max_order": ORDER}
+        found = kros.quantify(first, settings.form, first.frequencies(POINTS), **units_of)
     return {
         "times": times,
         "memory": memory,

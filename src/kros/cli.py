@@ -8,14 +8,13 @@ become messages in `kros.edge`.
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from .core.work import keep_freed_memory
+from .core.work import Progress
 from .edge import NOT_MET, UNDECIDED, EdgeGroup, log_to_stderr
 
 app = typer.Typer(
@@ -55,6 +54,12 @@ def _count(workers: int | None) -> int:
     return available_cores() if workers is None else workers
 
 
+def _progress(quiet: bool = False) -> Progress:
+    from .study.engine.progress import Lines
+
+    return Progress() if quiet else Lines()
+
+
 def _say(lines: Iterable[str]) -> None:
     for line in lines:
         typer.echo(line)
@@ -80,9 +85,8 @@ def main(
         bool, _option("Say the version and nothing else.", "--version", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    """Set up logging and memory."""
+    """Set up logging."""
     log_to_stderr(verbose)
-    keep_freed_memory()
 
 
 @app.command()
@@ -97,31 +101,9 @@ def init(
     """Look at a folder of recordings and write a study for it."""
     from .data.discovery.discover import Wanted
     from .study.commands.init import init_study
-    from .study.engine.progress import make_progress
 
     wanted = Wanted(tuple(measured or ()), tuple(input_ or ()), files, period)
-    ask = _ask_parts if _on_terminal() else None
-    with make_progress(False, asks=ask is not None) as progress:
-        study = init_study(folder, out, wanted, ask, progress)
-    _say(study.lines)
-
-
-def _on_terminal() -> bool:
-    return sys.stdin.isatty() and sys.stdout.isatty()
-
-
-def _ask_parts(columns: Any) -> Any:
-    """Ask which columns are measured and which are inputs; Return takes what is proposed."""
-    from .data.discovery.discover import assign
-    from .data.discovery.roles import ColumnPart
-    from .study.commands.init import column_lines
-
-    _say(column_lines(columns))
-    answers = []
-    for part, what in ((ColumnPart.MEASURED, "Measured states"), (ColumnPart.INPUT, "Inputs")):
-        proposed = ", ".join(c.name for c in columns if c.part is part)
-        answers.append([n for n in typer.prompt(what, default=proposed).replace(",", " ").split() if n])
-    return assign(columns, *answers)
+    _say(init_study(folder, out, wanted, _progress()))
 
 
 @app.command()
@@ -137,11 +119,9 @@ def demo(
 ) -> None:
     """Simulate a population with one badly assembled drive and run the whole study on it."""
     from .study.commands.demo import Simulation, run_demo
-    from .study.engine.progress import make_progress
 
-    with make_progress(quiet) as progress:
-        result = run_demo(out, Simulation(units, episodes, seconds, seed), _count(workers), progress, set_ or ())
-    _finish(result, quiet)
+    simulation = Simulation(units, episodes, seconds, seed)
+    _finish(run_demo(out, simulation, _count(workers), _progress(quiet), set_ or ()), quiet)
 
 
 @app.command()
@@ -177,11 +157,9 @@ def run(
     """Run a study: recordings to verified observer and report."""
     from .study import load_config
     from .study import run as run_study
-    from .study.engine.progress import make_progress
 
-    with make_progress(quiet) as progress:
-        config, folder = load_config(study, set_ or ()), out or study.parent / "runs" / study.stem
-        result = run_study(config, folder, until=until, workers=_count(workers), scheduler=scheduler, progress=progress)
+    config, folder, places = load_config(study, set_ or ()), out or study.parent / "runs" / study.stem, _count(workers)
+    result = run_study(config, folder, until=until, workers=places, scheduler=scheduler, progress=_progress(quiet))
     _finish(result, quiet)
 
 
@@ -280,12 +258,9 @@ def report(run_folder: Run) -> None:
 @app.command()
 def figures(run_folder: Run, out: Path) -> None:
     """Write the report's figures as PNG and PDF."""
-    from .study.engine.progress import make_progress
     from .study.stages.report import write_figures
 
-    with make_progress(False) as progress:
-        names = write_figures(run_folder, out, progress)
-    _say([f"{len(names)} figures in {out}"])
+    _say([f"{len(write_figures(run_folder, out, _progress()))} figures in {out}"])
 
 
 @app.command("list")

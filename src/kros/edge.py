@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from typing import Any, TextIO
 
@@ -21,6 +22,7 @@ from typer.core import TyperGroup
 from .core.errors import ConfigError, DataError, DimensionError, KrosError, MissingDependencyError
 
 FAILED, BAD_INPUT, NOT_MET, UNDECIDED, SIGNALLED = 1, 2, 3, 4, 128
+_SIGNALS = [getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)]
 _USAGE = [kind for kind in typer.BadParameter.__mro__ if kind.__name__ == "ClickException"]  # perhaps typer's own
 _PASSED: tuple[type[BaseException], ...] = (typer.Exit, typer.Abort, *_USAGE)
 _BAD_INPUT = (ConfigError, DataError, DimensionError, MissingDependencyError)
@@ -38,18 +40,15 @@ class EdgeGroup(TyperGroup):
 @contextlib.contextmanager
 def edge(ctx: Any = None) -> Iterator[None]:
     """Turn any exception into one message on standard error and an exit code; `ctx` knows which command it is."""
-    from .study.engine.stop import Stopped, stoppable
-
     try:
-        with stoppable():
+        with _stoppable():
             yield
     except KeyboardInterrupt as stopped:
-        number = stopped.signal if isinstance(stopped, Stopped) else signal.SIGINT
-        name = number.name if isinstance(stopped, Stopped) else "Ctrl-C"
+        number = signal.Signals(stopped.args[0] if stopped.args else signal.SIGINT)
         resumes = ctx is None or ctx.invoked_subcommand in (None, "run", "demo")
         again = "nothing half done is left; run the same command again."
         again = "the same command goes on where this one ended." if resumes else again
-        typer.echo(f"kros: stopped by {name}; {again}", err=True)
+        typer.echo(f"kros: stopped by {number.name if stopped.args else 'Ctrl-C'}; {again}", err=True)
         raise typer.Exit(SIGNALLED + number) from stopped
     except _PASSED:
         raise
@@ -60,6 +59,28 @@ def edge(ctx: Any = None) -> Iterator[None]:
         _silence_if_broken()
         typer.echo(f"kros: {message(error)}".encode(errors="backslashreplace").decode(), err=True)
         raise typer.Exit(BAD_INPUT if isinstance(error, _BAD_INPUT) else FAILED) from error
+
+
+@contextlib.contextmanager
+def _stoppable() -> Iterator[None]:
+    """Raise KeyboardInterrupt with its number at a signal to stop, so that what is half done goes as after an error."""
+    main = threading.current_thread() is threading.main_thread()
+    signals = [number for number in _SIGNALS if main and signal.getsignal(number) is signal.SIG_DFL]
+
+    def restore() -> None:
+        for number in signals:
+            signal.signal(number, signal.SIG_DFL)
+
+    def stop(number: int, frame: object) -> None:
+        restore()  # a second signal ends the process
+        raise KeyboardInterrupt(number)
+
+    for number in signals:
+        signal.signal(number, stop)
+    try:
+        yield
+    finally:
+        restore()
 
 
 class OnceHandler(logging.StreamHandler[TextIO]):

@@ -21,8 +21,8 @@ from kros.data import (
     steps,
     to_pykoop,
     write_parquet,
-    write_raw,
 )
+from kros.data.readers.motor_drive_raw import write_raw
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 PERIOD = 1e-3

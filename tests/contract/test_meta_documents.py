@@ -64,7 +64,9 @@ def check_configuration(text: str) -> None:
         _ = load_mapping(table).steps
     else:
         kros.study.validate_config({"data": {"source": "."}, **table}, ROOT)
-        kros.data.steps.parse_steps(table.get("data", {}).get("prepare", ()))
+        from kros.data.prepare import parse_steps
+
+        parse_steps(table.get("data", {}).get("prepare", ()))
 
 
 @pytest.mark.parametrize("name", MODULES)

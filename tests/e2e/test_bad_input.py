@@ -77,15 +77,6 @@ def test_bad_override_and_stage(kros, study, tmp_path):
     refused(kros, path, tmp_path, "--until", "quantify", options=("--until", "lunch"))
 
 
-def test_nan_is_located(kros, study, tmp_path, raw):
-    def change(lines):
-        row = lines[1501].split(",")
-        return [*lines[:1501], ",".join([row[0], row[1], "nan", *row[3:]]), *lines[1502:]]
-
-    edit(first_csv(raw), change)
-    refused(kros, study(source=raw, reader="motor-drive-raw"), tmp_path, "velocity", "NaN", "001001")
-
-
 def test_one_unit_only(kros, study, tmp_path, raw):
     folders = sorted((raw / "batch_b" / "population").iterdir())
     for folder in folders:

@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
+from kros.core.store import describe, read_manifest, write_manifest
 from kros.data import Channel, Population, Role, from_arrays, write_parquet
 from kros.plants import PLANTS
 
@@ -69,8 +70,11 @@ def lifted(demo: Path, tmp_path_factory) -> Path:
     """The demo's run as if its observer with parameters had been chosen."""
     run = tmp_path_factory.mktemp("lifted") / "run"
     shutil.copytree(demo, run)
-    (run / "observers" / "deployed.json").unlink()
-    shutil.copyfile(run / "observers" / "koopman" / "estimator.json", run / "observers" / "deployed.json")
+    deployed, manifest = run / "observers" / "deployed.json", read_manifest(run)
+    deployed.unlink()
+    shutil.copyfile(run / "observers" / "koopman" / "estimator.json", deployed)
+    manifest["synthesize"].files["observers/deployed.json"] = describe(deployed)
+    write_manifest(run, manifest)
     return run
 
 
@@ -131,6 +135,9 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     for file in (tmp_path / "logged").iterdir():
         np.savetxt(file, _cut(file), delimiter=",", header=",".join(["t", *SEEN]), comments="", fmt="%.17g")
     result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv")
+    assert result.exit_code == 1
+    assert "--track phase" in result.stderr
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "x.csv", "--track", "phase")
     assert result.exit_code == 0, result.output
     assert result.output.count("parameters tracked from the value of the smallest innovation") == 3
     names, values = table(tmp_path / "x.csv")
@@ -140,12 +147,9 @@ def test_a_phase_that_cannot_be_calibrated_is_followed_from_where_the_innovation
     for unit, own in facts["parameters"].items():
         apart = np.angle(np.exp(1j * (own["phase"] - calibrated[unit]["phase"])))
         assert abs(apart) < 0.6  # motion in one direction cannot tell a phase from a lag
-    assert (
-        kros(
-            "estimate", lifted, tmp_path / "field.toml", tmp_path / "y.csv", "--parameter", "m001001.phase=1.2"
-        ).output.count("given")
-        == 1
-    )
+    options = ("--track", "phase", "--parameter", "m001001.phase=1.2")
+    result = kros("estimate", lifted, tmp_path / "field.toml", tmp_path / "y.csv", *options)
+    assert result.output.count("that is given") == 1
     assert np.isfinite(values).all()
 
 
@@ -173,7 +177,7 @@ def test_what_does_not_fit_is_said(kros, lifted, field, tmp_path) -> None:
         assert not out.exists()
 
     refused("position", "'rad'", "'deg'", "scale")
-    refused("looks like csv", "TOML with [data]", data=tmp_path / "logged")
+    refused("there is no file", "TOML with [data]", data=tmp_path / "logged")
     text = data.read_text().replace("deg", "rad")
     data.write_text(text.replace('{ name = "target_velocity", role = "input", column = "target_velocity" },', ""))
     refused("target_velocity is missing")

@@ -22,7 +22,7 @@ def drives(tmp_path_factory) -> Path:
     """Five drives in the raw layout, in two conditions."""
     folder = tmp_path_factory.mktemp("drives") / "raw"
     simulated = kros.plants.HarmonicDrivePopulation(n_units=5, n_episodes=3, seconds=6.0, seed=5).simulate()
-    kros.data.write_raw(simulated.raw, folder)
+    kros.data.readers.motor_drive_raw.write_raw(simulated.raw, folder)
     return folder
 
 

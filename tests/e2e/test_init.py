@@ -10,9 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from typer.testing import CliRunner
 
-from kros.cli import app
 from kros.data import EpisodeKey, Population
 from kros.plants import DcMotorPopulation, PendulumPopulation
 from kros.study import load_config
@@ -142,7 +140,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     assert kros("run", study, "--out", tmp_path / "run", "--until", "read", "--workers", 1).exit_code == 0
 
 
-def test_roles_are_taken_from_options_and_never_asked_without_a_terminal(kros, tmp_path, motors):
+def test_roles_are_taken_from_options(kros, tmp_path, motors):
     folder, study = tmp_path / "recordings", tmp_path / "study.toml"
     folder.mkdir()
     form = {"delimiter": ",", "header": "aa,bb,cc,dd", "comments": "", "fmt": "%.10g"}
@@ -194,19 +192,6 @@ def test_headers_twice_times_rounded_and_lines_behind_the_numbers(kros, tmp_path
     assert kros("init", rounded, "--out", tmp_path / "rounded.toml", "--period", motors.sample_period_s).exit_code == 0
     ended = folder("ended", "time,position,velocity,current,u", 6, "End of file\n")
     assert "Expected 5 columns, got 1: End of file" in kros("init", ended, "--out", tmp_path / "ended.toml").output
-
-
-def test_roles_are_asked_at_a_terminal(tmp_path, monkeypatch, motors):
-    folder = written(tmp_path / "recordings", motors, "plain")
-    monkeypatch.setattr("kros.cli._on_terminal", lambda: True)
-    result = CliRunner().invoke(
-        app, ["init", str(folder), "--out", str(tmp_path / "study.toml")], input="position, velocity\n\n"
-    )
-    assert result.exit_code == 0, result.output
-    assert "Measured states [position]: " in result.output
-    assert "Inputs [voltage]: " in result.output
-    found = open_source(load_config(tmp_path / "study.toml"))
-    assert (found.measured, found.inputs) == (("position", "velocity"), ("voltage",))
 
 
 def test_one_recording_a_unit_is_cut_into_episodes(kros, tmp_path):

@@ -127,7 +127,7 @@ def test_nothing_is_made_twice_and_what_is_not_asked_for_is_gone(kros, run):
     [
         ("evaluate.folds=1", "at least 2"),
         ("evaluate.folds=-2", "greater than or equal to 0"),
-        ("evaluate.folds=5", "there are 4 units"),
+        ("evaluate.folds=5", "of 4 units each fold needs one"),
         ('data.exclude=["004", "xyz"]', "no unit xyz"),
         ('data.exclude=["001", "002", "003"]', "at least two units"),
     ],
@@ -143,7 +143,7 @@ def test_too_few_units_left_to_learn_from(kros, pendulums, tmp_path):
     settings = ("--set", "evaluate.folds=2", "--set", 'data.exclude=["004"]')
     result = kros("run", study(tmp_path, pendulums), "--out", tmp_path / "run", *settings)
     assert result.exit_code == 2
-    assert "leaves 1 of 3 units" in result.stderr
+    assert "of 3 units each fold needs one" in result.stderr
 
 
 def test_an_excluded_unit_is_nowhere(pendulums, tmp_path):

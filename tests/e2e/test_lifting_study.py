@@ -96,13 +96,13 @@ def machines(n_samples):
     ]
     data = {}
     for unit in "123":
-        data[unit] = {"default": {}}
-        for number, length in enumerate(n_samples):
+        data[unit] = []
+        for length in n_samples:
             u = rng.normal(size=(length, 2))
             x = np.zeros((length, 2))
             for k in range(length - 1):
                 x[k + 1] = [0.9 * x[k, 0] + 0.1 * x[k, 1], 0.8 * x[k, 1] + u[k].sum() * (1 + 0.1 * int(unit))]
-            data[unit]["default"][str(number)] = np.hstack([x, u])
+            data[unit].append(np.hstack([x, u]))
     return from_arrays(data, channels, 0.01)
 
 

@@ -8,8 +8,16 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import gramian
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey
-from kros.evaluate import Disturbance, DisturbedEpisodes, Kind, robustness_rows, standard_disturbances
-from kros.evaluate.disturb import Measured, hold_missing
+from kros.evaluate.disturb import (
+    Disturbance,
+    Kind,
+    Measured,
+    disturbed_errors,
+    disturbed_rows,
+    hold_missing,
+    standard_disturbances,
+)
+from kros.evaluate.errors import error_percent
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.baselines.extended_kalman import ExtendedKalman
@@ -171,23 +179,24 @@ def test_holding_takes_the_last_measurement_that_arrived():
         np.testing.assert_array_equal(held[k], last)
 
 
-def test_errors_against_severity_do_not_depend_on_how_many_run_at_once(monkeypatch):
+def test_errors_over_severity_are_of_every_episode_channel_and_disturbance():
     x, u = plant(600)
-    keys = tuple(EpisodeKey(unit, "default", "0") for unit in "aabb")
+    keys = tuple(EpisodeKey(unit, "default", "0") for unit in "abcd")
     batch = EpisodeBatch(keys, np.array([600, 600, 500, 600]), x, u, 0.01, {"phase": np.zeros(4)})
-    disturbances = tuple(standard_disturbances([Kind.DROPPED, Kind.NOISE, Kind.DELAY]))
-    episodes = DisturbedEpisodes(batch, (0,), disturbances)
+    disturbances = standard_disturbances([Kind.DROPPED, Kind.NOISE, Kind.DELAY])
     observers = [observer(LIFTED), observer(LIFTED, 0.5 * L)]
 
-    def run(given, inputs):
-        return run_observers(observers, given.y, inputs, given.parameters)
+    def run(keys, y, u, values):
+        return (run_observers([one], y, u, values) for one in observers)
 
-    errors = episodes.errors(run, 2)
-    monkeypatch.setattr("kros.evaluate.robustness._AT_ONCE", 3 * 2 * x.size)
-    np.testing.assert_allclose(episodes.errors(run, 2), errors, rtol=1e-12)
-    assert errors.shape == (2, 1 + len(disturbances), 4, 2)
-    rows = robustness_rows("first", errors[0], episodes, ("x", "v"))
+    first, second = disturbed_errors(batch, (0,), disturbances, run)
+    assert first.shape == second.shape == (1 + len(disturbances), 4, 2)
+    rows = list(disturbed_rows(first, disturbances, {0: "x", 1: "v"}))
     assert len(rows) == 2 * (1 + len(disturbances))
     plain = next(r for r in rows if (r["disturbance"], r["channel"]) == ("none", "v"))["error_percent"]
-    means = [errors[0, 0, :2, 1].mean(), errors[0, 0, 2:, 1].mean()]
-    assert plain == {"mean": pytest.approx(np.mean(means)), "worst": pytest.approx(max(means))}
+    (estimate,) = run_observers(observers[:1], batch.measurements([0]), u, {"phase": np.zeros(4)})
+    alone = error_percent(estimate[..., :2], x, batch.lengths)
+    np.testing.assert_allclose(first[0], alone, rtol=1e-12)
+    assert plain == {"mean": pytest.approx(alone[:, 1].mean()), "worst": pytest.approx(alone[:, 1].max())}
+    (lost,) = disturbed_rows(np.full((1, 4, 2), np.inf), [], {1: "v"})
+    assert lost["error_percent"] == {"mean": None, "worst": None}

@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from kros.core import DimensionError, KrosError, StateSpace, gain, h2_norm, hinf_norm
 from kros.core.linalg import radius_text
-from kros.core.lti import dense_response
 
 
 @pytest.mark.parametrize(("pole", "dt"), [(1.0, 1.0), (-1.2, 1.0), (0.0, 0.0), (0.5, 0.0)])
@@ -68,28 +67,3 @@ def test_bad_input_is_named():
 )
 def test_spectral_radius_is_told_from_one(value, text):
     assert radius_text(value) == text
-
-
-@pytest.mark.parametrize("dt", [0.0, 1e-3])
-@pytest.mark.parametrize("delays", [0, 6])
-def test_dense_responses_are_those_of_single_frequencies(dt, delays):
-    rng = np.random.default_rng(delays)
-    n = 5
-    A = rng.standard_normal((n, n))
-    A = A * (0.999 / np.abs(np.linalg.eigvals(A)).max()) if dt > 0 else A - 5 * np.eye(n)
-    size = 10.0 ** rng.uniform(-4, 4, n)  # states in any units of measure
-    A, B, C = A * size[:, None] / size, rng.standard_normal((n, 2)) * size[:, None], rng.standard_normal((3, n)) / size
-    late = (
-        np.diag(np.ones(delays - 1), -1) if delays else np.zeros((0, 0))
-    )  # a chain of delays has no basis of eigenvectors
-    A = np.block([[A, np.zeros((n, delays))], [np.zeros((delays, n)), late if dt > 0 else late - np.eye(delays)]])
-    B, C = np.vstack([B, np.eye(delays, 2)]), np.hstack([C, np.ones((3, delays))])
-    system, freqs = (
-        StateSpace(A, B, C, rng.standard_normal((3, 2)), dt),
-        np.concatenate([[1e-6], np.linspace(0.01, 499, 300)]),
-    )
-    expected, found = system.frequency_response(freqs), dense_response(system, freqs)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
-    np.testing.assert_array_equal(
-        dense_response(gain(np.eye(2), 1.0), freqs), gain(np.eye(2), 1.0).frequency_response(freqs)
-    )

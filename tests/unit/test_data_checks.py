@@ -91,7 +91,7 @@ def test_scan_refuses_an_input_that_never_moves() -> None:
     resting[0][:, 2] = 0.0
     scan_digests(population({"a": resting[:2], "b": resting[2:]}))
     resting[1][:, 2] = 0.0
-    with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays at 0 in all 2 episodes"):
+    with pytest.raises(DataError, match=r"Unit a \(default\): input 'u' stays where it is in each of 2 episodes"):
         scan_digests(population({"a": resting[:2], "b": resting[2:]}))
 
 

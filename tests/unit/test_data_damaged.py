@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pyarrow import parquet
 
 from kros.core import limits
-from kros.core.errors import ConfigError, DataError
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, from_pykoop, prepare, read, steps, write_parquet
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
@@ -134,13 +134,6 @@ def test_periods_that_are_none(period: Any) -> None:
         from_pykoop(np.column_stack([np.zeros(80), samples(0)]), 1, period)
 
 
-@pytest.mark.parametrize("cutoff", [0.0, -1.0, 50.0, 51.0, float("nan"), float("inf")])
-def test_cut_offs_lie_between_zero_and_nyquist(cutoff: float) -> None:
-    population = from_arrays({"a": [samples(0)]}, CHANNELS, 0.01)
-    with pytest.raises(ConfigError, match=r"below the Nyquist frequency of 50 Hz"):
-        prepare(population, [steps.Differentiate("x", "w", cutoff)])
-
-
 def test_resampling_to_more_samples_than_anybody_wants() -> None:
     tiny = prepare(from_arrays({"a": [samples(0)]}, CHANNELS, 0.01), [steps.Resample(1e-12)])
     with pytest.raises(DataError, match="would make"):
@@ -149,7 +142,7 @@ def test_resampling_to_more_samples_than_anybody_wants() -> None:
 
 @pytest.mark.parametrize("name", ["", " ", "a\nb", "a\0", "\udcff"])
 def test_names_that_are_none(name: str) -> None:
-    for data in ({name: [samples(0)]}, {"a": {name: [samples(0)]}}, {"a": {"c": {name: samples(0)}}}):
+    for data in ({name: [samples(0)]}, {"a": {name: [samples(0)]}}, {EpisodeKey("a", "c", name): samples(0)}):
         with pytest.raises(DataError, match="name"):
             from_arrays(data, CHANNELS, 0.01)
     with pytest.raises(DataError, match="channel"):
@@ -239,14 +232,14 @@ def test_files_elsewhere_are_not_read(stored: Path) -> None:
 @pytest.mark.parametrize(
     "copied",
     [
-        {"a": {"c": {"1": 0, "2": 1, "9": 0}}, "b": {"c": {"1": 2, "2": 3}}},
-        {"a": {"c": {"1": 0, "2": 1}}, "b": {"c": {"1": 2, "2": 0}}},
-        {"a": {"c": {"1": 0, "2": 1}, "d": {"7": 0}}, "b": {"c": {"1": 2}}},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("a", "c", "9"): 0, ("b", "c", "1"): 2},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("b", "c", "1"): 2, ("b", "c", "2"): 0},
+        {("a", "c", "1"): 0, ("a", "c", "2"): 1, ("a", "d", "7"): 0, ("b", "c", "1"): 2},
     ],
     ids=["within a unit", "between units", "between conditions"],
 )
 def test_copies_are_refused_and_named(tmp_path: Path, copied: Any) -> None:
-    data = {u: {c: {e: samples(seed) for e, seed in es.items()} for c, es in cs.items()} for u, cs in copied.items()}
+    data = {EpisodeKey(*place): samples(seed) for place, seed in copied.items()}
     population = from_arrays(data, CHANNELS, 0.01)
     with pytest.raises(DataError, match=r"[Ee]pisode \d of unit \w .* episode 1 of unit a \(c\)"):
         scan_digests(population)
@@ -257,18 +250,8 @@ def test_copies_are_refused_and_named(tmp_path: Path, copied: Any) -> None:
 
 @pytest.mark.parametrize("period", [1.0, 0.5, 60.0, 1e-6])
 def test_unusual_periods_are_said(period: float) -> None:
-    assert "unusual" in period_alerts(samples(0, 500), CHANNELS, period)[0]
-    assert period_alerts(samples(0, 500), CHANNELS, 0.01) == ()
-
-
-@pytest.mark.parametrize("scale", [1e3, 1e-3, 1e6])
-def test_a_speed_that_is_no_slope_is_said(scale: float) -> None:
-    t = np.arange(2000) * 1e-2
-    motion = np.column_stack([np.sin(t), np.cos(t), np.sign(np.sin(3 * t))])
-    assert period_alerts(motion, CHANNELS, 1e-2) == ()
-    found = [a for a in period_alerts(motion, CHANNELS, 1e-2 * scale) if "slope" in a]
-    assert len(found) >= 1
-    assert "'v' is the slope of 'x'" in found[0]
+    assert "unusual" in period_alerts(period)[0]
+    assert period_alerts(0.01) == ()
 
 
 def test_lines_before_the_header_are_counted_alike_whatever_they_hold(tmp_path: Path) -> None:

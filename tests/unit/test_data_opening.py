@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import ConfigError, DataError
-from kros.data import Channel, Role, from_arrays, prepare, read, write_parquet, write_raw
-from kros.data.readers.motor_drive_raw import CHANNELS, STEPS
+from kros.data import Channel, Role, from_arrays, prepare, read, write_parquet
+from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, write_raw
 from kros.data.readers.opening import detect_reader
 
 MAPPING: dict[str, Any] = {
@@ -51,20 +51,6 @@ def test_the_fitting_reader_is_found_and_used(folders: Path, name: str) -> None:
     assert named.read(named.episodes[0]).shape[1] == len(named.channels)
 
 
-@pytest.mark.parametrize(
-    ("reader", "folder", "found"),
-    [
-        ("parquet", "motor-drive-raw", "holds a folder 'population' or 'outliers', so it looks like motor-drive-raw"),
-        ("motor-drive-raw", "parquet", r"holds population\.json, so it looks like parquet"),
-        ("parquet", "csv", "holds CSV files, so it looks like csv"),
-        ("motor-drive-raw", "csv", 'set data.reader = "csv"'),
-    ],
-)
-def test_wrong_reader(folders: Path, reader: str, folder: str, found: str) -> None:
-    with pytest.raises(DataError, match=rf"{folder} as {reader}: .*{found}"):
-        read(folders / folder, reader)
-
-
 @pytest.mark.parametrize("reader", ["motor-drive-raw", "parquet", "csv", None])
 def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) -> None:
     mapping = MAPPING if reader == "csv" else None
@@ -74,7 +60,8 @@ def test_missing_empty_and_useless_folders(folders: Path, reader: str | None) ->
         read(folders / "empty", reader, mapping=mapping)
     with pytest.raises(DataError, match=r"this is a file"):
         read(folders / "other" / "photo.jpg", reader, mapping=mapping)
-    with pytest.raises(DataError, match="no reader fits" if reader != "csv" else "no file matches"):
+    problem = {"motor-drive-raw": "found no folder", "parquet": "there is no file", "csv": "no file matches"}
+    with pytest.raises(DataError, match=problem.get(reader or "", "no reader fits")):
         read(folders / "other", reader, mapping=mapping)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import EpisodeKey, from_arrays, prepare, write_raw
-from kros.data.readers.motor_drive_raw import CHANNELS, STEPS, read_motor_drive_raw
+from kros.data import EpisodeKey
+from kros.data.readers.motor_drive_raw import read_motor_drive_raw
 
 HEADER = "t,theta,omega,tau,theta_ref,omega_ref"
 N = 1100
@@ -86,11 +86,6 @@ def test_reads_values_units_and_facts(raw: Path) -> None:
     np.testing.assert_allclose(values, np.column_stack(expected)[1000:], rtol=1e-13, atol=1e-15)
 
 
-@pytest.mark.parametrize("inner", [".", "batch_b"])
-def test_source_may_hold_batch_b_or_population(raw: Path, inner: str) -> None:
-    assert len(read_motor_drive_raw(raw / inner).episodes) == 12
-
-
 def test_two_time_stamps_add_up_unless_an_episode_is_in_both(raw: Path) -> None:
     again = folder(raw, "001011", stamp="20230101T000000")
     write_file(again / "cycle_002.csv", truth(5))
@@ -107,14 +102,6 @@ def test_missing_header_line(raw: Path) -> None:
         read_motor_drive_raw(raw)
 
 
-def test_not_a_number_where_the_offset_is_calibrated(raw: Path) -> None:
-    samples = truth(3)
-    samples[612:614, 1] = np.nan
-    write_file(folder(raw, "001011") / "cycle_001.csv", samples)
-    with pytest.raises(DataError, match="channel 'position' has 2 NaN at samples 612-613"):
-        read_motor_drive_raw(raw).read(EpisodeKey("001011", "noload", "1"))
-
-
 @pytest.mark.parametrize("per_second", [1e3, 1e6])
 def test_time_in_milliseconds_or_microseconds(raw: Path, per_second: float) -> None:
     expected = read_motor_drive_raw(raw)
@@ -127,22 +114,6 @@ def test_time_in_milliseconds_or_microseconds(raw: Path, per_second: float) -> N
     assert found.sample_period_s == 0.001
     for key, value in zip(expected.episodes, values, strict=True):
         np.testing.assert_allclose(found.read(key), value, rtol=1e-12, atol=1e-15)
-
-
-def test_another_rate_is_taken_as_it_is_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write_file(folder(tmp_path, "001011") / "cycle_000.csv", truth(0) * [2, 1, 1, 1, 1, 1])
-    assert read_motor_drive_raw(tmp_path).sample_period_s == 0.002
-    assert "sampled at 1 kHz, found steps of 0.002" in caplog.text
-
-
-def test_too_short_for_the_offset_or_the_rest(raw: Path) -> None:
-    write_file(folder(raw, "001011") / "cycle_000.csv", truth(3, 900))
-    write_file(folder(raw, "001011") / "cycle_001.csv", truth(3, 1001))
-    population = read_motor_drive_raw(raw)
-    with pytest.raises(DataError, match="calibrated over samples 500-999, the episode has 899"):
-        population.read(EpisodeKey("001011", "noload", "0"))
-    with pytest.raises(DataError, match="leaves nothing of 1000 samples"):
-        population.read(EpisodeKey("001011", "noload", "1"))
 
 
 def test_names_that_do_not_fit(raw: Path) -> None:
@@ -161,22 +132,3 @@ def test_no_layout_and_no_files(tmp_path: Path) -> None:
     folder(tmp_path, "000001").mkdir(parents=True)
     with pytest.raises(DataError, match="no file matches files"):
         read_motor_drive_raw(tmp_path)
-
-
-def simulated(seed: int = 0) -> np.ndarray:
-    """An episode in the reader's channels and units, before preparation."""
-    return truth(seed)[:, 1:] * [DEG, DEG, 0.01, DEG, DEG]
-
-
-def prepared_channels() -> tuple:
-    return prepare(from_arrays({"a": [np.ones((2, 5))]}, CHANNELS, 1e-3), STEPS).channels
-
-
-@pytest.mark.parametrize(
-    "key", [EpisodeKey("7", "load", "0"), EpisodeKey("000007", "hot", "0"), EpisodeKey("000007", "load", "a")]
-)
-def test_write_raw_refuses_other_names(tmp_path: Path, key: EpisodeKey) -> None:
-    population = from_arrays({key: simulated()}, prepared_channels(), 1e-3)
-    with pytest.raises(DataError, match="needs a unit of six digits"):
-        write_raw(population, tmp_path / "raw")
-    assert not (tmp_path / "raw").exists()

@@ -7,6 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError
 from kros.data import Channel, EpisodeKey, Population, Role, from_arrays, from_frame, prepare, steps
+from kros.data.prepare import parse_steps
 from kros.data.steps import Resample, lowpass
 
 KEY = EpisodeKey("a", "default", "0")
@@ -164,7 +165,7 @@ def test_steps_from_toml() -> None:
         steps.Shift(("u",), 1),
     ]
     expected = (steps.Scale(("x", "y"), 2.0), steps.Trim(10, None, 2), steps.Resample(0.01), steps.Shift(("u",), 1))
-    assert steps.parse_steps(tables) == expected
+    assert parse_steps(tables) == expected
 
 
 @pytest.mark.parametrize(
@@ -183,4 +184,4 @@ def test_steps_from_toml() -> None:
 )
 def test_steps_from_toml_refuse(table: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        steps.parse_steps([table])
+        parse_steps([table])

@@ -141,13 +141,3 @@ def test_folders_of_these_names_are_no_proof_of_the_raw_layout(tmp_path: Path, n
     assert detect_reader(tmp_path) == "csv"
     (tmp_path / name / "20240101T120000_001011_load").mkdir()
     assert detect_reader(tmp_path) == "motor-drive-raw"
-
-
-@pytest.mark.parametrize("level", [1.0, -20.0])
-def test_one_episode_alone_may_change_a_flag_for_a_few_samples(level: float) -> None:
-    data, rng = episodes(), np.random.default_rng(8)
-    for rows in data.values():
-        for values in rows:
-            values[:, 2] = level + 1e-6 * rng.normal(size=SAMPLES)
-    data["u0"][0][7:9, 2] = -level
-    assert len(survey(population(data))[0].episodes) == UNITS * EPISODES

@@ -2,6 +2,8 @@
 
 import json
 import string
+import subprocess
+import sys
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
@@ -13,8 +15,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from kros.core.errors import ConfigError, DataError
-from kros.core.locks import locked
+from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
 from kros.data.readers.parquet import group_file, read_parquet, write_group, write_index
 
@@ -178,17 +179,6 @@ def test_damaged_folders(tmp_path: Path) -> None:
         read_parquet(out)
 
 
-def test_what_a_killed_writer_left_goes_and_two_at_once_are_refused(tmp_path: Path) -> None:
-    out, left = tmp_path / "population", tmp_path / ".kros.population"
-    (left / "draft").mkdir(parents=True)
-    (left / "draft" / "half").write_text("done")
-    with locked(left), pytest.raises(ConfigError, match="is at work in it"):
-        write_parquet(population(), out)
-    write_parquet(population(), out)
-    assert [p.name for p in tmp_path.iterdir()] == ["population"]
-    assert not (out / "half").exists()
-
-
 def test_an_episode_is_read_once_and_a_file_that_was_written_anew_is_read_anew(tmp_path: Path) -> None:
     for name, units in (("one", ("a",)), ("two", ("b", "a"))):
         write_parquet(population(units), tmp_path / name)
@@ -197,3 +187,19 @@ def test_an_episode_is_read_once_and_a_file_that_was_written_anew_is_read_anew(t
     assert found.read(key) is first
     (tmp_path / "two" / "a@cold.parquet").replace(tmp_path / "one" / "a@cold.parquet")
     np.testing.assert_array_equal(found.read(key), population(("b", "a")).read(key))
+
+
+def test_reading_and_writing_leave_pandas_alone(tmp_path: Path) -> None:
+    """Workers start without the half second that pandas costs."""
+    (tmp_path / "csv").mkdir()
+    (tmp_path / "csv" / "a.csv").write_text("t,x\n0,1\n0.1,2\n0.2,4\n")
+    code = """
+import sys
+from kros.data import read, write_parquet
+table = {"files": "a", "time": "t", "channel": [{"name": "x", "column": "x", "role": "state"}]}
+write_parquet(read(sys.argv[1] + "/csv", "csv", mapping=table), sys.argv[1] + "/out")
+population = read(sys.argv[1] + "/out")
+assert population.read(population.episodes[0]).ravel().tolist() == [1, 2, 4]
+assert "pandas" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, timeout=60)

@@ -11,7 +11,7 @@ import pytest
 from kros.core import DimensionError, StateSpace
 from kros.data import Channel, Role
 from kros.identify import ModelSet
-from kros.interop import from_control, models_to_control, to_control, uncertainty_to_control
+from kros.interop import from_control, to_control, uncertainty_to_control
 from kros.lifting import Lifting
 from kros.uncertainty import quantify
 
@@ -66,15 +66,6 @@ def test_a_system_keeps_its_response_both_ways() -> None:
     assert back.dt == DT
 
 
-def test_python_control_gets_copies() -> None:
-    system = random_batch()
-    to_control(system).A[0, 0] = 99.0
-    there = to_control(system)
-    from_control(there).A[0, 0] = 99.0
-    assert system.A[0, 0] != 99.0
-    assert there.A[0, 0] != 99.0
-
-
 def test_continuous_systems_go_both_ways() -> None:
     continuous = to_control(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]], 0.0))
     assert continuous.dt == from_control(continuous).dt == 0
@@ -102,24 +93,11 @@ def test_wrong_names_are_refused(names: list[str] | str) -> None:
         to_control(random_batch(), states=names)
 
 
-def test_models_carry_the_names_of_their_signals() -> None:
-    population = models()
-    systems = models_to_control(population)
-    assert list(systems) == ["unit.0", "unit.1", "unit.2"]
-    labels = ["position", "velocity", "sin(0·5*position + phase)"]
-    assert all(
-        s.state_labels == labels and s.output_labels == labels and s.input_labels == ["target"]
-        for s in systems.values()
-    )
-    assert systems["unit.1"].name == "unit·1"
-    assert np.array_equal(systems["unit.1"].A, population.A[1])
-    assert list(models_to_control(population, ["unit.2"])) == ["unit.2"]
-
-
-@pytest.mark.parametrize("units", [["unit.7"], "unit.1"])
-def test_unknown_units_are_refused(units: list[str] | str) -> None:
-    with pytest.raises(DimensionError, match="the models are of"):
-        models_to_control(models(), units)
+def test_names_have_no_dots() -> None:
+    names = ["position", "velocity", "sin(0.5*position + phase)"]
+    system = to_control(models().systems(["unit.1"])[0], name="unit.1", states=names, inputs=["target"], outputs=names)
+    assert (system.name, system.input_labels) == ("unit·1", ["target"])
+    assert system.state_labels == system.output_labels == [*names[:2], "sin(0·5*position + phase)"]
 
 
 def test_weights_cover_the_residuals_in_python_control_too() -> None:

@@ -69,7 +69,7 @@ def test_episodes_of_different_length_are_held_at_their_end():
 
     rng = np.random.default_rng(3)
     channels = [Channel("x", Role.STATE, "", True), Channel("u", Role.INPUT)]
-    data = {"1": {"default": {"0": rng.normal(size=(30, 2)), "1": rng.normal(size=(20, 2))}}}
+    data = {"1": [rng.normal(size=(30, 2)), rng.normal(size=(20, 2))]}
     population = from_arrays(data, channels, 0.1)
     batch = EpisodeBatch.read(population, population.episodes)
     assert batch.lengths.tolist() == [30, 20]

@@ -5,8 +5,8 @@ import pytest
 
 from kros.core.errors import DimensionError
 from kros.evaluate import Kind, unit_interval
-from kros.evaluate.intervals import interval_rows, mean_intervals
-from kros.evaluate.robustness import severity_of_growth
+from kros.evaluate.disturb import severity_of_growth
+from kros.evaluate.intervals import interval_rows
 from kros.report.disturbances import curves
 from kros.report.error_tables import error_tables
 
@@ -70,21 +70,25 @@ def evaluation(units=8, seed=0):
     ]
 
 
+def intervals(rows):
+    """Intervals by observer, condition and channel."""
+    return {(r["observer"], r["condition"], r["channel"]): tuple(r["interval"]) for r in interval_rows(rows)}
+
+
 def test_intervals_of_all_observers_are_those_of_each():
     rows = evaluation()
-    found = mean_intervals(rows)
+    found = intervals(rows)
     values = [r["error_percent"] for r in rows if (r["observer"], r["channel"], r["role"]) == ("b", "v", "off_nominal")]
     np.testing.assert_allclose(found["b", "noload", "v"], unit_interval(values))
-    cell = error_tables({"study": {"identify_on": "noload"}, "evaluation": rows, "intervals": interval_rows(rows)})[
-        0
-    ].cells["b"]["v"]
+    metrics = {"study": {"identify_on": "noload"}, "evaluation": rows, "intervals": interval_rows(rows)}
+    cell = error_tables(metrics)[0].cells["b"]["v"]
     assert cell.interval == found["b", "noload", "v"]
     assert cell.interval[0] < cell.mean < cell.interval[1]
-    assert len(interval_rows(rows)) == 4
+    assert len(found) == 4
 
 
 def test_no_interval_where_an_estimate_diverged_or_units_are_few():
     rows = evaluation()
     rows[1]["error_percent"] = None
-    assert ("a", "noload", "v") not in mean_intervals(rows)
-    assert mean_intervals(evaluation(units=3)) == {}
+    assert ("a", "noload", "v") not in intervals(rows)
+    assert interval_rows(evaluation(units=3)) == []

@@ -32,7 +32,7 @@ def recordings(units: int, noise: float) -> FieldRecordings:
     y = x[:, 0] + noise * rng.normal(size=500)
     y[0] = 0.0
     population = from_arrays({"a": [np.column_stack([y, u])]}, CHANNELS, 0.01)
-    return FieldRecordings(replace(plain, monitor=watch), population, {"a": {}}, {}, frozenset(), None)
+    return FieldRecordings(replace(plain, monitor=watch), population, {"a": {}})
 
 
 @pytest.mark.parametrize(

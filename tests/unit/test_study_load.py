@@ -16,7 +16,8 @@ from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
 from kros.study.stages.load import load_metrics, run_load
 
-POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
+# The first two seconds of an episode are not judged.
+POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=4, seconds=6.0, seed=0, loop="soft").simulate().population
 
 
 def context(folder: Path, **options: object) -> SimpleNamespace:
@@ -29,10 +30,10 @@ def context(folder: Path, **options: object) -> SimpleNamespace:
         config=SimpleNamespace(load=LoadConfig(**options)),
         facts=facts,
         population=population,
-        calibration=None,
         lifting=Lifting(population.states),
         identified=SimpleNamespace(
             kinds=("linear",),
+            parameters={unit: {} for unit in population.unit_ids},
             models=lambda name=None: SimpleNamespace(measured=(0,)),
             population=population,
             sizes=dict.fromkeys(population.states + population.inputs, 7.0),

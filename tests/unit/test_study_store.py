@@ -59,23 +59,29 @@ def test_another_artefact_of_a_stage_takes_the_place_of_the_first_which_can_come
     assert store.stored(digest_of("b")) is None
 
 
-def test_runs_inside_are_those_that_an_artefact_was_made_with(tmp_path):
-    store, first, second = Store(tmp_path), digest_of("first"), digest_of("second")
-    for text, digest in (("one", first), ("two", second)):
-        inside = store.nested("left_out", "0")
-        with inside.drafting() as draft:
-            draft.draft().mkdir()
-            draft.draft("b.txt").write_text(text)
-            draft.commit("identify", digest_of(text), 0.0)
-        with store.drafting() as draft:
-            draft.commit("left_out", digest, 0.0)
-    assert store.files() == {"left_out/0/b.txt"}
-    assert store.stored(second) is not None
-    assert store.stored(first) is None
-    inside.add("identify", inside.stored(digest_of("one")))
-    assert store.stored(first) is not None
-    with pytest.raises(DataError, match="is missing or another one"):
-        store.verify("left_out")
+def test_a_run_inside_is_among_the_files_of_its_stage_and_shares_the_store(tmp_path):
+    store = Store(tmp_path)
+    with store.drafting() as draft:
+        inside = draft.nested("left_out", "0")
+        with inside.drafting() as own:
+            own.draft().mkdir()
+            own.draft("b.txt").write_text("text")
+            own.commit("identify", digest_of("inside"), 0.0)
+        draft.commit("left_out", digest_of("whole"), 0.0)
+    assert store.files() == {"left_out/0/b.txt", "left_out/0/manifest.json"}
+    store.sweep()
+    assert store.stored(digest_of("inside")) is not None
+    store.drop("left_out")
+    assert store.files() == frozenset()
+    assert not (tmp_path / "left_out").exists()
+
+
+def test_a_digest_cannot_reach_out_of_the_store(tmp_path):
+    store = written(tmp_path, "one")
+    path = tmp_path / "manifest.json"
+    path.write_text(path.read_text().replace(digest_of("a"), "../../victim").replace('"checksum"', '"other"'))
+    with pytest.raises(DataError, match="is damaged"):
+        store.verify()
 
 
 def test_files_of_others_stay(tmp_path):

@@ -1,7 +1,5 @@
 """Ground floor: systems, norms, artifacts and errors. Imports nothing else of kros.
 
-What needs NumPy is loaded on first use, so that importing the package stays cheap.
-
 Examples
 --------
 >>> from kros.core import StateSpace, hinf_norm
@@ -10,31 +8,23 @@ Examples
 1.0
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 from .errors import (
     ConfigError,
     DataError,
     DimensionError,
-    ExportError,
     IdentificationError,
     KrosError,
     MissingDependencyError,
     SynthesisError,
 )
-from .lazy import lazy_names
-
-if TYPE_CHECKING:
-    from .lti import StateSpace, block_diagonal, gain
-    from .norms import h2_norm, hinf_norm
+from .lti import StateSpace, block_diagonal, gain
+from .norms import h2_norm, hinf_norm
+from .removed import refusing
 
 __all__ = [
     "ConfigError",
     "DataError",
     "DimensionError",
-    "ExportError",
     "IdentificationError",
     "KrosError",
     "MissingDependencyError",
@@ -46,5 +36,4 @@ __all__ = [
     "hinf_norm",
 ]
 
-_HOME = {"StateSpace": "lti", "block_diagonal": "lti", "gain": "lti", "h2_norm": "norms", "hinf_norm": "norms"}
-__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)
+__getattr__ = refusing(__name__)

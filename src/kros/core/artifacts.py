@@ -25,27 +25,14 @@ from pydantic_core import to_jsonable_python
 
 from . import limits
 from .errors import DataError, KrosError
-from .files import read_bytes, shortened, write_bytes
+from .files import pass_on_shortage, read_bytes, shortened, write_bytes
 
 T = TypeVar("T")
 SCHEMA = 1
 CHECKSUM = "checksum"
 _AGAIN = "write it again with the step that made it"
-_ENDING = ".npy"
 _DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
-_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError)  # of bytes that were changed
-
-
-class LoadedContent(dict[Any, Any]):
-    """A JSON object or a set of arrays as read from a file; a key that is missing is an error that names the file."""
-
-    def __init__(self, content: Mapping[Any, Any], path: Path) -> None:
-        super().__init__(content)
-        self.path = path
-
-    def __missing__(self, key: Any) -> Any:
-        problem = f"key {key!r} is missing, found {shortened(str(list(self)))}"
-        raise DataError(f"Reading {self.path}: {problem}; write it again with this version.")
+_DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
 
 
 def plain(value: Any) -> Any:
@@ -72,15 +59,10 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file, or say which file is missing or broken; its objects are `LoadedContent`."""
-    path = Path(path)
-    text = _read(path, limits.MAX_JSON_BYTES)
-
-    def loaded(content: dict[str, Any]) -> LoadedContent:
-        return LoadedContent(content, path)
-
+    """Read a JSON file, or say which file is missing or broken."""
+    text = _read(Path(path), limits.MAX_JSON_BYTES)
     try:
-        return json.loads(text.decode(), object_hook=loaded, parse_constant=_finite, parse_float=_finite)
+        return json.loads(text.decode(), parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise DataError(f"Reading {path}: not valid JSON ({shortened(str(error))}); {_AGAIN}.") from error
 
@@ -115,45 +97,30 @@ def check_checksum(content: Mapping[str, Any], path: Path) -> bool:
 def pack_arrays(arrays: Mapping[str, np.ndarray]) -> bytes:
     """Return an .npz of arrays, without pickle and not compressed."""
     buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            content = io.BytesIO()
-            np.lib.format.write_array(content, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}{_ENDING}", date_time=(1980, 1, 1, 0, 0, 0)), content.getvalue())
+    np.savez(buffer, allow_pickle=False, **arrays)
     return buffer.getvalue()
 
 
 def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
-    """Return what `pack_arrays` packed."""
+    """Return what `pack_arrays` packed; compressed archives, pickled objects and what was changed are refused."""
     try:
-        with zipfile.ZipFile(io.BytesIO(packed)) as archive:
-            return {info.filename.removesuffix(_ENDING): _array(info, archive) for info in archive.infolist()}
+        with np.load(io.BytesIO(packed), allow_pickle=False) as archive:
+            if any(info.compress_type != zipfile.ZIP_STORED for info in archive.zip.infolist()):
+                raise ValueError("it is compressed, which kros never does")
+            damaged, arrays = archive.zip.testzip(), {name: archive[name] for name in archive.files}
+        if damaged is not None or not all(isinstance(array, np.ndarray) for array in arrays.values()):
+            raise ValueError("a part of it was changed")
+        return arrays
     except _DAMAGED as error:
+        pass_on_shortage(error, path)
         problem = f"not a valid archive of arrays ({error or type(error).__name__})"
-        raise DataError(f"Reading {path}: {problem}; write it again with the step that made it.") from error
-
-
-def _array(info: zipfile.ZipInfo, archive: zipfile.ZipFile) -> np.ndarray:
-    """Return one array, whose header states as many bytes as there are."""
-    name = info.filename
-    if not name.endswith(_ENDING) or info.compress_type != zipfile.ZIP_STORED or info.file_size != info.compress_size:
-        raise ValueError(f"{name!r} is compressed, which kros never does, or not an array")
-    content = archive.read(info)  # checks the CRC
-    file = io.BytesIO(content)
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"{name!r} has a header of another version")
-    shape, fortran, dtype = np.lib.format.read_array_header_1_0(file)
-    start, count = file.tell(), math.prod(shape)
-    if dtype.hasobject or min(shape, default=0) < 0 or count * dtype.itemsize != len(content) - start:
-        raise ValueError(f"{name!r} holds {len(content) - start} bytes, {dtype} of shape {shape} would not")
-    values = np.frombuffer(content, dtype, count, start).reshape(shape, order="F" if fortran else "C")
-    return np.array(values, order="K")
+        raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Read all arrays of an .npz; pickled objects and packed archives are refused."""
     path = Path(path)
-    return LoadedContent(unpack_arrays(_read(path, limits.MAX_ARRAYS_BYTES), path), path)
+    return unpack_arrays(_read(path, limits.MAX_ARRAYS_BYTES), path)
 
 
 def _read(path: Path, limit: int) -> bytes:
@@ -188,12 +155,11 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
     if digest is None and not archive.exists():
-        return content, LoadedContent({}, archive)
+        return content, {}
     packed = _read(archive, limits.MAX_ARRAYS_BYTES)
     if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
-        problem = f"it is not the file that {path.name} was written with"
-        raise DataError(f"Reading {archive}: {problem}; write both again with the step that made them.")
-    return content, LoadedContent(unpack_arrays(packed, archive), archive)
+        raise DataError(f"Reading {archive}: it is not the file that {path.name} was written with; {_AGAIN}.")
+    return content, unpack_arrays(packed, archive)
 
 
 @contextmanager

@@ -16,15 +16,7 @@ from typing import Any
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
-from .locks import locked
 
-_KINDS = {
-    stat.S_IFDIR: "a folder",
-    stat.S_IFIFO: "a named pipe",
-    stat.S_IFSOCK: "a socket",
-    stat.S_IFCHR: "a device",
-    stat.S_IFBLK: "a device",
-}
 TEMPORARY = ".kros."  # how names begin of what is beside its place until it is whole
 _NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 
@@ -52,8 +44,8 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
     except (OSError, ValueError) as failure:
         raise error(f"Reading {path}: {failure}; check the path and the permissions.") from failure
     if not stat.S_ISREG(status.st_mode):
-        kind = _KINDS.get(stat.S_IFMT(status.st_mode), "not a regular file")
-        raise error(f"Reading {path}: a regular file is needed, found {kind}; copy its content to a file first.")
+        found = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, socket or device"
+        raise error(f"Reading {path}: a regular file is needed, found {found}; copy its content to a file first.")
     if status.st_size > limit:
         advice = "split it, or raise the limit in kros.core.limits"
         raise error(f"Reading {path}: files of up to {limit} bytes are read, found {status.st_size}; {advice}.")
@@ -98,23 +90,12 @@ def whole_folder(out: Path) -> Iterator[Path]:
     out = out.absolute()
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise DataError(f"Writing {out}: it exists and is not empty; choose another name or remove it first.")
-    work = out.with_name(f"{TEMPORARY}{out.name}")
-    draft = work / "draft"
-    work.mkdir(parents=True, exist_ok=True)
-    try:
-        with locked(work):
-            shutil.rmtree(draft, ignore_errors=True)  # of a process that was killed
-            try:
-                draft.mkdir()
-                yield draft
-                with suppress(FileNotFoundError):
-                    out.rmdir()
-                draft.replace(out)
-            finally:
-                shutil.rmtree(draft, ignore_errors=True)
-    finally:
-        with suppress(OSError):  # another process has begun
-            work.rmdir()
+    with draft_beside(out.parent) as draft:
+        draft.mkdir()
+        yield draft
+        with suppress(FileNotFoundError):
+            out.rmdir()
+        draft.replace(out)
 
 
 def link_or_copy(source: Path, target: Path) -> None:

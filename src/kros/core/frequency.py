@@ -15,8 +15,6 @@ from .errors import ConfigError
 
 Array = npt.NDArray[np.float64]
 
-_WIDEST = 0.5  # of Nyquist: where the grid of a recording of a few samples begins
-
 
 def nyquist_hz(sample_period_s: float) -> float:
     """Return half the sampling frequency, Hz."""
@@ -29,17 +27,10 @@ def nyquist_hz(sample_period_s: float) -> float:
 def log_grid(
     sample_period_s: float, n_freqs: int = 1000, decades: float = 6.0, longest_s: float | None = None
 ) -> Array:
-    """Return logarithmically spaced frequencies up to the Nyquist frequency, shape (n_freqs,), Hz."""
-    if n_freqs < 2 or not decades > 0:
-        wanted = "at least two frequencies over a positive number of decades"
-        raise ConfigError(f"Frequency grid: needs {wanted}, found {n_freqs} over {decades}.")
+    """Return logarithmic frequencies up to Nyquist, Hz, from the lowest that a recording of some length holds."""
     top = nyquist_hz(sample_period_s)
-    low = top * 10.0**-decades
-    if longest_s is not None:
-        if not longest_s > 0:
-            raise ConfigError(f"Frequency grid: the longest recording should have a length, found {longest_s} s.")
-        low = min(max(low, 1 / longest_s), _WIDEST * top)
-    grid = np.geomspace(low, top, n_freqs)
+    low = max(top * 10.0**-decades, 0.0 if longest_s is None else 1 / longest_s)
+    grid = np.geomspace(min(low, top / 2), top, n_freqs)
     grid[-1] = top
     return grid
 

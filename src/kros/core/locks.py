@@ -58,20 +58,20 @@ def _take(handle: int, shared: bool) -> None:
 
 def _open(path: Path, shared: bool) -> int:
     """Open and lock a file, again where its last holder has just removed it."""
-    while True:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
-        try:
-            _take(handle, shared)
-            if os.path.samestat(os.fstat(handle), path.lstat()):
-                return handle
-        except FileNotFoundError:
-            pass
-        except OSError as error:
-            if error.errno not in _BUSY:
-                log.warning("%s: no locks here (%s); do not run two studies in one folder at once", path, error)
-                return handle
-            holder = os.read(handle, 200).decode(errors="replace") or "another process"
-            os.close(handle)
-            advice = "wait until it ends, or name another folder"
-            raise ConfigError(f"Folder {path.parent}: {holder} is at work in it; {advice}.") from error
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
+    try:
+        _take(handle, shared)
+        if os.path.samestat(os.fstat(handle), path.lstat()):
+            return handle
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        if error.errno not in _BUSY:
+            log.warning("%s: no locks here (%s); do not run two studies in one folder at once", path, error)
+            return handle
+        holder = os.read(handle, 200).decode(errors="replace") or "another process"
         os.close(handle)
+        advice = "wait until it ends, or name another folder"
+        raise ConfigError(f"Folder {path.parent}: {holder} is at work in it; {advice}.") from error
+    os.close(handle)
+    return _open(path, shared)

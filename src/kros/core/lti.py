@@ -17,17 +17,15 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import DimensionError
-from .linalg import adjoint, balanced_size
 
 Array = npt.NDArray[Any]
 
 
 def real_array(name: str, values: Any) -> Array:
     """Return a matrix of doubles, or say by name what else was found."""
-    if np.iscomplexobj(values):
-        advice = "take the real part if that is meant"
-        raise DimensionError(f"{name} should be a matrix of real numbers, found complex ones; {advice}.")
     try:
+        if np.iscomplexobj(values):
+            raise ValueError("complex numbers; take the real part if that is meant")
         return np.asarray(values, dtype=float)
     except (TypeError, ValueError) as error:
         problem = f"found {type(values).__name__}: {error}"
@@ -36,14 +34,10 @@ def real_array(name: str, values: Any) -> Array:
 
 def sampling_period(name: str, dt: Any) -> float:
     """Return the sampling period in seconds, or say by name what else was found."""
-    try:
-        period = float(dt)
-    except (TypeError, ValueError):
-        period = -1.0
-    if not 0 <= period < np.inf:
+    if not isinstance(dt, int | float | np.number) or not 0 <= dt < np.inf:
         wanted = "should be a number of seconds, not negative, 0 for continuous time"
         raise DimensionError(f"{name}: the sampling period {wanted}; found {dt!r}.")
-    return period
+    return float(dt)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +76,9 @@ class StateSpace:
             object.__setattr__(self, name, real_array(f"State space: {name}", getattr(self, name)))
         object.__setattr__(self, "dt", sampling_period("State space", self.dt))
         n, m, p = self.A.shape[-1], self.B.shape[-1], self.C.shape[-2]
-        expected = {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}
-        for name, shape in expected.items():
-            if getattr(self, name).shape[-2:] != shape:
-                shapes = {key: getattr(self, key).shape for key in "ABCD"}
+        shapes = {name: getattr(self, name).shape for name in "ABCD"}
+        for name, shape in {"A": (n, n), "B": (n, m), "C": (p, n), "D": (p, m)}.items():
+            if shapes[name][-2:] != shape:
                 problem = f"{name} should end in shape {shape}, found {shapes}"
                 raise DimensionError(f"State space: {problem}; transpose or pad the offending matrix.")
 
@@ -168,25 +161,6 @@ class StateSpace:
             self.D @ other.D,
             self.dt,
         )
-
-
-def dense_response(system: StateSpace, freqs_hz: npt.ArrayLike) -> Array:
-    """Return the response of one system at very many frequencies by one Schur decomposition in balanced coordinates."""
-    from scipy.linalg import schur
-
-    n, m = system.n_states, system.n_inputs
-    if not n:
-        return system.frequency_response(freqs_hz)
-    s = 2j * np.pi * np.asarray(freqs_hz, dtype=float)
-    zeta = np.expm1(s * system.dt) if system.dt > 0 else s
-    A = system.A - np.eye(n) if system.dt > 0 else system.A
-    size = balanced_size(A)
-    T, Z = schur(A * size / size[:, None], output="complex")
-    B, C = adjoint(Z) @ (system.B / size[:, None]), (system.C * size) @ Z
-    states = np.empty((n, m, len(zeta)), dtype=complex)
-    for i in reversed(range(n)):
-        states[i] = (B[i][:, None] + np.tensordot(T[i, i + 1 :], states[i + 1 :], 1)) / (zeta - T[i, i])
-    return np.asarray(np.moveaxis(np.tensordot(C, states, 1), -1, 0) + system.D)
 
 
 def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:

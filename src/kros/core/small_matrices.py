@@ -13,8 +13,6 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 
-_RANK = 1e-12  # columns closer to parallel than this are left to the SVD, which decides about the rank
-
 
 def entries_first(matrices: Array) -> Array:
     """Move the matrix axes to the front: (..., p, m) to (p, m, ...), contiguous."""
@@ -55,53 +53,17 @@ def sigma_max(matrices: npt.ArrayLike) -> Array:
 
 def sigma_max_first(matrices: Array) -> Array:
     """Return the largest singular value of entries-first matrices (p, m, ...), shape (...)."""
-    p, m = matrices.shape[:2]
-    if min(p, m) > 2:
-        return np.linalg.norm(entries_last(matrices), 2, axis=(-2, -1))
-    return np.sqrt(sigma_max_squared(matrices))
-
-
-def sigma_max_squared(matrices: Array) -> Array:
-    """Return the squared largest singular value for `min(p, m) <= 2`."""
     columns = matrices if matrices.shape[1] <= matrices.shape[0] else np.swapaxes(matrices, 0, 1)
+    if columns.shape[1] > 2:
+        return np.linalg.norm(entries_last(columns), 2, axis=(-2, -1))
     first = squared(columns[:, 0]).sum(axis=0)
     if columns.shape[1] == 1:
-        return first
+        return np.sqrt(first)
     second = squared(columns[:, 1]).sum(axis=0)
     cross = np.einsum("i...,i...->...", np.conj(columns[:, 0]), columns[:, 1])
-    half = (first - second) / 2
-    return (first + second) / 2 + np.sqrt(half**2 + squared(cross))
-
-
-def condition_number(matrices: Array) -> Array:
-    """Return condition numbers of square matrices (..., n, n), shape (...); infinite where singular."""
-    if matrices.shape[-1] != 2:
-        return np.asarray(np.linalg.cond(matrices))
-    entries = entries_first(matrices)
-    det = np.abs(entries[0, 0] * entries[1, 1] - entries[0, 1] * entries[1, 0])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(sigma_max_squared(entries) / det)
+    return np.sqrt((first + second) / 2 + np.sqrt((first - second) ** 2 / 4 + squared(cross)))
 
 
 def pseudo_inverse_first(matrices: Array) -> Array:
     """Return pseudo-inverses, entries first, of matrices (..., p, m)."""
-    if min(matrices.shape[-2:]) != 2:
-        return entries_first(np.linalg.pinv(matrices))
-    if matrices.shape[-2] < matrices.shape[-1]:
-        return np.ascontiguousarray(np.swapaxes(pseudo_inverse_first(np.swapaxes(matrices, -1, -2)), 0, 1))
-    columns = entries_first(matrices)
-    g1, g2 = columns[:, 0], columns[:, 1]
-    r11, size = np.sqrt(squared(g1).sum(axis=0)), np.sqrt(squared(g2).sum(axis=0))
-    with np.errstate(all="ignore"):
-        q1 = g1 / r11
-        r12 = (np.conj(q1) * g2).sum(axis=0)
-        v = g2 - q1 * r12
-        again = (np.conj(q1) * v).sum(axis=0)
-        v = v - q1 * again
-        r22 = np.sqrt(squared(v).sum(axis=0))
-        second = np.conj(v) / r22**2
-        out = np.stack([(np.conj(q1) - (r12 + again) * second) / r11, second])
-        weak = ~((r22 > _RANK * size) & (r11 > _RANK * size))
-    if weak.any():
-        out[:, :, weak] = entries_first(np.linalg.pinv(np.moveaxis(columns[:, :, weak], -1, 0)))
-    return out
+    return entries_first(np.linalg.pinv(matrices))

@@ -12,17 +12,14 @@ out of its folder.
 from __future__ import annotations
 
 import hashlib
-import shutil
-from collections.abc import Collection, Mapping
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
 from pydantic import Field, NonNegativeFloat
 
 from .artifacts import CHECKSUM, check_checksum, read_json, with_checksum, write_json
 from .errors import ConfigError, DataError
-from .files import TEMPORARY, draft_beside, is_file, link_or_copy, stamp_of
+from .files import is_file, stamp_of
 from .settings import Settings
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"
@@ -32,10 +29,9 @@ Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last cha
 class Artefact(Settings):
     """Files that follow from what `digest` is of."""
 
-    digest: str = Field(pattern="^([0-9a-f]{64})?$")  # none for files that are of no stage
+    digest: str = Field(pattern="^[0-9a-f]{64}$")
     seconds: NonNegativeFloat = 0.0  # that it took
     files: dict[str, Described] = Field(default_factory=dict)  # by name
-    runs: dict[str, str] = Field(default_factory=dict)  # digests of runs that were made with it, by folder
     results: tuple[str, ...] = ()  # digests of the results that it was computed from
 
     @classmethod
@@ -103,66 +99,4 @@ def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
 
 def recorded_files(folder: Path) -> frozenset[str]:
     """Return the names of all files that belong to a run."""
-    artefacts = read_manifest(folder).values()
-    runs = [run for artefact in artefacts for run in artefact.runs]
-    inside = (f"{run}/{name}" for run in runs for name in recorded_files(place(folder, run)))
-    return frozenset(inside).union(*(artefact.files for artefact in artefacts))
-
-
-@dataclass(frozen=True)
-class ArtefactStore:
-    """A folder of artefacts."""
-
-    folder: Path
-
-    def load(self, digest: str) -> Artefact | None:
-        """Return an artefact that is there, whole."""
-        folder = self.folder / digest
-        if not is_file(folder / INDEX):
-            return None
-        try:
-            artefact = Artefact.read(folder / INDEX)
-            whole = artefact.digest == digest and all(artefact.matches(folder, name) for name in artefact.files)
-        except (ConfigError, DataError, AttributeError, TypeError):
-            return None
-        return artefact if whole else None
-
-    def draft(self) -> AbstractContextManager[Path]:
-        """Give the path of a draft beside the artefacts; it goes where it was not put into its place."""
-        return draft_beside(self.folder)
-
-    def put(self, draft: Path, artefact: Artefact) -> None:
-        """Move a draft into its place; what is there, and not whole, goes."""
-        write_json(draft / INDEX, with_checksum(artefact.model_dump()))
-        target = self.folder / artefact.digest
-        if target.exists():
-            target.replace(draft.with_name("old"))
-        draft.replace(target)
-
-    def link(self, artefact: Artefact, name: str, folder: Path) -> None:
-        """Put a file of an artefact into a folder too: the same file where the file system can, else a copy."""
-        if artefact.matches(folder, name):
-            return
-        target, beside = place(folder, name), self.folder / f"{TEMPORARY}link"
-        try:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            link_or_copy(self.folder / artefact.digest / name, beside)
-            beside.replace(target)
-        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
-            obstacle = error.filename2 or error.filename
-            raise ConfigError(f"Run folder {folder}: {obstacle} is in the place of a result; move it away.") from error
-
-    def sweep(self, named: Collection[str]) -> None:
-        """Remove what is not named: artefacts, results, drafts of processes that were killed."""
-        for path in self.folder.iterdir() if self.folder.is_dir() else ():
-            ours = len(path.stem) == hashlib.sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
-            if ours and path.stem not in named:
-                remove(path)
-
-
-def remove(path: Path) -> None:
-    """Remove a file or a folder."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+    return frozenset().union(*(artefact.files for artefact in read_manifest(folder).values()))

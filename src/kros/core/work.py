@@ -7,12 +7,10 @@ on how they were obtained; what cannot be read back whole is computed again.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,8 +25,6 @@ from .store import digest_of
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_TRIM, _MMAP = -1, -3  # M_TRIM_THRESHOLD and M_MMAP_THRESHOLD of glibc
-_RETAINED, _OF_HEAP = 1 << 28, 1 << 25  # bytes; glibc takes no more than the second
 
 
 class Executor:
@@ -60,37 +56,38 @@ class Results:
     source: str
     used: set[str] = field(default_factory=set)
 
-    def digests(self, function: Callable[[Any], Any], of_tasks: Iterable[str | None]) -> list[str | None]:
-        """Return the digests of results from those of what the tasks hold; None where a task has none."""
-        name = f"{function.__module__}.{function.__qualname__}"
-        digests = [None if digest is None else digest_of(self.source, name, digest) for digest in of_tasks]
-        self.used.update(digest for digest in digests if digest is not None)
-        return digests
+    def place(self, function: Callable[[Any], Any], mark: str | None) -> Path | None:
+        """Return where the result of a task is, by a digest of what it holds; None where a task has none."""
+        if mark is None:
+            return None
+        digest = digest_of(self.source, f"{function.__module__}.{function.__qualname__}", mark)
+        self.used.add(digest)
+        return self.folder / f"{digest}.npz"
 
-    def read(self, digest: str | None, kinds: Iterable[type]) -> Any:
-        """Return a result, or None."""
-        path = self.folder / f"{digest}.npz"
-        if digest is None or not path.exists():
-            return None
-        try:
-            return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, {kind.__name__: kind for kind in kinds})
-        except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
-            log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
-            return None
+
+def _read(path: Path | None, kinds: Iterable[type]) -> Any:
+    """Return a result, or None where there is none or it cannot be read."""
+    if path is None or not path.exists():
+        return None
+    try:
+        return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, {kind.__name__: kind for kind in kinds})
+    except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
+        log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
+        return None
 
 
 @dataclass(frozen=True)
 class Storing:
-    """A function of a digest and a task, whose result is written where it has a digest."""
+    """A function of a path and a task, whose result is written where it has a path."""
 
     function: Callable[[Any], Any]
-    folder: Path
 
-    def __call__(self, task: tuple[str | None, Any]) -> Any:
+    def __call__(self, task: tuple[Path | None, Any]) -> Any:
         """Compute."""
-        result = self.function(task[1])
-        if task[0] is not None:
-            write_bytes(self.folder / f"{task[0]}.npz", packed(result))
+        path, content = task
+        result = self.function(content)
+        if path is not None:
+            write_bytes(path, packed(result))
         return result
 
 
@@ -115,10 +112,8 @@ def _plain(value: Any, arrays: list[np.ndarray]) -> Any:
         arrays.append(np.asarray(value))
         return ["array" if isinstance(value, np.ndarray) else "number", len(arrays) - 1, np.shape(value)]
     if dataclasses.is_dataclass(value):
-        return [
-            type(value).__name__,
-            {f.name: _plain(getattr(value, f.name), arrays) for f in dataclasses.fields(value)},
-        ]
+        names = [f.name for f in dataclasses.fields(value)]
+        return [type(value).__name__, {name: _plain(getattr(value, name), arrays) for name in names}]
     if isinstance(value, list | tuple):
         return [type(value).__name__, [_plain(v, arrays) for v in value]]
     if isinstance(value, dict):
@@ -167,22 +162,20 @@ class Work:
         function: Callable[[Any], T],
         tasks: Iterable[Any],
         marks: Iterable[str | None],
-        kinds: Iterable[type] = (),
+        kinds: Collection[type] = (),
         usable: Callable[[Any, Any], bool] = lambda task, result: True,
     ) -> Iterator[T]:
         """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`."""
         if self.results is None:
             yield from self.map(title, function, tasks)
             return
-        tasks, kinds, digests = list(tasks), tuple(kinds), self.results.digests(function, marks)
-        earlier: list[Any] = []
-        for task, digest in zip(tasks, digests, strict=True):
-            result = self.results.read(digest, kinds)
-            earlier.append(result if result is not None and usable(task, result) else None)
-        new = [row for row, result in zip(zip(digests, tasks, strict=True), earlier, strict=True) if result is None]
+        pairs = [(self.results.place(function, mark), task) for mark, task in zip(marks, tasks, strict=True)]
+        read = [_read(path, kinds) for path, _ in pairs]
+        earlier = [r if r is None or usable(task, r) else None for r, (_, task) in zip(read, pairs, strict=True)]
+        new = [pair for pair, result in zip(pairs, earlier, strict=True) if result is None]
         if new:
-            log.info("%s: %d of %d are new or changed", title, len(new), len(tasks))
-        computed = self.map(title, Storing(function, self.results.folder), new)
+            log.info("%s: %d of %d are new or changed", title, len(new), len(pairs))
+        computed = self.map(title, Storing(function), new)
         for result in earlier:
             yield next(computed) if result is None else result
         next(computed, None)  # its progress ends
@@ -200,11 +193,3 @@ class Work:
 
 def _call(work: Callable[[], T]) -> T:
     return work()
-
-
-def keep_freed_memory() -> None:
-    """Let glibc keep what is freed for the next array, up to 256 MB; nothing changes elsewhere."""
-    with suppress(AttributeError, TypeError, OSError):
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_TRIM, _RETAINED)
-        mallopt(_MMAP, _OF_HEAP)

@@ -19,9 +19,8 @@ from .batch import EpisodeBatch
 from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes
 from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame, from_pykoop, to_pykoop
-from .readers.motor_drive_raw import write_raw
 from .readers.opening import read
-from .readers.parquet import read_parquet, write_parquet
+from .readers.parquet import write_parquet
 
 __all__ = [
     "Channel",
@@ -35,11 +34,9 @@ __all__ = [
     "from_pykoop",
     "prepare",
     "read",
-    "read_parquet",
     "split_episodes",
     "steps",
     "to_pykoop",
     "write_parquet",
-    "write_raw",
 ]
 __getattr__ = refusing(__name__)

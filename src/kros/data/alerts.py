@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 
 import numpy as np
 import numpy.typing as npt
 
-from .population import Channel, EpisodeKey, Role
+from .population import Channel, EpisodeKey
 from .recording import CHECK, some, title
 
 Array = npt.NDArray[np.float64]
@@ -20,7 +19,6 @@ _FACTORS = {  # between units of measure that are mixed up, and what they are
     60.0: "minutes and seconds",
     1000.0: "a unit and its thousandth",
 }
-UNUSUAL = "check the unit of the column of time (time_scale)"
 
 
 @dataclass(frozen=True)
@@ -29,18 +27,17 @@ class AlertRule:
 
     near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
     compact: float = 3.0  # by which sizes may differ on either side of it
-    correlated: float = 0.95  # of a channel with the slope of another one, from which on it counts as its derivative
-    decades: float = 0.05  # by which the factor between both may differ from a thousand or a million
 
 
 _RULE = AlertRule()
 
 
-def period_alerts(values: Array, channels: Sequence[Channel], period_s: float) -> tuple[str, ...]:
-    """Return what speaks against a sampling period."""
-    unusual = f"The sampling period of {period_s:g} s is unusual: {UNUSUAL} and sample_period_s"
-    alerts = [] if CHECK.shortest_s < period_s < CHECK.longest_s else [f"{unusual}, on which every frequency depends."]
-    return (*alerts, *_derivatives(values, channels, period_s))
+def period_alerts(period_s: float) -> tuple[str, ...]:
+    """Return what speaks against a sampling period: a time in ms or us that is taken for seconds."""
+    if CHECK.shortest_s < period_s < CHECK.longest_s:
+        return ()
+    unusual = f"The sampling period of {period_s:g} s is unusual: check the unit of the column of time (time_scale)"
+    return (f"{unusual} and sample_period_s, on which every frequency depends.",)
 
 
 def size_of(values: Array) -> Array:
@@ -77,17 +74,3 @@ def _two_scales(sizes: Mapping[str, float]) -> str:
     fewer = some(names[:cut] if smaller else names[cut:])
     factor = f"{np.exp(gap):.3g} times {'smaller' if smaller else 'larger'}"
     return f"{factor} in {fewer} than in the others: are its units of measure mixed up ({' or '.join(kinds)})?"
-
-
-def _derivatives(values: Array, channels: Sequence[Channel], period_s: float) -> Iterator[str]:
-    """A state that is another one's slope, but for a factor of a thousand or a million: units of time are mixed."""
-    states = [i for i, c in enumerate(channels) if c.role is Role.STATE]
-    for one, other in permutations(states, 2):
-        slope, speed = values[2:, one] - values[:-2, one], values[1:-1, other]  # of two periods
-        sizes = np.linalg.norm(slope), np.linalg.norm(speed)
-        if min(sizes) > 0 and slope @ speed > _RULE.correlated * sizes[0] * sizes[1]:
-            decades = np.log10(2 * period_s) + np.log10(sizes[1]) - np.log10(sizes[0])
-            if min(abs(abs(decades) - 3), abs(abs(decades) - 6)) < _RULE.decades:
-                slope_of = f"{channels[other].name!r} is the slope of {channels[one].name!r}"
-                factor = f"times {10.0 ** round(decades):g} at the sampling period of {period_s:g} s"
-                yield f"{slope_of} {factor}: {UNUSUAL}, or the units of these channels."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -11,6 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError
 from .population import EpisodeKey, Population
+from .recording import some
 
 Array = npt.NDArray[np.float64]
 
@@ -68,6 +70,8 @@ class EpisodeBatch:
         """Read episodes, each cut to at most `max_samples`, with the lifting parameters that all units have."""
         if not keys:
             raise DataError("Reading a batch of episodes: no episodes were named; check the split.")
+        if twice := [str(key) for key, count in Counter(keys).items() if count > 1]:
+            raise DataError(f"Reading a batch of episodes: {some(twice)} named more than once; name each once.")
         pairs = [population.read_with_truths(key) for key in keys]
         batch = cls.of(population, {k: e[:max_samples] for k, (e, _) in zip(keys, pairs, strict=True)}, parameters)
         if not (truths and population.truths):

@@ -6,7 +6,7 @@ import logging
 import math
 import unicodedata
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from hashlib import sha256
 from numbers import Real
 from typing import Any
@@ -15,16 +15,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core import limits
-from ..core.errors import ConfigError, DataError
+from ..core.errors import DataError
 from ..core.files import shortened
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from .recording import CHECK, title, usable
 
 logger = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-Look = Callable[[EpisodeKey, Array], None]
-
-ON_NAN = ("error", "drop_episode")
 
 
 class NonFiniteError(DataError):
@@ -76,24 +73,23 @@ def check_finite(
 ) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
     for column in range(len(channels)) if columns is None else columns:
-        bad = np.flatnonzero(~usable(values[:, column]))
+        signal = values[:, column]
+        kinds = {
+            "NaN": np.isnan(signal),
+            f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
+            "infinity": np.isinf(signal),
+        }
+        bad = np.flatnonzero(np.any(list(kinds.values()), axis=0))
         if bad.size:
-            kinds = " and ".join(sorted({_kind(v) for v in values[bad, column]}))
+            what = " and ".join(kind for kind, places in kinds.items() if places.any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
             advice = 'fix the source or set data.on_nan = "drop_episode"'
             name = channels[column].name
-            raise NonFiniteError(f"{title(key)}: channel {name!r} has {bad.size} {kinds} at {where}; {advice}.")
-
-
-def _kind(value: float) -> str:
-    """Return what an unusable value is."""
-    if np.isnan(value):
-        return "NaN"
-    return "infinity" if np.isinf(value) else f"above {limits.MAX_VALUE:g}"
+            raise NonFiniteError(f"{title(key)}: channel {name!r} has {bad.size} {what} at {where}; {advice}.")
 
 
 class GroupWatch:
-    """What only the episodes of one unit and condition tell together: channels that never move, and wild samples.
+    """What only the episodes of one unit and condition show together: channels that never move, and wild samples.
 
     A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
     values, and what it moves by in half of the other episodes.
@@ -103,22 +99,19 @@ class GroupWatch:
         self._channels = channels
         self._resting: list[dict[int, float]] = []
         self._ranges: dict[EpisodeKey, Array] = {}
-        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # samples, values and quantiles of a channel
+        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # column, samples and values, quantiles
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
         signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
         self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
         self._ranges[key] = np.ptp(values, axis=0)
-        for i, column in enumerate(values.T):
-            few = np.sort(column[:: max(1, len(column) // 64)])
-            if self._ranges[key][i] <= CHECK.wild * (few[-2] - few[1]):
-                continue  # a few samples show already that the channel moves as much
-            outside = max(1, len(column) // 100)  # at each end; one at least, for short episodes
-            quantiles = np.sort(column)[[outside, len(column) // 2, -1 - outside]]
-            far = np.flatnonzero(np.abs(column - quantiles[1]) > CHECK.wild * (quantiles[2] - quantiles[0]))
-            if far.size:
-                self._suspects.append((key, i, np.stack([far, column[far]]), quantiles))
+        outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
+        rows = [outside, len(values) // 2, len(values) - 1 - outside]
+        quantiles = np.partition(values, rows, axis=0)[rows]
+        for i in np.flatnonzero(self._ranges[key] > CHECK.wild * (quantiles[2] - quantiles[0])):
+            far = np.flatnonzero(np.abs(values[:, i] - quantiles[1, i]) > CHECK.wild * np.ptp(quantiles[:, i]))
+            self._suspects.append((key, int(i), np.stack([far, values[far, i]]), quantiles[:, i]))
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0, and the place."""
@@ -138,14 +131,11 @@ class GroupWatch:
         first = self._resting[0] if self._resting else {}
         for i in sorted(set(first).intersection(*self._resting)):
             key, channel = next(iter(self._ranges)), self._channels[i]
-            what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays"
-            count = f"{len(self._resting)} episodes"
-            if channel.role is Role.STATE:
-                place = f"where it is in each of {count}, in the first at {first[i]:g}"
-                raise DataError(f"{what} {place}; check the sensor and the column, or leave the unit out.")
-            if all(resting[i] == first[i] for resting in self._resting):
-                place = f"at {first[i]:g} in all {count}, so nothing can be learned from it"
-                raise DataError(f"{what} {place}; check the column, or remove the channel.")
+            if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
+                continue  # it differs from episode to episode
+            what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"
+            place = f"in each of {len(self._resting)} episodes, in the first at {first[i]:g}"
+            raise DataError(f"{what} {place}; check the sensor and the column, or remove the channel or the unit.")
 
 
 def check_names(kind: str, names: Iterable[Any]) -> None:
@@ -210,35 +200,29 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
 
 
-def scan_digests(
-    population: Population, on_nan: str = "error", look: Look | None = None
-) -> list[tuple[EpisodeKey, str]]:
-    """Read and check every episode; return the usable ones with their digests. `look` is called with every episode."""
-    groups = (usable_episodes(population, keys, on_nan, look) for _, _, keys in population.groups())
+def scan_digests(population: Population, on_nan: str = "error") -> list[tuple[EpisodeKey, str]]:
+    """Read and check every episode; return the usable ones with their digests."""
+    groups = (usable_episodes(population, keys, on_nan) for _, _, keys in population.groups())
     digests = [(key, digest) for group in groups for key, _, digest in group]
     refuse_copies(digests)
     return digests
 
 
 def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: str, look: Look | None = None
+    population: Population, keys: Iterable[EpisodeKey], on_nan: str = "error"
 ) -> Iterator[tuple[EpisodeKey, Array, str]]:
     """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
-    if on_nan not in ON_NAN:
-        raise ConfigError(f"data.on_nan should be one of {list(ON_NAN)}, found {on_nan!r}; correct it.")
     watch = GroupWatch(population.columns)
     for key in keys:
         try:
             values = population.source(key)
             check_episode(values, key, population.columns)
         except NonFiniteError as error:
-            if on_nan == "error":
+            if on_nan != "drop_episode":
                 raise
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(key, values)
-        if look is not None:
-            look(key, values)
         yield key, values, digest_of(values)
     watch.check()
 

@@ -61,10 +61,6 @@ class FoundLimit:
     units: tuple[str, ...]  # units that were seen at them
     samples: int  # how long
 
-    def __str__(self) -> str:
-        ends = [f"{value:.4g}" for value in (self.lower, self.upper) if value is not None]
-        return f"{' and '.join(ends)}, where {len(self.units)} units were for {self.samples} samples"
-
 
 def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
     """Return the flat tops of a signal, shape (n_samples,), with inputs of shape (n_samples, m), at both ends."""

@@ -146,10 +146,9 @@ def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
 
 def part_columns(columns: Iterable[Channel]) -> dict[str, Any]:
     """Return the columns of a source as the ``channels`` and the ``truths`` of a population."""
-    parts: dict[bool, list[Channel]] = {False: [], True: []}
-    for column in columns:
-        parts[column.role is Role.TRUTH].append(column)
-    return {"channels": tuple(parts[False]), "truths": tuple(parts[True])}
+    columns = tuple(columns)
+    truths = tuple(c for c in columns if c.role is Role.TRUTH)
+    return {"channels": tuple(c for c in columns if c.role is not Role.TRUTH), "truths": truths}
 
 
 @dataclass(frozen=True)

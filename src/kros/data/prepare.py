@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter, ValidationError
 
-from ..core.errors import DataError
-from ..core.files import stamp_of
+from ..core.errors import ConfigError, DataError
+from ..core.files import did_you_mean, shortened, stamp_of
 from ..core.store import digest_of
 from .checks import check_episode, check_period, check_structure, checked_blocks
 from .population import (
@@ -27,7 +28,7 @@ from .population import (
     restrict,
 )
 from .recording import Recording, Recordings, check_even, estimate_period
-from .steps import Signals, Step
+from .steps import STEPS, Signals, Step
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,8 +46,10 @@ class PreparedSource:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recorded(key)
         if not any(step.makes_even for step in self.steps):
-            where = self.recordings.where(key) if isinstance(self.recordings, Recordings) else ""
-            check_even(recording, self.period_s, self.reference, where)
+            file = (
+                self.recordings.file(self.recordings.places[key]) if isinstance(self.recordings, Recordings) else None
+            )
+            check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
         signals = Signals(self.channels, self.period_s)
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
@@ -56,11 +59,9 @@ class PreparedSource:
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
-        blocks = None
-        if isinstance(self.recordings, Recordings) and not self.steps:
-            blocks = self.recordings.blocks(key, rows)
-        if blocks is not None:
-            return checked_blocks(blocks, key, self.channels, gaps=self.gaps)
+        blocks = getattr(self.recordings, "blocks", None)
+        if blocks is not None and not self.steps:
+            return checked_blocks(blocks(key, rows), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
 
@@ -147,9 +148,32 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     return replace(population, sample_period_s=signals.period_s, source=source, **about)
 
 
+def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
+    """Return steps from TOML tables such as ``{"step": "trim", "start": 1000}``; steps pass through."""
+    return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
+
+
+def _parse_step(table: Mapping[str, Any], where: str) -> Step:
+    """Return the step of one table."""
+    name = table.get("step") if isinstance(table, Mapping) else None
+    if not isinstance(name, str) or name not in STEPS:
+        raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
+    try:
+        return TypeAdapter(STEPS[name]).validate_python({key: v for key, v in table.items() if key != "step"})
+    except ValidationError as error:
+        problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
+        key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
+        text = f"{key}: {problem['msg'].lower()}, found {actual}"
+        if problem["type"] == "unexpected_keyword_argument":
+            text = f"unknown key {key!r}{did_you_mean(key, known) or ';'} known keys are {', '.join(known)}"
+        if problem["type"] == "missing":
+            text = f"key {key!r} is missing, found {list(table)}; add it"
+        raise ConfigError(f"{where} (step {name!r}): {text}.") from error
+
+
 @dataclass(frozen=True, eq=False)
 class Scaled:
-    """A source whose columns are divided by sizes, shape (n_columns,); nothing is copied."""
+    """A source whose columns are divided by sizes, shape (n_columns,)."""
 
     source: EpisodeSource
     sizes: npt.NDArray[np.float64]
@@ -166,9 +190,9 @@ class Scaled:
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
     """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
     owners = [c.of or c.name for c in population.columns]
-    factors = np.array([float(sizes.get(name, 1.0)) for name in owners])
+    source = Scaled(population.source, np.array([float(sizes.get(name, 1.0)) for name in owners]))
     columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
-    return replace(population, source=Scaled(population.source, factors), **part_columns(columns))
+    return replace(population, source=source, **part_columns(columns))
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:

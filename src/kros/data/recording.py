@@ -5,7 +5,7 @@ reader ── Recording ── steps ── Recording ── checks ── sampl
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -62,10 +62,6 @@ class Recordings:
         """Return one episode as recorded."""
         raise NotImplementedError
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Float] | None:
-        """Return the samples of an episode in blocks; None where it can only be read whole."""
-        return None
-
     def __call__(self, key: EpisodeKey) -> Recording:
         """Return one episode, without a last sample that repeats the stamp before it, as stopped recorders write."""
         if key not in self.places:
@@ -75,11 +71,6 @@ class Recordings:
         time = recording.time_s
         repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
         return recording.cut(0, len(recording.values) - 1) if repeated else recording
-
-    def where(self, key: EpisodeKey) -> str:
-        """Return in which file an episode is, for messages; nothing where it is in none."""
-        file = self.file(self.places[key])
-        return "" if file is None else f" in {file}"
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in, where it is in one."""
@@ -100,7 +91,7 @@ def title(key: EpisodeKey) -> str:
     return f"E{str(key)[1:]}"
 
 
-def some(names: Sequence[str], most: int = 4) -> str:
+def some(names: Sequence[str], most: int = 8) -> str:
     """Return the first of some names for a message, and how many more there are."""
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
@@ -128,10 +119,9 @@ def check_increasing(recording: Recording, where: str = "") -> None:
     bad = np.flatnonzero(~(np.diff(time) > 0))
     if bad.size:
         k = int(bad[0])
-        raise DataError(
-            f"{title(recording.key)}{where}: time should increase, found {time[k]:g} s at sample {k} and "
-            f"{time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps); remove repeated or disordered samples."
-        )
+        actual = f"found {time[k]:g} s at sample {k} and {time[k + 1]:g} s at sample {k + 1} ({len(bad)} such steps)"
+        advice = "remove repeated or disordered samples"
+        raise DataError(f"{title(recording.key)}{where}: time should increase, {actual}; {advice}.")
 
 
 def check_even(recording: Recording, period_s: float, reference: EpisodeKey, where: str = "") -> None:

@@ -17,30 +17,28 @@ The column `late` lags by a sample, and the angle, in degrees, has an offset tha
 >>> prepared = kros.data.prepare(data, [*declared, steps.Scale(("angle",), 0.0174533, "rad")])
 >>> prepared.read(prepared.keys()[0]).round(2).tolist(), prepared.channels[0].unit
 ([[0.0, 2.0, 0.0], [1.57, 3.0, 90.0], [3.14, 4.0, 180.0]], 'rad')
->>> steps.parse_steps([{"step": "resample", "period_s": 0.005}])
-(Resample(period_s=0.005, max_gap_s=None, passband=0.8),)
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import ConfigDict
 
 from ..core import limits
 from ..core.errors import ConfigError, DataError
-from ..core.files import did_you_mean, shortened
+from ..core.files import did_you_mean
 from ..core.removed import refusing
 from .checks import check_finite
 from .population import Channel, Role, Scalings, scaling_of
 from .recording import CHECK, Recording, check_increasing, estimate_period, title
 
-__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim", "parse_steps"]
+__all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]
 __getattr__ = refusing(__name__)
 
 Float = npt.NDArray[np.float64]
@@ -338,45 +336,3 @@ def lowpass(values: Float, cutoff: float) -> Float:
 
 
 STEPS: dict[str, type[Step]] = {kind.step: kind for kind in (Scale, Shift, Offset, Trim, Resample, Differentiate)}
-
-
-def parse_steps(tables: Iterable[Step | Mapping[str, Any]], where: str = "data.prepare") -> tuple[Step, ...]:
-    """Return steps from TOML tables (steps pass through).
-
-    Parameters
-    ----------
-    tables : iterable of mapping or Step
-        For example ``[{"step": "trim", "start": 1000}]``.
-    where : str
-        What the messages call the list.
-
-    Raises
-    ------
-    ConfigError
-        An unknown step or key, a missing key, or a value of the wrong type.
-
-    Examples
-    --------
-    >>> from kros.data.steps import parse_steps
-    >>> parse_steps([{"step": "trim", "start": 1000}])
-    (Trim(start=1000, stop=None, tail=0),)
-    """
-    return tuple(t if isinstance(t, Step) else _parse_step(t, f"{where}[{i}]") for i, t in enumerate(tables))
-
-
-def _parse_step(table: Mapping[str, Any], where: str) -> Step:
-    """Return the step of one table."""
-    name = table.get("step") if isinstance(table, Mapping) else None
-    if not isinstance(name, str) or name not in STEPS:
-        raise ConfigError(f"{where}: step should be one of {list(STEPS)}, found {name!r}; correct it.")
-    try:
-        return TypeAdapter(STEPS[name]).validate_python({key: v for key, v in table.items() if key != "step"})
-    except ValidationError as error:
-        problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
-        key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
-        text = f"{key}: {problem['msg'].lower()}, found {actual}"
-        if problem["type"] == "unexpected_keyword_argument":
-            text = f"unknown key {key!r}{did_you_mean(key, known) or ';'} known keys are {', '.join(known)}"
-        if problem["type"] == "missing":
-            text = f"key {key!r} is missing, found {list(table)}; add it"
-        raise ConfigError(f"{where} (step {name!r}): {text}.") from error

@@ -6,8 +6,9 @@ Population --survey--> Population that can be used, RecordingFacts
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,7 @@ from ..core.files import is_file, link_or_copy
 from ..core.store import file_digest
 from ..core.work import Work
 from .alerts import period_alerts, scale_alerts, size_of
-from .checks import check_population, refuse_copies, scan_digests
+from .checks import check_population, refuse_copies, usable_episodes
 from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit, smallest_step
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .prepare import recording_marks
@@ -32,7 +33,6 @@ Array = npt.NDArray[np.float64]
 log = logging.getLogger(__name__)
 UNLOADED = "noload"
 _PARTS = ("train", "test")
-_TEXTS = ("dropped", "alerts", "reserve")
 
 
 @dataclass(frozen=True)
@@ -76,13 +76,10 @@ class RecordingFacts:
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
-        facts = {name: getattr(self, name) for name in ("identify_on", "groups", "resolution", *_TEXTS)}
-        for part in _PARTS:
-            facts[part] = [[k.unit, k.condition, k.episode] for k in getattr(self, part)]
+        facts = {f.name: getattr(self, f.name) for f in fields(self)}
         facts["limits"] = {name: asdict(limit) for name, limit in self.limits.items()}
-        if self.digests:
-            facts["digests"] = {part: [self.digests.get(k) for k in getattr(self, part)] for part in _PARTS}
-        return facts
+        facts["digests"] = {part: [self.digests.get(k) for k in facts[part]] for part in _PARTS}
+        return facts | {part: [astuple(k) for k in facts[part]] for part in _PARTS}
 
     @classmethod
     @loader
@@ -90,18 +87,11 @@ class RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
         parts: dict[str, Any] = {part: tuple(EpisodeKey(*row) for row in content[part]) for part in _PARTS}
-        known = content.get("digests", {})
-        pairs = [pair for part, keys in parts.items() for pair in zip(keys, known.get(part, ()), strict=False)]
-        limits = content.get("limits", {})
-        return cls(
-            identify_on=content["identify_on"],
-            groups=content["groups"],
-            resolution=content["resolution"],
-            limits={name: FoundLimit(**{**of, "units": tuple(of["units"])}) for name, of in limits.items()},
-            digests={key: digest for key, digest in pairs if digest},
-            **parts,
-            **{name: tuple(content.get(name, ())) for name in _TEXTS},
-        )
+        pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
+        limits = {name: FoundLimit(**{**of, "units": tuple(of["units"])}) for name, of in content["limits"].items()}
+        known: dict[str, Any] = {name: content[name] for name in ("identify_on", "groups", "resolution")}
+        known |= {name: tuple(content[name]) for name in ("dropped", "alerts", "reserve")}
+        return cls(**known, **parts, limits=limits, digests={key: text for key, text in pairs if text})
 
 
 @dataclass(frozen=True)
@@ -114,20 +104,28 @@ class _Group:
 
 
 @dataclass(frozen=True)
+class _EpisodeFacts:
+    """What a worker saw in one episode."""
+
+    key: EpisodeKey
+    digest: str
+    n_samples: int
+    size: Array  # of the channels
+    reach: Array  # lowest and highest inputs, shape (2, m)
+    ends: dict[str, Ends]  # of the states that are not measured
+
+
+@dataclass(frozen=True)
 class _GroupFacts:
     """What a worker read in one unit and condition; `written` is the digest of the file that it wrote."""
 
     record: GroupRecord | None
     written: str | None
     resolution: dict[str, float]
-    scanned: list[tuple[EpisodeKey, str]]
-    alerts: tuple[str, ...]
-    ends: dict[str, list[Ends]]
-    inputs: list[Array]  # lowest and highest inputs of every episode, shape (2, m)
-    sizes: list[Array]  # of the channels of every episode, with its number of samples behind them
+    episodes: list[_EpisodeFacts]
 
 
-_KINDS = (_GroupFacts, GroupRecord, EpisodeKey, FlatTops)
+_KINDS = (_GroupFacts, GroupRecord, EpisodeKey, FlatTops, _EpisodeFacts)
 
 
 @dataclass(frozen=True)
@@ -174,39 +172,38 @@ def survey(
 
     groups = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
     retained = _retained(population, groups, folder)
-    part = [group for group in groups if group.scanned[0][0].unit not in set(chosen.reserve)]
-    facts = _facts(population, retained, part, chosen)
-    for name, limit in facts.limits.items():
-        log.info("%s is limited at %s.", name, limit)
+    episodes = [e for group in groups for e in group.episodes if e.key.unit not in set(chosen.reserve)]
+    resolution = {m: min(g.resolution[m] for g in groups) for m in retained.measured}
+    facts = replace(_facts(population, retained, episodes, chosen), resolution=resolution)
     for alert in facts.alerts:
         log.warning("%s", alert)
     return retained, facts
 
 
 def _facts(
-    population: Population, retained: Population, groups: Sequence[_GroupFacts], options: SurveyOptions
+    population: Population, retained: Population, episodes: Sequence[_EpisodeFacts], options: SurveyOptions
 ) -> RecordingFacts:
-    """Return the facts of all groups that take part."""
+    """Return the facts of all episodes that take part."""
     left, part = set(retained.episodes), [u for u in retained.unit_ids if u not in set(options.reserve)]
     splits = split_episodes(retained.select(part), options.test)
-    sizes = {key: size for g in groups for (key, _), size in zip(g.scanned, g.sizes, strict=True)}
-    short = [f"{title(key)} has {int(size[-1])}" for key, size in sizes.items() if size[-1] < options.fewest]
-    if short:
+    if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
-    alerts = [alert for g in groups for alert in g.alerts] + list(scale_alerts(sizes, population.columns))
-    outliers = {u for u in part if retained.unit(u).group == OUTLIERS}
+    sizes, groups = {e.key: e.size for e in episodes}, {unit: retained.unit(unit).group for unit in part}
+    pooled = [e for e in episodes if groups[e.key.unit] != OUTLIERS]
+    ranges = np.ptp(np.concatenate([e.reach for e in pooled]), axis=0) if pooled else np.zeros(0)
+    limits = {name: found_limit([e.ends[name] for e in pooled], ranges) for name in (pooled[0].ends if pooled else ())}
     return RecordingFacts(
         identify_on=condition_of(population.select(part), options.identify_on),
-        groups={unit: retained.unit(unit).group for unit in part},
+        groups=groups,
         train=tuple(k for s in splits.values() for k in s.train),
         test=tuple(k for s in splits.values() for k in s.test),
-        resolution={m: min(g.resolution[m] for g in groups) for m in retained.measured},
+        resolution={},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=tuple(dict.fromkeys(alerts)),
+        alerts=(*period_alerts(retained.sample_period_s), *scale_alerts(sizes, population.columns)),
         reserve=tuple(options.reserve),
-        limits=_limits([g for g in groups if g.scanned[0][0].unit not in outliers]),
-        digests=dict(pair for g in groups for pair in g.scanned),
+        limits={name: limit for name, limit in limits.items() if limit is not None},
+        digests={e.key: e.digest for e in episodes},
     )
 
 
@@ -233,43 +230,28 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
-    ((unit, condition, _),) = population.groups()
-    names, n = [c.name for c in population.channels], len(population.states)
-    ends: dict[str, list[Ends]] = {name: [] for name in population.states if name not in population.measured}
-    first: list[Array] = []
-    sizes: list[Array] = []
-    reach: list[Array] = []
+    ((unit, condition, keys),) = population.groups()
+    names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
+    n, hidden = len(population.states), [s for s in population.states if s not in population.measured]
 
-    def look(key: EpisodeKey, values: Array) -> None:
-        first.extend([values] if not first else [])
-        sizes.append(np.append(size_of(values), len(values)))
-        inputs = values[:, n : len(names)]
-        reach.append(np.stack([inputs.min(axis=0), inputs.max(axis=0)]))
-        for name, of in ends.items():
-            of.append(ends_of(unit, f"{condition}/{key.episode}", values[:, names.index(name)], inputs))
+    def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
+        for key, values, digest in usable_episodes(population, keys, task.on_nan):
+            for name in population.measured if not episodes else ():
+                resolution[name] = smallest_step(values[:, names.index(name)])
+            inputs, place = values[:, n : len(names)], f"{condition}/{key.episode}"
+            ends = {name: ends_of(unit, place, values[:, names.index(name)], inputs) for name in hidden}
+            reach = np.stack([inputs.min(axis=0), inputs.max(axis=0)])
+            episodes.append(_EpisodeFacts(key, digest, len(values), size_of(values), reach, ends))
+            yield key, values, digest
 
     if task.folder is None:
-        digests = scan_digests(population, on_nan=task.on_nan, look=look)
+        deque(usable(), maxlen=0)
     else:
-        record = write_group(population, unit, condition, task.folder, task.on_nan, look)
-        digests = record.recognised
-    if not digests:
+        record = write_group(population, unit, condition, task.folder, usable())
+        written = file_digest(task.folder / record.file) if record.episodes else None
+    if not episodes:
         raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
-    if record is not None and task.folder is not None:
-        written = file_digest(task.folder / record.file)
-    resolution = {name: smallest_step(first[0][:, names.index(name)]) for name in population.measured}
-    alerts = period_alerts(first[0][:, : len(names)], population.channels, population.sample_period_s)
-    return _GroupFacts(record, written, resolution, digests, alerts, ends, reach, sizes)
-
-
-def _limits(groups: Sequence[_GroupFacts]) -> dict[str, FoundLimit]:
-    """Return the limits that the states of all units were seen at."""
-    if not groups:
-        return {}
-    reach = np.concatenate([inputs for group in groups for inputs in group.inputs])
-    ranges, names = np.ptp(reach, axis=0), groups[0].ends
-    limits = {name: found_limit([e for g in groups for e in g.ends[name]], ranges) for name in names}
-    return {name: limit for name, limit in limits.items() if limit is not None}
+    return _GroupFacts(record, written, resolution, episodes)
 
 
 def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Path | None) -> Population:
@@ -277,7 +259,6 @@ def _retained(population: Population, groups: Sequence[_GroupFacts], folder: Pat
     if folder is not None:
         write_index(population, [g.record for g in groups if g.record is not None], folder, converted=False)
         return read_parquet(folder)
-    scanned = [pair for group in groups for pair in group.scanned]
-    refuse_copies(scanned)
-    present = {key for key, _ in scanned}
-    return replace(population, episodes=tuple(k for k in population.episodes if k in present))
+    digests = {e.key: e.digest for group in groups for e in group.episodes}
+    refuse_copies(digests.items())
+    return replace(population, episodes=tuple(k for k in population.episodes if k in digests))

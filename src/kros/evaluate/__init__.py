@@ -11,24 +11,18 @@ Examples
 """
 
 from ..core.removed import refusing
-from .disturb import Disturbance, Kind, standard_disturbances
+from .disturb import Kind
 from .errors import error_percent, error_rms, error_spectrum
 from .intervals import unit_interval
 from .next_unit import next_unit_bound
-from .robustness import DisturbedEpisodes, robustness_rows
-from .truth import TrueErrors, true_errors
+from .truth import true_errors
 
 __all__ = [
-    "Disturbance",
-    "DisturbedEpisodes",
     "Kind",
-    "TrueErrors",
     "error_percent",
     "error_rms",
     "error_spectrum",
     "next_unit_bound",
-    "robustness_rows",
-    "standard_disturbances",
     "true_errors",
     "unit_interval",
 ]

@@ -3,23 +3,29 @@
 The batch of episodes is repeated for every disturbance, disturbance outermost, so that observers run on all of them in
 one pass. Disturbances of one kind share their random draws (the samples that are lost at 5 % are lost at 10 %, too), so
 that errors over severity are smooth. Estimates are compared with the recordings as they are.
+
+    episodes --disturb--> measurements --observers--> estimates --recordings--> errors over severity
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
 from ..core.settings import member
+from ..data.batch import EpisodeBatch
 from ..data.batch import hold_missing as hold_missing  # beside what makes them miss
+from ..data.population import EpisodeKey
+from .errors import error_percent
 
 Array = npt.NDArray[np.float64]
-LOST_IN_GAPS = 0.1  # share of samples that gaps take, whatever their length
+Row = dict[str, Any]
 
 
 class Kind(str, Enum):
@@ -59,64 +65,31 @@ class Kind(str, Enum):
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One disturbance.
-
-    Parameters
-    ----------
-    kind : Kind or str
-    severity : float
-        In the unit of its kind; zero disturbs nothing.
-    draw : int
-        Number of the random draw; disturbances of one kind and draw share it.
-
-    Raises
-    ------
-    ConfigError
-        For a severity out of range.
-
-    Examples
-    --------
-    >>> from kros.evaluate import Disturbance
-    >>> Disturbance("dropped", 0.1).kind.value
-    'dropped'
-    """
+    """A kind of disturbance with its severity, in the kind's unit; zero disturbs nothing."""
 
     kind: Kind
     severity: float
-    draw: int = 0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "kind", member(Kind, self.kind, "Disturbance: the kind"))
         most = 1.0 if self.kind is Kind.DROPPED else np.inf
         if not 0 <= self.severity <= most or self.severity == np.inf:
-            raise ConfigError(
-                f"Disturbance {self.kind.value}: the severity {self.severity} should be between 0 and {most:g}."
-            )
+            raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be between 0 and {most:g}.")
         if self.kind in {Kind.GAP, Kind.DELAY} and self.severity != int(self.severity):
             raise ConfigError(f"Disturbance {self.kind.value}: {self.severity} should be a whole number of samples.")
 
 
-SEVERITIES: dict[Kind, tuple[float, ...]] = {
-    Kind.DROPPED: (0.02, 0.05, 0.1, 0.2, 0.3, 0.5),
-    Kind.GAP: (10, 30, 100, 300, 1000),
-    Kind.BIAS: (1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
-    Kind.QUANTISATION: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
-    Kind.NOISE: (1e-7, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2),
-    Kind.PHASE: (np.pi / 16, np.pi / 8, np.pi / 4, np.pi / 2, np.pi),
-    Kind.DELAY: (1, 2, 3, 4, 8, 16),
-}
-
-
 def standard_disturbances(kinds: Sequence[Kind] = tuple(Kind)) -> list[Disturbance]:
-    """Return the disturbances of a study: five or six severities of every kind.
-
-    Examples
-    --------
-    >>> from kros.evaluate import Kind, standard_disturbances
-    >>> [disturbance.severity for disturbance in standard_disturbances([Kind.BIAS])]
-    [1e-06, 1e-05, 0.0001, 0.001, 0.01]
-    """
-    return [Disturbance(kind, severity) for kind in kinds for severity in SEVERITIES[kind]]
+    """Return the disturbances of a study: six severities of every kind, evenly spaced on a logarithmic axis."""
+    steps = np.arange(6)
+    severities = {
+        Kind.DROPPED: 0.5 ** (steps[::-1] + 1.0),
+        Kind.GAP: np.round(10 ** (1 + 0.4 * steps)),
+        Kind.PHASE: np.pi * 0.5 ** steps[::-1],
+        Kind.DELAY: 2.0**steps,
+    }
+    shares = 10.0 ** (steps - 7)  # of the largest value
+    return [Disturbance(kind, float(severity)) for kind in kinds for severity in severities.get(kind, shares)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,15 +97,8 @@ class Measured:
     """Measurements of a batch of episodes, and what is calibrated about the machines behind them."""
 
     y: Array  # shape (n_samples, batch, q)
-    parameters: Mapping[str, Array]  # mapping of str to ndarray, shape (batch,); Lifting parameters
-    size: Array  # shape (q,); Range of every measurement
-
-    def __post_init__(self) -> None:
-        if self.y.ndim != 3 or self.size.shape != self.y.shape[2:]:
-            raise DimensionError(
-                f"Measurements {self.y.shape} should be (n_samples, batch, q), with a range for each, found "
-                f"{self.size.shape}."
-            )
+    parameters: Mapping[str, Array]  # lifting parameters, shape (batch,)
+    size: Array  # largest value of every measurement, shape (q,)
 
     def under(self, disturbances: Sequence[Disturbance | None], seed: int = 0) -> Measured:
         """Return the measurements under every disturbance, side by side."""
@@ -149,7 +115,7 @@ class Measured:
                 for values in parameters.values():
                     values[i] += disturbance.severity
             else:
-                rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), disturbance.draw])
+                rng = np.random.default_rng([seed, list(Kind).index(disturbance.kind), 0])
                 y[:, i] = _CHANGES[disturbance.kind](self, disturbance.severity, rng)
         flat = {name: values.reshape(-1) for name, values in parameters.items()}
         return Measured(y.reshape(n_samples, -1, q), flat, self.size)
@@ -166,7 +132,7 @@ def _gap(measured: Measured, severity: float, rng: np.random.Generator) -> Array
     length = min(int(severity), n_samples - 1)
     if not length:
         return measured.y
-    period = min(round(length / LOST_IN_GAPS), n_samples)
+    period = min(10 * length, n_samples)  # so gaps take a tenth of all samples, whatever their length
     k = np.arange(n_samples)[:, None]
     starts = 1 + np.floor(rng.random((-(-n_samples // period), batch)) * (period - length))
     inside = k % period - starts[k[:, 0] // period]
@@ -204,3 +170,50 @@ _CHANGES: dict[Kind, Callable[[Measured, float, np.random.Generator], Array]] = 
     Kind.NOISE: _noise,
     Kind.DELAY: _delay,
 }
+
+
+Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
+
+
+def disturbed_errors(
+    batch: EpisodeBatch, measured: Sequence[int], disturbances: Sequence[Disturbance], run: Run
+) -> list[Array]:
+    """Return errors in percent of every estimator, shape (1 + disturbance, batch, n), the first undisturbed.
+
+    `run` takes keys, measurements, inputs and lifting parameters, and yields estimates (estimator, n_samples, batch, n
+    or more). Errors are not finite where an estimate diverged or there is none.
+    """
+    every, n = (None, *disturbances), batch.states.shape[-1]
+    size = np.abs(batch.states[..., list(measured)]).max(axis=(0, 1))
+    given = Measured(batch.measurements(measured), batch.parameters, size).under(every)
+    inputs, errors = np.tile(batch.inputs, (1, len(every), 1)), list[Array]()
+    for estimates in run(batch.keys * len(every), given.y, inputs, given.parameters):
+        for estimate in estimates:
+            parts = np.split(estimate[..., :n], len(every), axis=1)
+            errors.append(np.stack([error_percent(part, batch.states, batch.lengths) for part in parts]))
+    return errors
+
+
+def disturbed_rows(errors: Array, disturbances: Sequence[Disturbance], channels: Mapping[int, str]) -> Iterator[Row]:
+    """Yield a row a disturbance, severity and channel: mean and worst over episodes, None where one diverged."""
+    severities = [("none", 0.0), *((d.kind.value, float(d.severity)) for d in disturbances)]
+    for (kind, severity), of_episodes in zip(severities, errors, strict=True):
+        for column, channel in channels.items():
+            values = of_episodes[:, column]
+            known = bool(np.isfinite(values).all())
+            error = {name: float(of(values)) if known else None for name, of in (("mean", np.mean), ("worst", np.max))}
+            yield {"disturbance": kind, "severity": severity, "channel": channel, "error_percent": error}
+
+
+def severity_of_growth(severities: npt.ArrayLike, errors: npt.ArrayLike, factor: float = 2.0) -> float:
+    """Return the severity at which an error reaches a multiple of that without disturbance."""
+    s, e = np.asarray(severities, dtype=float), np.asarray(errors, dtype=float)
+    if s.shape != e.shape or s.ndim != 1 or not len(s) or s[0] != 0:
+        raise DimensionError(f"Severity of growth: {s} should begin at zero, with as many errors, found {e.shape}.")
+    limit = factor * e[0]
+    beyond = np.flatnonzero(~(e < limit))
+    if not len(beyond) or beyond[0] == 0:
+        return np.inf if not len(beyond) else 0.0
+    k = beyond[0]
+    share = (limit**2 - e[k - 1] ** 2) / (e[k] ** 2 - e[k - 1] ** 2) if np.isfinite(e[k]) else 1.0
+    return float(np.sqrt(s[k - 1] ** 2 + share * (s[k] ** 2 - s[k - 1] ** 2)))

@@ -9,10 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-START = 50  # samples in which an observer finds out what it does not know at first
 _SEGMENT = 512  # samples of a Welch segment, as in the paper
-_TOGETHER = 6  # episodes whose spectra are computed at once: their segments stay in the cache
-_TURNED = 256  # samples of all signals that are put in order at once: they stay in the cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,15 +18,13 @@ class ErrorSummary:
 
     rms: Array  # (batch, n)
     percent: Array  # (batch, n): `100 rms(x_hat - x) / max|x|` of every episode
-    start_percent: Array  # (batch, n): of the first `START` samples, over the largest value of the episode
-    rest_percent: Array  # (batch, n): the same of the samples behind
     spectra: Array  # (batch, n_freqs, n): Welch's power spectral density of the error
     freqs_hz: Array  # (n_freqs,)
 
     @classmethod
     def joined(cls, parts: Sequence[ErrorSummary]) -> ErrorSummary:
         """Return the summary of one batch after the other."""
-        names = ("rms", "percent", "start_percent", "rest_percent", "spectra")
+        names = ("rms", "percent", "spectra")
         return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
     def band_power(self, band_hz: tuple[float, float]) -> Array:
@@ -38,43 +33,22 @@ class ErrorSummary:
         return self.spectra[:, inside].sum(axis=1) * (self.freqs_hz[1] - self.freqs_hz[0])
 
 
-def summarise(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
-    """Summarise the error of an estimate."""
-    return summarise_all(estimate[None], truth, lengths, dt)[0]
-
-
-def summarise_all(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
-    """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), otherwise as `summarise`."""
+def summarise(estimates: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> list[ErrorSummary]:
+    """Summarise errors of estimates, shape (estimate, n_samples, batch, n or more), against (n_samples, batch, n)."""
     with np.errstate(over="ignore", invalid="ignore"):
         return [_summary(estimate[..., : truth.shape[2]], truth, lengths, dt) for estimate in estimates]
 
 
 def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: float) -> ErrorSummary:
-    error = _signals(estimate, truth)
-    for signals, length in zip(error, lengths, strict=True):
-        signals[:, length:] = 0.0
+    error = np.ascontiguousarray(np.moveaxis(estimate - truth, 0, -1))  # (batch, n, n_samples)
     spectra = np.empty((len(lengths), _SEGMENT // 2 + 1, error.shape[1]))
     for length in np.unique(lengths):
-        episodes = np.flatnonzero(lengths == length)
-        for rows in np.split(episodes, range(_TOGETHER, len(episodes), _TOGETHER)):
-            spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
-    first, whole = (np.einsum("bns,bns->bn", part, part) for part in (error[..., :START], error))
-    counts = (lengths, np.minimum(START, lengths), np.maximum(lengths - START, 1))
-    squares = (whole, first, np.maximum(whole - first, 0.0))
-    rms = [np.sqrt(sums / count[:, None]) for sums, count in zip(squares, counts, strict=True)]
-    largest = _largest(truth, lengths)
-    freqs = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
-    percent, start, rest = (_percent(values, largest) for values in rms)
-    return ErrorSummary(rms[0], percent, start, rest, spectra, freqs)
-
-
-def _signals(estimate: Array, truth: Array) -> Array:
-    """The error with every signal in one piece, shape (batch, n, n_samples)."""
-    error = np.empty((*truth.shape[1:], len(truth)))
-    for start in range(0, len(truth), _TURNED):
-        part = slice(start, start + _TURNED)
-        error[..., part] = np.moveaxis(estimate[part] - truth[part], 0, -1)
-    return error
+        rows = lengths == length
+        error[rows, :, length:] = 0.0
+        spectra[rows] = np.swapaxes(error_spectrum(error[rows, :, :length], dt, axis=-1)[1], 1, 2)
+    rms = np.sqrt(np.einsum("bns,bns->bn", error, error) / lengths[:, None])
+    freqs_hz = np.asarray(np.fft.rfftfreq(_SEGMENT, dt), dtype=float)
+    return ErrorSummary(rms, _percent(rms, _largest(truth, lengths)), spectra, freqs_hz)
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
@@ -149,22 +123,8 @@ def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int =
     >>> float(freqs_hz[density.argmax()])
     25.0
     """
-    signal = np.moveaxis(np.asarray(error, dtype=float), axis, -1)
-    size = min(segment, signal.shape[-1])
-    window = _window(size)
-    pieces = np.lib.stride_tricks.sliding_window_view(signal, size, axis=-1)[..., :: size - size // 2, :]
-    spectra = np.fft.rfft((pieces - pieces.mean(axis=-1, keepdims=True)) * window, segment)
-    density = _density(np.mean(spectra.real**2 + spectra.imag**2, axis=-2), window, segment, dt)
-    return np.asarray(np.fft.rfftfreq(segment, dt), dtype=float), np.moveaxis(density, -1, axis)
+    from scipy.signal import welch
 
-
-def _window(size: int) -> Array:
-    """Hann's window."""
-    return np.asarray(0.5 - 0.5 * np.cos(2 * np.pi * np.arange(size) / size))
-
-
-def _density(powers: Array, window: Array, segment: int, dt: float) -> Array:
-    """The one-sided power spectral density of mean squares of transforms, frequencies last."""
-    density = powers * (dt / max(np.sum(window**2), np.finfo(float).tiny))
-    density[..., 1 : (segment + 1) // 2] *= 2  # all but zero and, of an even number, Nyquist
-    return np.asarray(density)
+    values = np.asarray(error, dtype=float)
+    freqs_hz, density = welch(values, 1 / dt, nperseg=min(segment, values.shape[axis]), nfft=segment, axis=axis)
+    return np.asarray(freqs_hz), np.asarray(density)

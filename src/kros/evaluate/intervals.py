@@ -14,9 +14,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 
 Array = npt.NDArray[np.float64]
-Cell = tuple[str, str, str]
-_ENDS = (0.025, 0.975)
-_FEWEST = 3  # units: of two there are three resamples
+Row = Mapping[str, Any]
 
 
 def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
@@ -51,36 +49,24 @@ def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tu
     rows = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
     places = rows + len(values) * np.arange(draws)[:, None]
     counts = np.bincount(places.ravel(), minlength=draws * len(values)).reshape(draws, len(values)) / len(values)
-    return _interval(np.tensordot(counts, values, 1))
-
-
-def _interval(means: Array) -> tuple[Array, Array]:
-    lower, upper = np.quantile(means, _ENDS, axis=0)
+    lower, upper = np.quantile(np.tensordot(counts, values, 1), (0.025, 0.975), axis=0)
     return np.asarray(lower), np.asarray(upper)
 
 
-def mean_intervals(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal") -> dict[Cell, tuple[float, float]]:
-    """Return the 95 % interval of the mean error over units, by observer, condition and channel."""
-    found: dict[Cell, dict[str, float | None]] = {}
-    for row in rows:
-        if row["role"] == role:
-            found.setdefault((row["observer"], row["condition"], row["channel"]), {})[row["unit"]] = row[
-                "error_percent"
-            ]
-    alike: dict[tuple[str, ...], list[Cell]] = {}
-    for cell, by_unit in found.items():
-        if len(by_unit) >= _FEWEST and all(v is not None and np.isfinite(v) for v in by_unit.values()):
+def interval_rows(rows: Sequence[Row], role: str = "off_nominal") -> list[dict[str, Any]]:
+    """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
+    errors: dict[tuple[str, str, str], dict[str, Any]] = {}
+    for row in (row for row in rows if row["role"] == role):
+        cell = (row["observer"], row["condition"], row["channel"])
+        errors.setdefault(cell, {})[row["unit"]] = row["error_percent"]
+    alike: dict[tuple[str, ...], list[tuple[str, str, str]]] = {}
+    for cell, by_unit in errors.items():
+        if len(by_unit) > 2 and all(value is not None and np.isfinite(value) for value in by_unit.values()):
             alike.setdefault(tuple(sorted(by_unit)), []).append(cell)
-    intervals: dict[Cell, tuple[float, float]] = {}
+    intervals = []
     for units, cells in alike.items():
-        lower, upper = unit_interval(np.array([[found[cell][unit] for cell in cells] for unit in units], dtype=float))
-        intervals |= {cell: (float(low), float(high)) for cell, low, high in zip(cells, lower, upper, strict=True)}
+        ends = np.transpose(unit_interval([[float(errors[cell][unit]) for cell in cells] for unit in units]))
+        for cell, interval in zip(cells, ends.tolist(), strict=True):
+            place = dict(zip(("observer", "condition", "channel"), cell, strict=True))
+            intervals.append({**place, "role": role, "interval": interval})
     return intervals
-
-
-def interval_rows(rows: Sequence[Mapping[str, Any]], role: str = "off_nominal") -> list[dict[str, Any]]:
-    """Return the same as rows, each with its ``interval`` of lower and upper end."""
-    return [
-        {"observer": observer, "condition": condition, "channel": channel, "role": role, "interval": list(ends)}
-        for (observer, condition, channel), ends in mean_intervals(rows, role).items()
-    ]

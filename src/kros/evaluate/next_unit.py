@@ -69,9 +69,8 @@ def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: flo
     if not 0 < confidence < 1:
         raise DataError(f"Bound of the next unit: the confidence is between 0 and 1, found {confidence:g}.")
     if errors.ndim != 2 or scale.shape != errors.shape[1:] or not scale.size:
-        raise DataError(
-            f"Bound of the next unit: needs errors (unit, k) and a scale (k,), found {errors.shape} and {scale.shape}."
-        )
+        shapes = f"needs errors (unit, k) and a scale (k,), found {errors.shape} and {scale.shape}"
+        raise DataError(f"Bound of the next unit: {shapes}.")
     if not (np.isfinite(scale) & (scale > 0)).all():
         raise DataError(f"Bound of the next unit: a scale is positive and finite, found {scale.tolist()}.")
     if len(errors) < fewest_units(confidence):

@@ -6,15 +6,16 @@ in whatever units.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from zlib import crc32
 
 import numpy as np
 import numpy.typing as npt
 
-from ..data import EpisodeBatch
+from ..data import EpisodeBatch, Population
 from ..data.population import EpisodeKey
+from ..observer import Observer
 from ..observer.sensor import Sensor, Sensors
 
 Array = npt.NDArray[np.float64]
@@ -22,14 +23,15 @@ Array = npt.NDArray[np.float64]
 
 def as_shown(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str], seed: int = 0) -> EpisodeBatch:
     """Return episodes with what the declared sensors show of their states; where nothing is declared, as they are."""
-    told = {list(states).index(name): own for name, own in sensor.items() if own != Sensor()}
-    if not told:
+    declared = {list(states).index(name): one for name, one in sensor.items() if one != Sensor()}
+    if not declared:
         return batch
     shown, lost = batch.states.copy(), np.zeros(batch.states.shape, dtype=bool)
-    for j, own in told.items():
+    for j, one in declared.items():
         xi, eta, chance = _draws(batch.keys, len(shown), [seed, j])
-        shown[..., j] = _noisy(_late(batch.states[..., j], own.delay_samples + own.jitter_samples * xi), own, eta)
-        lost[1:, :, j] = chance[1:] < own.dropout  # observers start at the first one
+        y = _late(batch.states[..., j], one.delay_samples + one.jitter_samples * xi) + one.bias + one.noise * eta
+        shown[..., j] = np.rint(y / one.resolution) * one.resolution if one.resolution else y
+        lost[1:, :, j] = chance[1:] < one.dropout  # observers start at the first one
     return replace(batch, shown=shown, lost=lost if lost.any() else None)
 
 
@@ -40,13 +42,12 @@ def as_arriving(batch: EpisodeBatch, sensor: Sensors, states: Sequence[str]) -> 
 
 def _draws(keys: Sequence[EpisodeKey], n_samples: int, seed: Sequence[int]) -> tuple[Array, Array, Array]:
     """Draw moments, noise and chances of arrival, (n_samples, batch) each; longer episodes go on."""
-    found = np.empty((3, n_samples, len(keys)))
+    draws = np.empty((3, n_samples, len(keys)))
     for i, key in enumerate(keys):
-        own = crc32("\0".join((key.unit, key.condition, key.episode)).encode())
-        streams = [np.random.default_rng([*seed, own, what]) for what in range(3)]
-        found[0, :, i], found[1, :, i] = (rng.standard_normal(n_samples) for rng in streams[:2])
-        found[2, :, i] = streams[2].random(n_samples)
-    return found[0], found[1], found[2]
+        place = crc32("\0".join((key.unit, key.condition, key.episode)).encode())
+        moments, noise, chances = (np.random.default_rng([*seed, place, what]) for what in range(3))
+        draws[..., i] = moments.standard_normal(n_samples), noise.standard_normal(n_samples), chances.random(n_samples)
+    return draws[0], draws[1], draws[2]
 
 
 def _late(y: Array, behind: Array) -> Array:
@@ -54,12 +55,31 @@ def _late(y: Array, behind: Array) -> Array:
     at = np.clip(np.arange(len(y))[:, None] - behind, 0, len(y) - 1)
     low = np.floor(at).astype(int)
     share = at - low
-    value = np.take_along_axis(y, low, axis=0)
-    return np.where(
-        share > 0, value + share * (np.take_along_axis(y, np.minimum(low + 1, len(y) - 1), axis=0) - value), value
-    )
+    value, following = (np.take_along_axis(y, np.minimum(at, len(y) - 1), axis=0) for at in (low, low + 1))
+    return np.where(share > 0, value + share * (following - value), value)
 
 
-def _noisy(y: Array, own: Sensor, eta: Array) -> Array:
-    y = y + own.bias + own.noise * eta
-    return np.rint(y / own.resolution) * own.resolution if own.resolution else y
+@dataclass(frozen=True)
+class Arriving:
+    """Episodes as they arrive: y (n_samples, batch, q), and u (n_samples, batch, m)."""
+
+    batch: EpisodeBatch
+    y: Array
+    u: Array
+
+    def parameters(self, observer: Observer) -> dict[str, npt.ArrayLike]:
+        """Return the lifting parameters of all episodes."""
+        return observer.own(self.batch.parameters)
+
+
+def arriving(
+    observer: Observer,
+    population: Population,
+    episodes: Mapping[EpisodeKey, Array],
+    values: Mapping[str, Mapping[str, float]],
+) -> Arriving:
+    """Return episodes that were read, or parts of them, with lifting parameters by unit."""
+    batch = EpisodeBatch.of(population, episodes, values)
+    measured = [population.states.index(observer.lifting.states[i]) for i in observer.measured]
+    y = as_arriving(batch, observer.sensor, population.states).measurements(measured)
+    return Arriving(batch, y, batch.inputs[..., [population.inputs.index(name) for name in observer.inputs]])

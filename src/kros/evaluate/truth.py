@@ -16,43 +16,22 @@ import numpy.typing as npt
 from .errors import error_percent, error_rms
 
 Array = npt.NDArray[np.float64]
-_LONGEST = 200  # samples of delay that are looked at, either way
 
 
 @dataclass(frozen=True, eq=False)
 class TrueErrors:
-    """Errors of signals against truths over a batch of episodes.
+    """Errors of signals against truths over a batch of episodes."""
 
-    Parameters
-    ----------
-    states : tuple of int
-        Column of the state that each truth is the truth of.
-    rms, error_percent : ndarray, shape (batch, n_truths)
-        As those of `ErrorSummary`.
-    lag_s : ndarray, shape (batch, n_truths), s
-        How late the signal is, see `delay_samples`; NaN where it cannot be told.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import TrueErrors
-    >>> late = TrueErrors((1,), rms=np.array([[0.1]]), error_percent=np.array([[5.0]]), lag_s=np.array([[0.002]]))
-    >>> late.lag_s.item()
-    0.002
-    """
-
-    states: tuple[int, ...]
-    rms: Array
-    error_percent: Array
-    lag_s: Array
+    states: tuple[int, ...]  # column of the state that each truth is the truth of
+    rms: Array  # (batch, n_truths)
+    error_percent: Array  # (batch, n_truths): as that of `ErrorSummary`
+    lag_s: Array  # (batch, n_truths), s: how late the signal is, see `delay_samples`; NaN where that is unknown
 
     @classmethod
     def joined(cls, parts: Sequence[TrueErrors]) -> TrueErrors:
         """Return the errors of one batch after the other."""
-        return cls(
-            parts[0].states,
-            *(np.concatenate([getattr(part, name) for part in parts]) for name in ("rms", "error_percent", "lag_s")),
-        )
+        names = ("rms", "error_percent", "lag_s")
+        return cls(parts[0].states, *(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def true_errors(
@@ -86,8 +65,8 @@ def true_errors(
     return TrueErrors(states, error_rms(signals, truths, lengths), error_percent(signals, truths, lengths), lag * dt)
 
 
-def delay_samples(signals: Array, truths: Array) -> Array:
-    """Return the delay of truths that fits signals best in the least-squares sense.
+def delay_samples(signals: Array, truths: Array, longest: int = 200) -> Array:
+    """Return the delay of truths, at most `longest` either way, that fits signals best in the least-squares sense.
 
     Minimises ``J(d) = sum_k (y_k - x_{k-d})^2`` over a window of samples that is the same for all `d`, so that the ends
     of an episode favour no delay. All whole `d` are computed at once, ``J(d) = sum y^2 - 2 sum y_k x_{k-d} + sum
@@ -97,7 +76,7 @@ def delay_samples(signals: Array, truths: Array) -> Array:
     from scipy.fft import irfft, next_fast_len, rfft
 
     n = len(signals)
-    most = min(_LONGEST, n // 4)
+    most = min(longest, n // 4)
     found = np.full(signals.shape[1:], np.nan)
     y, x = (np.moveaxis(a, 0, -1).reshape(-1, n) for a in (signals, truths))
     usable = np.isfinite(y).all(axis=-1) & (np.ptp(x, axis=-1) > 0)

@@ -16,24 +16,10 @@ from typing import TYPE_CHECKING
 from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from .control import UncertaintyForControl, from_control, models_to_control, to_control, uncertainty_to_control
+    from .control import UncertaintyForControl, from_control, to_control, uncertainty_to_control
     from .sklearn_estimator import KoopmanRegressor
 
-_HOME = {
-    **dict.fromkeys(
-        ("UncertaintyForControl", "from_control", "models_to_control", "to_control", "uncertainty_to_control"),
-        "control",
-    ),
-    "KoopmanRegressor": "sklearn_estimator",
-}
+__all__ = ["KoopmanRegressor", "UncertaintyForControl", "from_control", "to_control", "uncertainty_to_control"]
 
-__all__ = [
-    "KoopmanRegressor",
-    "UncertaintyForControl",
-    "from_control",
-    "models_to_control",
-    "to_control",
-    "uncertainty_to_control",
-]
-
+_HOME = dict.fromkeys(__all__, "control") | {"KoopmanRegressor": "sklearn_estimator"}
 __getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)

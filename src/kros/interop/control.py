@@ -1,4 +1,4 @@
-"""Systems to and from python-control, with the names of their signals.
+"""Systems to and from python-control, with the names of their signals, and how models of it differ.
 
 kros.core.StateSpace (a batch) ── to_control ──► control.StateSpace (a list) ── from_control ──► kros.core.StateSpace
 """
@@ -13,7 +13,6 @@ import numpy as np
 
 from ..core.errors import DataError, DimensionError, MissingDependencyError
 from ..core.lti import StateSpace
-from ..identify import ModelSet
 from ..uncertainty import ResponseUncertainty, UncertainModel
 
 try:
@@ -105,20 +104,13 @@ def to_control(
     >>> from_control(system).A
     array([[0.5]])
     """
-    if system.batch_shape:
-        return [
-            to_control(system[i], name=name, states=states, inputs=inputs, outputs=outputs)
-            for i in range(system.batch_shape[0])
-        ]
-    counts = {"states": system.n_states, "inputs": system.n_inputs, "outputs": system.n_outputs}
     signals = {"states": states, "inputs": inputs, "outputs": outputs}
-    for kind, names in signals.items():
-        if names is not None and (
-            isinstance(names, str) or len(names) != counts[kind] or len(set(names)) != counts[kind]
-        ):
-            raise DimensionError(
-                f"to_control: {counts[kind]} {kind} need as many different names, found {names!r}; correct the list."
-            )
+    if system.batch_shape:
+        return [to_control(system[i], name=name, **signals) for i in range(system.batch_shape[0])]
+    for (kind, names), count in zip(signals.items(), (system.n_states, system.n_inputs, system.n_outputs), strict=True):
+        if names is not None and (isinstance(names, str) or not len(names) == len(set(names)) == count):
+            problem = f"{count} {kind} need as many different names, found {names!r}"
+            raise DimensionError(f"to_control: {problem}; correct the list.")
     labels = {kind: [_label(text) for text in names] for kind, names in signals.items() if names}
     # Copies: python-control may change matrices in place. States that do nothing stay, since they carry names.
     matrices = [np.array(getattr(system, matrix)) for matrix in "ABCD"]
@@ -151,24 +143,16 @@ def from_control(system: Any) -> StateSpace:
     >>> from_control(control.tf([1.0], [1.0, -0.5], 0.01)).A.tolist()
     [[0.5]]
     """
-    if not is_system(system):
-        raise DimensionError(
-            f"from_control: needs a control.StateSpace or control.TransferFunction, found {type(system).__name__}."
-        )
+    if not isinstance(system, (control.StateSpace, control.TransferFunction)):
+        needs = "needs a control.StateSpace or control.TransferFunction"
+        raise DimensionError(f"from_control: {needs}, found {type(system).__name__}.")
     if system.dt is None or system.dt is True:
-        raise DimensionError(
-            f"from_control: the sampling period is not known (dt = {system.dt}); give it in seconds, control.ss(A, B, "
-            "C, D, 0.001), or 0."
-        )
+        advice = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
+        raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {advice}.")
     if isinstance(system, control.TransferFunction):
         return _realised(system)
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
     return StateSpace(A, B, C, D, float(system.dt))
-
-
-def is_system(model: Any) -> bool:
-    """Tell whether a model is known at every frequency."""
-    return isinstance(model, (control.StateSpace, control.TransferFunction))
 
 
 def _realised(model: Any) -> StateSpace:
@@ -197,49 +181,6 @@ def _realised(model: Any) -> StateSpace:
     return StateSpace(A.reshape(n, n), B, C, D, float(model.dt))
 
 
-def models_to_control(models: ModelSet, units: Sequence[str] | None = None) -> dict[str, Any]:
-    """Return the models of units as `control.StateSpace`, from inputs to lifted states, by unit.
-
-    Parameters
-    ----------
-    models : ModelSet
-    units : sequence of str, optional
-        Default: all.
-
-    Returns
-    -------
-    dict of str to control.StateSpace
-        States and outputs are named after the lifted functions, the system after the unit.
-
-    Raises
-    ------
-    DimensionError
-        An unknown unit.
-
-    Examples
-    --------
-    >>> import kros
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> models = kros.identify(motors, refine=False)
-    >>> systems = kros.interop.models_to_control(models.sets["linear_edmd"])
-    >>> len(systems), systems[motors.unit_ids[0]].input_labels
-    (2, ['voltage'])
-    """
-    asked = models.unit_ids if units is None else tuple(units)
-    unknown = [unit for unit in asked if unit not in models.unit_ids]
-    if unknown or isinstance(units, str):
-        raise DimensionError(
-            f"models_to_control: asked for units {units!r}, the models are of {list(models.unit_ids)}; correct the "
-            "list."
-        )
-    systems = models.systems(asked)
-    names = models.lifting.names
-    return {
-        unit: to_control(systems[i], name=unit, states=names, inputs=models.inputs, outputs=names)
-        for i, unit in enumerate(asked)
-    }
-
-
 def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:
     """Return nominal and weights as `control.StateSpace`, a nominal response as `control.FRD`.
 
@@ -255,10 +196,8 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
     0.01
     """
     if isinstance(model, UncertainModel):
-        nominal, scaled = (
-            to_control(model.nominal_system, name="nominal"),
-            to_control(model.scaled_nominal(), name="scaled_nominal"),
-        )
+        nominal = to_control(model.nominal_system, name="nominal")
+        scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
         certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
     else:
         G, certificate = model.nominal_response, model.certificate

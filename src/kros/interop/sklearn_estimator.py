@@ -29,7 +29,6 @@ except ImportError as error:
     ) from error
 
 Array = npt.NDArray[np.float64]
-EPISODE = "episode"
 
 
 class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -42,7 +41,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     ``X`` alone                  rows in order of time; each row is paired with the next one of its episode
     ``X`` and ``y``              rows pair up: ``y[k]`` is the next state of ``X[k]``; their order means nothing
     columns of an array          [episode,] states, inputs (as in pykoop)
-    columns of a DataFrame       states, inputs; a column named ``episode`` is the episode wherever it stands
+    columns of a DataFrame       the same, with the names of states and inputs
     ===========================  ==================================================================================
 
     Parameters
@@ -58,7 +57,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     alpha : float
         Tikhonov coefficient, added to the unnormalised Gram matrix; zero for plain least squares.
     episode_feature : bool
-        Whether the first column of an array is the episode, a number.
+        Whether the first column is the episode, a number.
     horizon : int or None
         `score` compares predictions this many samples ahead, from every sample, with the recorded inputs; None: the
         simulation of the whole episode from its first state.
@@ -154,10 +153,9 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _check_parameters(self) -> None:
         far = self.horizon is None or self.horizon >= 1
         if isinstance(self.functions, str) or not 0 <= self.alpha < np.inf or not far:
-            raise ConfigError(
-                "KoopmanRegressor: functions should be a list of texts, alpha at least zero and horizon at least one "
-                f"or None, found {self.functions!r}, {self.alpha!r}, {self.horizon!r}."
-            )
+            needs = "functions should be a list of texts, alpha at least zero and horizon at least one or None"
+            actual = f"found {self.functions!r}, {self.alpha!r}, {self.horizon!r}"
+            raise ConfigError(f"KoopmanRegressor: {needs}, {actual}.")
 
     def predict(self, X: Any) -> Array:
         """Predict the next state of every row, shape (n_samples, n_states), or (n_samples,) after such a `y`.
@@ -231,11 +229,8 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _read(self, X: Any, *, reset: bool) -> tuple[Array, npt.NDArray[np.int64]]:
         """Return states and inputs, and the first row of every episode with the number of rows."""
-        named = hasattr(X, "iloc") and EPISODE in list(X.columns)
-        ids = np.asarray(X[EPISODE]) if named else None
-        numbers = X.drop(columns=EPISODE) if named else X
-        values = np.asarray(validate_data(self, numbers, reset=reset, dtype=np.float64))
-        if self.episode_feature and ids is None:
+        values, ids = np.asarray(validate_data(self, X, reset=reset, dtype=np.float64)), None
+        if self.episode_feature:
             ids, values = values[:, 0], values[:, 1:]
         if not values.shape[1]:
             problem = "rows hold no state beside the episode"
@@ -260,7 +255,7 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             problem = f"does not agree with n_inputs = {self.n_inputs}, states = {self.states}{targets}"
             raise DataError(f"X has {n_columns} columns of states and inputs, which {problem}.")
         named = hasattr(X, "iloc") and all(isinstance(c, str) for c in X.columns)
-        frame = [c for c in X.columns if c != EPISODE][-n_columns:] if named else []
+        frame = list(X.columns)[-n_columns:] if named else []
         names = frame or [f"x{i}" for i in range(n)] + [f"u{i}" for i in range(n_columns - n)]
         self.state_names_ = tuple(names[:n] if self.states is None else self.states)
         self.input_names_ = tuple(names[n:])
@@ -284,9 +279,7 @@ def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
     if n_pairs < len(names):
         problem = f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]"
         raise DataError(f"{problem}; record more, or use alpha > 0.")
-    dependent = np.flatnonzero(
-        relative_pivots(R) <= 450 * np.finfo(float).eps
-    )  # what rounding leaves of a sum of others
+    dependent = np.flatnonzero(relative_pivots(R) <= 450 * np.finfo(float).eps)  # what rounding leaves of a sum
     if dependent.size:
         problem = f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified"
         reason = "it depends on the columns before it, or is zero"

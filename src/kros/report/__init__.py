@@ -21,10 +21,7 @@ from typing import TYPE_CHECKING
 from ..core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from .files import write_figures
-    from .html import render
     from .plotting import plot
 
-__all__ = ["plot", "render", "write_figures"]
-_HOME = {"plot": "plotting", "render": "html", "write_figures": "files"}
-__getattr__, __dir__ = lazy_names(__name__, _HOME, __all__)
+__all__ = ["plot"]
+__getattr__, __dir__ = lazy_names(__name__, {"plot": "plotting"}, __all__)

@@ -25,13 +25,13 @@ Array: TypeAlias = npt.NDArray[Any]
 _PREFIXES = "pnµm kMG"  # powers of a thousand, from 10⁻¹²
 
 
-def grid(rows: int, columns: int, row_height_in: float, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
+def grid(rows: int, columns: int, **options: Any) -> tuple[Figure, npt.NDArray[Any]]:
     """Return a figure in constrained layout and its axes, shape (rows, columns); `options` as in `Figure.subplots`."""
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    layout = ConstrainedLayoutEngine(w_pad=0.05, h_pad=0.05, wspace=0.02, hspace=0.02)
-    figure = Figure(figsize=(DRAWING.width_in, rows * row_height_in), layout=layout)
+    layout = ConstrainedLayoutEngine(wspace=0, hspace=0)
+    figure = Figure(figsize=(DRAWING.width_in, DRAWING.row_in + (rows - 1) * DRAWING.more_rows_in), layout=layout)
     panels = figure.subplots(rows, columns, squeeze=False, **options)
     for panel in panels.ravel():
         engineering(panel.yaxis)
@@ -66,13 +66,13 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         columns = columns or (len(handles) if sum(map(len, labels)) < 90 else 2)
-        figure.set_figheight(figure.get_figheight() + 0.2 * ceil(len(handles) / columns))
-        figure.legend(handles, labels, loc="outside upper left", ncols=columns, borderaxespad=0.3, borderpad=0.1)
+        figure.set_figheight(figure.get_figheight() + DRAWING.legend_in * ceil(len(handles) / columns))
+        figure.legend(handles, labels, loc="outside upper left", ncols=columns)
 
 
 def note(axes: Axes, text: str, at: tuple[float, float], offset: tuple[float, float] = (0, 0), **options: Any) -> None:
     """Write a small text at a place in shares of the axes, moved by an offset in points."""
-    settings: dict[str, Any] = {"xycoords": "axes fraction", "size": 7.5} | options
+    settings: dict[str, Any] = {"xycoords": "axes fraction", "size": "small"} | options
     axes.annotate(text, at, xytext=offset, textcoords="offset points", **settings)
 
 
@@ -96,7 +96,7 @@ def decibel(values: npt.ArrayLike) -> Array:
 
 def line_over_shade(axes: Axes, freqs_hz: Array, line: Array, shade: Array, colour: str, style: str = "-") -> None:
     """Draw magnitudes over frequency in dB, above a broad light line of what they are compared with."""
-    axes.plot(freqs_hz, decibel(shade), color=colour, lw=3.2, alpha=0.3, solid_capstyle="butt")
+    axes.plot(freqs_hz, decibel(shade), color=colour, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
     axes.plot(freqs_hz, decibel(line), style, color=colour)
 
 
@@ -106,7 +106,9 @@ def lines_of_units(axes: Axes, x: Array, lines: Array, colour: str, label: str, 
 
     finite = [k for k, line in enumerate(lines) if np.isfinite(line).any()]
     paths = [np.column_stack([x, lines[k]]) for k in finite]
-    drawn = axes.add_collection(LineCollection(paths, colors=colour, linewidths=0.6, alpha=0.35, label=label))
+    drawn = axes.add_collection(
+        LineCollection(paths, colors=colour, linewidths=DRAWING.thin, alpha=DRAWING.shade, label=label)
+    )
     name_units(drawn, [units[k] for k in finite])
     axes.autoscale_view()
 
@@ -152,7 +154,7 @@ def units_axis(axes: Axes, units: Sequence[str]) -> None:
     axes.set_xlim(-0.7, len(units) - 0.3)
     axes.grid(visible=False, axis="x")
     if len(units) <= 40:
-        axes.set_xticks(range(len(units)), units, rotation=90 if len(units) > 4 else 0, size=7)
+        axes.set_xticks(range(len(units)), units, rotation=90 if len(units) > 4 else 0, size="small")
         axes.set_xlabel("unit")
     else:
         axes.set_xlabel(f"{len(units)} units, in order")

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from math import isfinite
 from typing import Any
 
@@ -71,10 +72,7 @@ def build(caption: str, columns: Sequence[Column], chosen: str | None = None, **
     if not first.values or len(known) < 2:
         return None
     rows = list(zip(*(_cells(column) for column in known), strict=True))
-    groups: list[tuple[str, int]] = []
-    for column in known:
-        span = groups.pop()[1] if groups and groups[-1][0] == column.group else 0
-        groups.append((column.group, span + 1))
+    groups = [(title, len(list(columns_of))) for title, columns_of in groupby(known, key=lambda c: c.group)]
     labels = [": ".join(part for part in (column.group, column.title) if part) for column in known]
     marked = [k for k, value in enumerate(first.values) if value == chosen]
     titled = groups if any(title for title, _ in groups) else ()

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..evaluate import Kind
-from ..evaluate.robustness import severity_of_growth
+from ..evaluate.disturb import severity_of_growth
 from .facts import Facts
 
 Array = npt.NDArray[np.float64]
@@ -64,23 +64,20 @@ def curves(rows: Sequence[Mapping[str, Any]], condition: str) -> Curves:
     return lines
 
 
-def doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> str:
+def _doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[str]) -> str:
     """Return the severity at which the error of hidden states doubles, as text."""
     hidden = [curve for c, curve in by_channel.items() if c not in measured] or list(by_channel.values())
-    if not hidden:
-        return ""
     with np.errstate(divide="ignore"):
         errors = np.exp(np.mean([np.log(curve.errors) for curve in hidden], axis=0))
-    severities = hidden[0].severities
-    severity = severity_of_growth(severities, errors)
+    tried = AXES[kind].factor * hidden[0].severities
+    severity = AXES[kind].factor * severity_of_growth(hidden[0].severities, errors)
     if not np.isfinite(severity):
-        return f"> {AXES[kind].factor * severities[-1]:.2g}"
-    below = "< " if severity < severities[1] else ""
-    return f"{below}{AXES[kind].factor * max(severity, severities[1]):.2g}"
+        return f"> {tried[-1]:.2g}"
+    return f"{'< ' if severity < tried[1] else ''}{max(severity, tried[1]):.2g}"
 
 
 def doublings(facts: Facts) -> dict[str, dict[Kind, str]]:
     """Return by observer and kind the severity at which its error doubles in the condition of the models."""
     tried, measured = curves(facts.get("robustness", []), facts.study["identify_on"]), facts.measured
     pairs = {name: [(kind, lines[kind]) for kind in AXES if kind in lines] for name, lines in tried.items()}
-    return {name: {kind: doubling(kind, of, measured) for kind, of in lines} for name, lines in pairs.items()}
+    return {name: {kind: _doubling(kind, of, measured) for kind, of in lines} for name, lines in pairs.items()}

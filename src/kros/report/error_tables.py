@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..data.population import natural_key
-from ..evaluate import unit_interval
 
 Rows = Sequence[Mapping[str, Any]]
-PAPER = "koopman_edmd/mixed"
-"""The paper's own observer, which powers at the gearbox frequency are compared with."""
 
 
 @dataclass(frozen=True)
@@ -23,13 +20,12 @@ class ErrorCell:
     mean: float | None = None
     worst: float | None = None
     worst_unit: str | None = None
-    interval: tuple[float, float] | None = None  # 95 % interval of the mean, by a bootstrap over units
+    interval: Sequence[float] | None = None  # 95 % interval of the mean, by a bootstrap over units
     diverged: int = 0  # units whose estimate diverged
     rms: float | None = None  # mean over units, in the channel's unit of measure
     worst_rms: float | None = None
     true_mean: float | None = None  # against the true signal, percent of its largest value
     lag_s: float | None = None  # of the estimate behind the true signal
-    band_db: float | None = None
 
 
 @dataclass(frozen=True)
@@ -39,7 +35,6 @@ class ErrorTable:
     condition: str
     channels: tuple[str, ...]
     cells: Mapping[str, Mapping[str, ErrorCell]]
-    ranked: frozenset[str]  # channels in which a smaller number is better
 
     def hidden(self, measured: Sequence[str], observer: str | None = None) -> list[str]:
         """Return the channels that are not measured and that an observer estimates, or any does; else all of them."""
@@ -58,53 +53,33 @@ def error_tables(metrics: Mapping[str, Any]) -> list[ErrorTable]:
     """Return a table a condition of the units that took part, the condition that was identified on first."""
     rows = [r for r in metrics.get("evaluation", []) if r["role"] in ("nominal", "off_nominal")]
     others = [r for r in rows if r["role"] == "off_nominal"] or rows
-    intervals = {(r["observer"], r["condition"], r["channel"]): r["interval"] for r in metrics.get("intervals", [])}
-    return _tables(others, metrics["study"]["identify_on"], intervals)
+    intervals = {
+        (r["observer"], r["condition"], r["channel"]): tuple(r["interval"]) for r in metrics.get("intervals", [])
+    }
+    return tables_of(others, metrics["study"]["identify_on"], intervals)
 
 
-def left_out_tables(rows: Rows, identify_on: str) -> list[ErrorTable]:
-    """Return the same of units that took no part in the design, from the rows of ``left_out``."""
-    return _tables(rows, identify_on, None)
-
-
-def _tables(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None) -> list[ErrorTable]:
-    """Group rows by condition, observer and channel."""
-    tables = []
+def tables_of(rows: Rows, identify_on: str, intervals: Mapping[Any, Any] | None = None) -> list[ErrorTable]:
+    """Return rows of errors by condition, observer and channel."""
+    tables, known = [], intervals or {}
     for condition in sorted({r["condition"] for r in rows}, key=lambda c: (c != identify_on, natural_key(c))):
         grouped: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
         for row in (r for r in rows if r["condition"] == condition):
             grouped.setdefault(row["observer"], {}).setdefault(row["channel"], []).append(row)
-        published = grouped.get(PAPER, {})
         cells = {
-            observer: {
-                c: _cell(units, published.get(c, []), _interval(units, intervals, (observer, condition, c)))
-                for c, units in channels.items()
-            }
-            for observer, channels in grouped.items()
+            name: {c: _cell(units, known.get((name, condition, c))) for c, units in channels.items()}
+            for name, channels in grouped.items()
         }
         names = tuple(dict.fromkeys(c for channels in grouped.values() for c in channels))
-        ranked = frozenset(c for c in names if condition == identify_on or condition != "load" or c != "current")
-        tables.append(ErrorTable(condition, names, cells, ranked))
+        tables.append(ErrorTable(condition, names, cells))
     return tables
 
 
-def _interval(rows: Rows, intervals: Mapping[Any, Any] | None, key: tuple[str, str, str]) -> tuple[float, float] | None:
-    """Return the interval of a mean: from the metrics, or by a bootstrap where these have none."""
-    if intervals is not None:
-        return tuple(intervals[key]) if key in intervals else None
-    values = [r["error_percent"] for r in rows]
-    if len(values) < 2 or None in values:
-        return None
-    low, high = unit_interval(values)
-    return float(low), float(high)
-
-
-def _cell(rows: Rows, published: Rows, interval: tuple[float, float] | None) -> ErrorCell:
+def _cell(rows: Rows, interval: Sequence[float] | None) -> ErrorCell:
     """Summarise the units of one observer and channel."""
-    band_db = _band_db(rows, published)
     lost = len({r["unit"] for r in rows if r["error_percent"] is None})
     if lost:
-        return ErrorCell(band_db=band_db, diverged=lost)
+        return ErrorCell(diverged=lost)
     worst = max(rows, key=lambda r: float(r["error_percent"]))
     rms = _known(rows, "rms")
     return ErrorCell(
@@ -116,7 +91,6 @@ def _cell(rows: Rows, published: Rows, interval: tuple[float, float] | None) -> 
         worst_rms=float(max(rms)) if rms else None,
         true_mean=_mean(_known(rows, "true_error_percent")),
         lag_s=_mean(_known(rows, "true_lag_s")),
-        band_db=band_db,
     )
 
 
@@ -128,13 +102,3 @@ def _known(rows: Rows, key: str) -> list[float]:
 
 def _mean(values: Sequence[float]) -> float | None:
     return float(np.mean(values)) if values else None
-
-
-def _band_db(rows: Rows, published: Rows) -> float | None:
-    """Return the ratio of mean powers around the gearbox frequency over the units that both have, dB."""
-    powers, others = ({r["unit"]: r.get("gearbox_band_power") for r in part} for part in (rows, published))
-    pairs = np.array([[powers[unit], others[unit]] for unit in powers if unit in others], float)
-    if not pairs.size or not np.isfinite(pairs).all() or not pairs.sum(axis=0).all():
-        return None
-    mean = pairs.mean(axis=0)
-    return float(10 * np.log10(mean[0] / mean[1]))

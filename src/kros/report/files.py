@@ -32,38 +32,7 @@ _BEYOND = re.compile(r"(?<=\d\.\d\d)\d+")  # a hundredth of a point is enough
 
 
 def write_figures(run: Path, out: Path, progress: Progress | None = None) -> list[str]:
-    """Write every figure of a run as PNG (200 dots an inch) and PDF.
-
-    Parameters
-    ----------
-    run : Path
-        Run folder; figures whose artifacts it does not have are left out and logged.
-    out : Path
-        Folder for the files; created where it is missing.
-    progress : Progress, optional
-        Shows how many figures are done.
-
-    Returns
-    -------
-    list of str
-        Names of the files written, in the order of the report.
-
-    Raises
-    ------
-    ConfigError
-        When `out` is a file.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import kros
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> with TemporaryDirectory() as folder:
-    ...     result = kros.run(motors, f"{folder}/run", until="read", identify={"refine": False})
-    ...     written = kros.report.write_figures(result.folder, f"{folder}/figures")
-    >>> "signals.png" in written
-    True
-    """
+    """Write every figure of a run as PNG and PDF to a folder; return the names of the files in their order."""
     out = Path(out)
     if out.exists() and not out.is_dir():
         raise ConfigError(f"Figures to {out}: is a file; name a folder.")

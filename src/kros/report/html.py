@@ -28,38 +28,9 @@ Mapped = Callable[[Callable[[str], Encoded], Iterable[str]], Iterator[Encoded]]
 
 
 def render(run: Path, metrics: Mapping[str, Any], mapped: Mapped = map, out: Path | None = None) -> Path:
-    """Write the report of a run folder.
+    """Write the report of a run from ``metrics.json``, of which any part but ``study`` may be absent.
 
-    Parameters
-    ----------
-    run : Path
-        Run folder, which figures are drawn from.
-    metrics : mapping
-        As in ``metrics.json``, the source of all texts and tables; any part but ``study`` may be absent.
-    mapped : callable
-        Maps the drawing of a figure over their names, in order, for example in several processes.
-    out : Path, optional
-        File to write; default: `report.html` in the run folder.
-
-    Returns
-    -------
-    Path
-        The report, written whole or not at all.
-
-    Raises
-    ------
-    DataError
-        When an artifact is broken or of another version.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import kros
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=2, seconds=1.0, seed=3).simulate().population
-    >>> with TemporaryDirectory() as folder:
-    ...     result = kros.run(motors, f"{folder}/run", until="identify", identify={"refine": False})
-    ...     print(kros.report.render(result.folder, result.metrics).name)
-    report.html
+    `mapped` maps the drawing of a figure over their names, in order, for example in several processes.
     """
     path = out if out is not None else Path(run) / "report.html"
     write_bytes(path, page(RunFolder(Path(run)), metrics, mapped).encode())

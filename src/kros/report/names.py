@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from math import floor, isfinite, log10
 
 from ..data.population import DEFAULT_CONDITION, EpisodeKey
-from ..data.recording import some
 from .theme import Tone
 
 
@@ -71,10 +70,15 @@ def model_label(name: str) -> str:
     return f"{label} ({about})" if kind else label
 
 
+def method_of(name: str) -> Method:
+    """Return what is known of an observer's method."""
+    method = split_observer(name)[1]
+    return METHODS.get(method, Method(words(method), "", Tone.GREY))
+
+
 def method_label(name: str) -> str:
     """Return what an observer's method is called."""
-    method = split_observer(name)[1]
-    return METHODS[method].label if method in METHODS else words(method)
+    return method_of(name).label
 
 
 def observer_label(name: str) -> str:
@@ -85,8 +89,7 @@ def observer_label(name: str) -> str:
 
 def observer_about(name: str) -> str:
     """Return what an observer is, in a few words."""
-    method = split_observer(name)[1]
-    return METHODS[method].about if method in METHODS else ""
+    return method_of(name).about
 
 
 def model_look(name: str) -> Look:
@@ -96,17 +99,14 @@ def model_look(name: str) -> Look:
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
-    method = split_observer(name)[1]
-    tone = METHODS[method].tone if method in METHODS else Tone.GREY
-    return Look(tone.light, {"kalman_tuned": "--", "estimator": "-."}.get(method, "-"))
+    styles = {"kalman_tuned": "--", "estimator": "-."}
+    return Look(method_of(name).tone.light, styles.get(split_observer(name)[1], "-"))
 
 
 def observer_look(name: str) -> Look:
     """Return how an observer's curves look beside others: the hue of its model, of a baseline that of its method."""
-    model, method = split_observer(name)
-    if method in BASELINES or not model:
-        return method_look(name)
-    return model_look(model)
+    model = split_observer(name)[0]
+    return method_look(name) if method_of(name).baseline or not model else model_look(model)
 
 
 def best_models(names: Iterable[str]) -> list[str]:
@@ -153,11 +153,6 @@ def squared(unit: str) -> str:
 def joined(parts: Sequence[str]) -> str:
     """Return a list for a sentence: with commas, and an "and" before the last."""
     return " and ".join(part for part in (", ".join(parts[:-1]), *parts[-1:]) if part)
-
-
-def some_of(names: Sequence[str], most: int = 8) -> str:
-    """Return the first names of a list, and how many more there are."""
-    return some(names, most)
 
 
 def episode_title(key: EpisodeKey) -> str:

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 PLOTS = {
     "Population": "recordings:population_figure",
     "IdentifiedModels": "models:identified_figure",
-    "UncertainModels": "uncertainty:sets_figure",
-    "Design": "synthesis:design_figure",
-    "RunResult": ":run_figure",
     "UncertainModel": "uncertainty:uncertain_figure",
+    "UncertainModels": "uncertainty:sets_figure",
+    "Design": "episodes:design_figure",
+    "RunResult": ":run_figure",
 }
 """Name of a result's class -> module and function that draws it; further parameters are the options of `plot`."""
 
@@ -29,12 +29,11 @@ def plot(result: Any, **options: Any) -> Figure:
     Parameters
     ----------
     result : one of the classes in `PLOTS`
-        A population: its first episode. Models: Bode plots. Uncertain models: forms, weights, every unit relative to
-        the weights. A design: the correction filter. A run: the estimates.
+        A population: its first episode. Models: Bode plots. Uncertain models: weights, every unit relative to them.
+        A design: the estimates on a held-out episode. A run: the estimates.
     **options
-        ``kind`` of identified and uncertain models, such as ``"linear"``; ``entries=True`` for an uncertain model entry
-        by entry; ``models`` of a design or an `UncertainModel`, the models behind it; ``name`` of a run, any of its
-        figures.
+        ``kind`` of identified and uncertain models, such as ``"linear"``; ``models`` of a design, the identified models
+        behind it; ``name`` of a run, any of its figures.
 
     Returns
     -------

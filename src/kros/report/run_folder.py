@@ -119,11 +119,6 @@ class RunFolder:
         """Sampling period, s."""
         return self._signals.sample_period_s
 
-    @property
-    def calibrated(self) -> bool:
-        """Whether the study has a phase calibration, hence a disturbance that is fixed to an angle."""
-        return self.has("calibration/calibration.json")
-
     @cached_property
     def calibration(self) -> PhaseCalibration:
         """The phase calibration."""

@@ -17,6 +17,12 @@ class Drawing:
     """How much is drawn; no number here changes a result."""
 
     width_in: float = 7.4  # of every figure
+    row_in: float = 1.9  # height of a figure of one row
+    more_rows_in: float = 1.0  # height of every further row
+    legend_in: float = 0.2  # height of a row of a legend
+    thin: float = 0.7  # points that lines beside others are wide
+    broad: float = 2.8  # points that a line is wide which others are compared with
+    shade: float = 0.35  # opacity of what lies behind
     dots_per_inch: int = 200
     points: int = 250  # buckets of a line over time, frequencies of residuals
     frequencies: int = 140  # of a frequency response

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from .error_tables import ErrorTable, left_out_tables
+from ..data.recording import some
+from .error_tables import ErrorCell, ErrorTable, tables_of
 from .facts import Facts
-from .names import BASELINES, condition_label, joined, minus, model_label, number, observer_label, some_of, words
+from .names import BASELINES, condition_label, joined, number, observer_label, words
 from .names import split_observer as split
 
 Row = Mapping[str, Any]
@@ -24,7 +25,6 @@ class Thresholds:
 
     better: float = 0.05  # share by which all mean errors of another observer are smaller
     improved: float = 0.01  # share by which a correction must reduce the error of the model alone
-    small_set: float = 5.0  # ratio of a model's simulation error to the size of its uncertain set
     noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
@@ -74,7 +74,7 @@ class Verdict:
 def judge(facts: Facts) -> Verdict:
     """Return the verdict on a run."""
     reasons = [Reason(Status.NOT_READY, *stop) for stop in _stopping(facts)]
-    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates, _small_set):
+    for checks in (_of_recordings, _of_units, _of_errors, _of_certificates):
         reasons += [Reason(Status.CHECK, *check) for check in checks(facts)]
     known = [reason.status for reason in reasons]
     status = next((s for s in (Status.NOT_READY, Status.CHECK) if s in known), Status.READY)
@@ -102,16 +102,16 @@ def _numbers(facts: Facts) -> list[Number]:
     """Return the errors of at most two hidden channels, and how many units are flagged."""
     numbers = []
     for channel in facts.hidden[:2]:
-        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else None
-        if cell is not None and cell.mean is not None:
+        cell = facts.table.cells[facts.deployed][channel] if facts.table is not None else ErrorCell()
+        if cell.mean is not None:
             notes = [f"RMS {number(cell.rms)} {facts.unit(channel)}".strip()] if cell.rms else []
             notes += [f"worst unit {cell.worst_unit}: {number(cell.worst)} %"]
-            true = f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}"
-            notes += [true] if cell.true_mean else []
+            if cell.true_mean:
+                notes.append(f"against the true signal: {number(cell.true_mean)} %{_lag(cell.lag_s)}")
             numbers.append(Number(number(cell.mean), "% of the largest value", f"error of {words(channel)}", notes))
     if rows := facts.get("outliers"):
         flagged, open_ = sorted({r["unit"] for r in rows if r["outlier"]}), undecided(rows)
-        notes = [some_of(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
+        notes = [some(flagged) or "none", *([f"UNDECIDED: {len(open_)} of {len(rows)} scores"] if open_ else [])]
         numbers.append(Number(str(len(flagged)), f"of {len({r['unit'] for r in rows})}", "units flagged", notes))
     return numbers
 
@@ -136,7 +136,7 @@ def _stopping(facts: Facts) -> Iterator[tuple[str, str, str]]:
     elif hidden and not_improved(table, facts.deployed, hidden) == hidden:
         text = f"“{facts.label}” is no better than its model without correction."
         yield text, f"Measure a signal that depends more on {channels(hidden)}.", "errors"
-    left = left_out_tables(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
+    left = tables_of(facts.get("left_out", {}).get("rows", []), facts.study["identify_on"])
     cells = left[0].cells.get(facts.deployed, {}) if left else {}
     if any(cell.mean is None for c, cell in cells.items() if c not in facts.measured):
         text = "Designed without the unit that it runs on, this kind of observer diverges on some units."
@@ -155,7 +155,9 @@ def _of_recordings(facts: Facts) -> Iterator[tuple[str, str, str]]:
         text += f"Models and observers describe {len(inside)} of {len(rows)} units, those recorded in "
         text += f"“{condition_label(facts.study['identify_on'])}”."
         yield text, "Record all units in the same conditions.", "recordings"
-    noise = facts.get("uncertainty", {}).get(facts.model, {}).get("noise_share")
+    kinds = facts.model, f"{facts.model}_edmd"  # refined models have no share of their own
+    shares = (facts.get("uncertainty", {}).get(kind, {}).get("noise_share") for kind in kinds)
+    noise = next(filter(None, shares), None)
     if noise and noise["at_peak"] >= THRESHOLDS.noise:
         text = f"{100 * noise['at_peak']:.0f} % of the spread at {number(noise['peak_hz'])} Hz is estimation noise, "
         yield f"{text}not variation between units.", "Record longer, or more episodes.", "spread"
@@ -175,7 +177,7 @@ def _of_units(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield _inconclusive(few, rows), "Score against at least 8 units in one condition.", "units"
     remarks = [f"{r['unit']} ({r['status']})" for r in facts.get("units", []) if r.get("status", "ok") != "ok"]
     if remarks:
-        yield f"Units with a remark: {some_of(remarks)}.", "See their rows.", "units"
+        yield f"Units with a remark: {some(remarks)}.", "See their rows.", "units"
 
 
 def _inconclusive(rows: Sequence[Row], every: Sequence[Row]) -> str:
@@ -215,7 +217,7 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         action = "Test it in parallel before anything depends on it."
         yield "No certificate at run time covers the observer.", action, "certificates"
     if outside := facts.entry.get("set_outside"):
-        text = f"Outside the set of recorded signals that the certificate covers: {some_of(outside)}."
+        text = f"Outside the set of recorded signals that the certificate covers: {some(outside)}."
         yield text, "Do not rely on the bounds for these units.", "certificates"
     if facts.observers and all(split(name)[1] in BASELINES for name in facts.observers):
         yield "No robust observer could be designed for this population.", "See why.", "certificates"
@@ -224,24 +226,6 @@ def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
         yield "The weights do not bound all units that they were fitted to.", "Raise their order.", "uncertainty"
     for fold, why in facts.get("left_out", {}).get("failed", {}).items():
         yield f"Fold {int(fold) + 1} of the units left out failed: {why}", "See the reason.", "left-out"
-
-
-def _small_set(facts: Facts) -> Iterator[tuple[str, str, str]]:
-    """Yield an uncertain set that is far smaller than the simulation errors of its models."""
-    entry = facts.get("uncertainty", {}).get(facts.model, {})
-    peak = entry.get("peak_db", {}).get(entry.get("form"))
-    errors = facts.get("models", {}).get(facts.model, {}).get("freerun_error_percent", {})
-    known = {channel: error["median"] for channel, error in errors.items() if error.get("median") is not None}
-    if peak is None or not known:
-        return
-    channel, size = max(known, key=lambda c: known[c]), 100 * 10 ** (peak / 20)
-    if known[channel] > THRESHOLDS.small_set * size:
-        text = (
-            f"The set of plants is smaller than the errors of its {model_label(facts.model)} models: residuals reach "
-            f"{minus(f'{peak:.1f}')} dB ({number(size, 2)} %), the simulation error of {words(channel)} is "
-            f"{number(known[channel], 2)} %. The set describes how units differ, not how models differ from the units."
-        )
-        yield text, "Do not read a bound over the set as a bound on the error.", "spread"
 
 
 def undecided(rows: Sequence[Row]) -> list[Row]:
@@ -255,7 +239,7 @@ def units_text(rows: Sequence[Row]) -> str:
     for row in rows:
         units.setdefault(row["unit"], []).append(condition_label(row["condition"]))
     named = {unit: ", ".join(filter(None, conditions)) for unit, conditions in units.items()}
-    return some_of([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
+    return some([f"{unit} ({conditions})" if conditions else unit for unit, conditions in named.items()])
 
 
 def certificates(facts: Facts) -> list[str]:

@@ -160,14 +160,13 @@ def _deployment(context: Context) -> dict[str, Any]:
     if not context.store.holds("observers", "deployed.json"):
         return {}
     observer = Observer.load(context.store.path("observers", "deployed.json"))
-    measured = [observer.lifting.states[i] for i in observer.measured]
-    sizes = observer.seen
-    ranges = [] if sizes is None else zip([*measured, *observer.inputs], [*sizes.measured, *sizes.inputs], strict=True)
+    measured, sizes = [observer.lifting.states[i] for i in observer.measured], observer.seen
+    largest = () if sizes is None else (*sizes.measured, *sizes.inputs)
     content = {
         "measured": measured,
         "inputs": list(observer.inputs),
         "estimates": list(observer.recorded),
-        "largest": dict(ranges),
+        "largest": dict(zip([*measured, *observer.inputs], largest, strict=False)),
         "delay_samples": observer.runtime.delay,
         "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
         "functions": list(observer.lifting.functions),

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ..core.artifacts import write_json
 from ..core.errors import ConfigError
 from ..core.settings import member
 from ..core.work import Executor, Progress, Work
@@ -19,7 +20,7 @@ from .engine.executors import open_executor
 from .engine.run_folder import load_run as load_run  # where readers of runs look for it
 from .engine.run_folder import open_run, require_own
 from .engine.steps import StageStep, run_steps
-from .engine.store import Store
+from .engine.store import METRICS, Store
 from .learning import LEARNING
 from .metrics import collect_metrics
 from .stages import evaluate, left_out, read, report
@@ -125,18 +126,13 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
     base, tables = Path(), dict(sections)
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
-            raise ConfigError(
-                "Run: data.source and data.reader name recordings, and a population is given already; leave them out."
-            )
+            raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
         raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
         base = out
     elif isinstance(source, StudyConfig):
         raw = source.dump()
     elif not isinstance(source, str | Path):
-        raise ConfigError(
-            f"Run: needs a Population, a folder or a study, found {type(source).__name__}; make one with "
-            "kros.from_arrays."
-        )
+        raise ConfigError(f"Run: needs a Population, a folder or a study, found {type(source).__name__}.")
     elif Path(source).is_dir():
         reader = detect_reader(Path(source))
         raw = {"name": out.name, "data": {"source": str(source)} | ({"reader": reader} if reader else {})}
@@ -169,6 +165,6 @@ def run_in(
     context = Context(config, store, Work(executor, progress or Progress()), given)
     run_steps(context, STEPS, until)
     metrics = collect_metrics(context, until)
-    store.keep("metrics.json", metrics)
+    write_json(store.path(METRICS), metrics)
     store.sweep()
     return RunResult(store.folder, metrics)

@@ -31,7 +31,6 @@ import numpy.typing as npt
 from ..core.errors import DataError, DimensionError
 from ..core.settings import member
 from ..core.small_matrices import (
-    condition_number,
     entries_first,
     entries_last,
     multiply,
@@ -174,7 +173,7 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     regular = np.ones(E.shape[:-2], bool)
     if form.inverse:
         product = E @ G if form is Form.INVERSE_ADDITIVE else E
-        regular = condition_number(np.eye(product.shape[-1]) - product) <= SET.condition
+        regular = np.linalg.cond(np.eye(product.shape[-1]) - product) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)
     return E, Gp - rebuild(form, G, E), regular
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from ...core.errors import DataError
-from ..readers.tables import ABSENT, CLOCK, DATES, Dialect, opened, timestamp_pattern
+from ..readers.tables import ABSENT, DATES, PARQUET, Dialect, opened, parquet_head, timestamp_pattern
 from .examine import RULE
 from .roles import is_unit_row
 
@@ -19,8 +19,6 @@ MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
 _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
-_UNNAMED = {name: re.sub(r"[?]P<[a-z]+>", "?:", text) for name, text in {"clock": CLOCK, **DATES}.items()}
-_TIME = re.compile(rf"^\s*(?:(?:{'|'.join(_UNNAMED[order] for order in DATES)})[T ]\s*)?{_UNNAMED['clock']}\s*$")
 
 
 @dataclass(frozen=True)
@@ -44,12 +42,14 @@ class TableHead:
     def timestamp(self, column: int) -> str | None:
         """Return the order of the date where a column holds timestamps, or None."""
         cells = [c for c in self.cells(column) if c]
-        fitting = (order for order in DATES if all(re.match(timestamp_pattern(order), c) for c in cells))
-        return next(fitting, None) if cells else None
+        return next((order for order in DATES if cells and all(_is_time(c, order) for c in cells)), None)
 
 
 def look_at(path: Path) -> TableHead:
-    """Return how a text file is written: the reading with most rows of numbers of equal width."""
+    """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
+    if path.suffix == PARQUET:
+        fields, cells = parquet_head(path, RULE.rows)
+        return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(cells))
     with opened(path) as file:
         content = b""
         while len(content) < RULE.head and (more := file.read(RULE.head - len(content))):
@@ -62,13 +62,11 @@ def look_at(path: Path) -> TableHead:
     if _score(rows, decimal)[0] < 2:
         actual = f"no rows of numbers were found in its first {len(lines)} lines"
         raise DataError(f"Reading {path}: {actual}; is it a recording?")
-    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding.removesuffix("-sig")))
+    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding))
 
 
 def encoding_of(content: bytes) -> str:
     """Return the encoding that the first bytes of a text speak for."""
-    if content.startswith(codecs.BOM_UTF8):
-        return "utf-8-sig"
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return "utf-16"
     for name in ("utf-8", "cp1252"):
@@ -97,10 +95,14 @@ def _is_number(cell: str, decimal: str) -> bool:
     return bool(_NUMBER.match(cell)) and ("," if decimal == "." else ".") not in cell
 
 
+def _is_time(cell: str, order: str) -> bool:
+    return bool(re.match(timestamp_pattern(order), cell))
+
+
 def _is_data(row: Sequence[str], decimal: str) -> bool:
     """Tell whether a row holds numbers: at most half of its cells are text that is no time."""
     cells = [c for c in row if c.lower() not in _NO_NUMBER]
-    numbers = sum(_is_number(c, decimal) or bool(_TIME.match(c)) for c in cells)
+    numbers = sum(_is_number(c, decimal) or any(_is_time(c, order) for order in DATES) for c in cells)
     return len(row) > 1 and numbers >= 1 and 2 * numbers >= len(cells)
 
 

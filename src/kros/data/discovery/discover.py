@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,15 +21,15 @@ from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import csv_files, read_csv_folder
-from ..readers.tables import PARQUET, Dialect, file_fields, parquet_head, read_columns
-from ..recording import some, usable
+from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
+from ..recording import CHECK, some, usable
 from .dialect import TableHead, look_at
-from .examine import RULE, Examined, examine
+from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 
 Array = npt.NDArray[np.float64]
-Ask = Callable[[Sequence[TableColumn]], Sequence[TableColumn]]
+_RECORDED = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
 
 
 @dataclass(frozen=True)
@@ -55,18 +56,17 @@ class Discovery:
     reading: str = ""  # what the first file was taken for
 
 
-def discover(source: Path, wanted: Wanted | None = None, ask: Ask | None = None, work: Work | None = None) -> Discovery:
+def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
     """Describe a folder of text tables or of Parquet files of any layout."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
-    mapping, notes = _names(list(alike), wanted.files)
+    mapping: dict[str, Any] = {"files": _names(list(alike), wanted.files)}
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
-    columns, keys, why = _columns(source, head, list(alike.values()), wanted.period_s)
-    mapping, notes = mapping | keys, notes | why
-    columns = _decided(columns, wanted, ask)
-    recorded = (ColumnPart.MEASURED, ColumnPart.STATE, ColumnPart.INPUT)
-    mapping["channel"] = [_channel(c) for c in columns if c.part in recorded]
-    draft = Discovery(mapping, (), tuple(columns), read_csv_folder(source, mapping | _exclusion(strange)), notes)
+    columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
+    columns = _decided(columns, wanted)
+    mapping |= {**keys, "channel": [_channel(c) for c in columns if c.part in _RECORDED]}
+    population = read_csv_folder(source, mapping | _exclusion(strange))
+    draft = Discovery(mapping, (), tuple(columns), population, notes)
     findings = [f"{len(strange)} files are not like the others and left alone: {some(strange)}"] if strange else []
     return _examined(source, draft, findings, [name for name in strange if re.search(mapping["files"], name)], work)
 
@@ -79,34 +79,33 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
         raise ConfigError(f"--files {expression!r}: is not a regular expression ({error}); correct it.") from error
     files = {relative: path for path, relative in csv_files(source)}
     selected = {relative: path for relative, path in files.items() if selects(relative)}
-    if selected:
-        return selected
-    if files:
+    if not files:
+        kinds = ".csv, .tsv, .txt, .dat, .parquet, or these with .gz"
+        raise DataError(
+            f"Looking at {source}: there are no files of recordings ({kinds}); save them as CSV or Parquet."
+        )
+    if not selected:
         problem = f"no file matches --files {expression!r}"
         raise DataError(f"Looking at {source}: {problem}; correct the expression, or leave it out.")
-    others = Counter(p.suffix.lower() for p in source.rglob("*") if p.is_file() and p.suffix).most_common(1)
-    instead = f"save its {others[0][1]} {others[0][0]} files as CSV or Parquet" if others else "check the folder"
-    kinds = ".csv, .tsv, .txt, .dat, .parquet, or these with .gz"
-    raise DataError(f"Looking at {source}: there are no files of recordings ({kinds}); {instead}.")
+    return selected
 
 
-def _names(paths: Sequence[str], expression: str | None) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the key of a mapping that says what names of files mean, and what it rests on."""
+def _names(paths: Sequence[str], expression: str | None) -> str:
+    """Return the expression that says what names of files mean."""
     names = infer_names(paths)
-    if expression is not None:
-        return {"files": expression}, {}
-    if names.other is not None:
+    if expression is None and names.other is not None:
         choice = f"--files '{names.other}' or --files '{names.pattern}'"
         two = f"{some(paths, 3)} can be episodes of one unit or units with one recording each"
         raise ConfigError(f"Names of files: {two}; choose, {choice}.")
-    guess = "a guess from the order of the words in file names: look at the units and episodes below"
-    return {"files": names.pattern}, {} if names.sure else {"files": guess}
+    return names.pattern if expression is None else expression
 
 
 def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
     """Return how most files are written, those files, and the others."""
-    paths = list(files.values())
-    heads = [h for path in paths[:: max(1, len(paths) // RULE.looked_at)] if (h := _head_of(path)) is not None]
+    paths, heads = list(files.values()), []
+    for path in paths[:: max(1, len(paths) // RULE.looked_at)]:
+        with suppress(DataError):
+            heads.append(look_at(path))
     if not heads:
         problem = "none of the files looked at holds rows of numbers"
         raise DataError(f"Looking at {paths[0].parent}: {problem}; check the folder.")
@@ -122,19 +121,8 @@ def _fits(path: Path, head: TableHead) -> bool:
         fields = file_fields(path, head.dialect)
     except DataError:
         return False
-    named = head.dialect.header or path.suffix == ".parquet"
+    named = head.dialect.header or path.suffix == PARQUET
     return set(head.fields) - {""} <= set(fields) if named else len(fields) == len(head.fields)
-
-
-def _head_of(path: Path) -> TableHead | None:
-    """Return how a file is written; None where it cannot be read."""
-    try:
-        if path.suffix != ".parquet":
-            return look_at(path)
-        fields, rows = parquet_head(path, RULE.rows)
-    except DataError:
-        return None
-    return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(rows))
 
 
 def _columns(
@@ -143,7 +131,10 @@ def _columns(
     """Return the columns with the parts that are proposed, the keys that say what time is, and what these rest on."""
     described = _described(head)
     numeric = [i for i in range(len(described)) if head.is_numeric(i) and head.fields[i]]
-    samples = [_numbers(path, head, numeric) for path in paths[:: max(1, len(paths) // RULE.sampled)]]
+    samples = []
+    for path in paths[:: max(1, len(paths) // RULE.sampled)]:
+        with suppress(DataError):
+            samples.append(_read(path, head, numeric))
     samples = [s for s in samples if s.shape[1] > 2]
     if not samples:
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
@@ -155,11 +146,9 @@ def _columns(
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)
-    for i, column in zip(numeric, propose([described[i] for i in numeric], samples), strict=True):
-        described[i] = column
+    proposed = dict(zip(numeric, propose([described[i] for i in numeric], samples), strict=True))
     for i, column in enumerate(described):
-        if i not in numeric and i != time:
-            described[i] = replace(column, why="no numbers")
+        described[i] = proposed.get(i, column if i == time else replace(column, why="no numbers"))
     return [c for c, name in zip(described, head.fields, strict=True) if name], keys, notes
 
 
@@ -196,21 +185,14 @@ def _time(
     raise DataError(f"Looking at {source}: {problem}, found the columns {found}; {advice}.")
 
 
-def _numbers(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
-    """Read the numeric columns of a file, shape (n_columns, n_rows); no rows where it cannot be read."""
-    try:
-        values = _read(path, head, columns)
-    except DataError:
-        return np.zeros((len(columns), 0))
-    return np.where(usable(values), values, np.nan)
-
-
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
-    """Read the numeric columns of a file, shape (n_columns, n_rows)."""
+    """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
     if path.suffix == PARQUET:
-        return read_columns(path, file_fields(path), [head.fields[i] for i in columns])
-    names = [f"{name or 'column'} #{i + 1}" for i, name in enumerate(head.fields)]
-    return read_columns(path, names, [names[i] for i in columns], head.dialect)
+        values = read_columns(path, file_fields(path), [head.fields[i] for i in columns])
+    else:
+        names = [f"{name or 'column'} #{i + 1}" for i, name in enumerate(head.fields)]
+        values = read_columns(path, names, [names[i] for i in columns], head.dialect)
+    return np.where(usable(values), values, np.nan)
 
 
 def _channel(column: TableColumn) -> dict[str, Any]:
@@ -227,34 +209,26 @@ def _channel(column: TableColumn) -> dict[str, Any]:
     return {key: value for key, value in table.items() if value is not None}
 
 
-def _decided(columns: Sequence[TableColumn], wanted: Wanted, ask: Ask | None) -> list[TableColumn]:
-    """Return the columns with the parts that were named or asked for, else proposed."""
-    decided = assign(columns, wanted.measured, wanted.inputs)
-    if ask is not None and not (wanted.measured and wanted.inputs):
-        decided = list(ask(decided))
-    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
-    for part, (what, option) in needed.items():
-        if not any(c.part is part for c in decided):
-            free = [c for c in decided if c.part is not ColumnPart.TIME]
-            names = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
-            problem = f"no column is {what} by its name; name it, {option} NAME"
-            raise ConfigError(f"Roles: {problem}. The columns are {names}.")
-    if any(c.part is ColumnPart.STATE for c in decided):
-        return decided
-    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
-
-
-def assign(columns: Sequence[TableColumn], measured: Sequence[str], inputs: Sequence[str]) -> list[TableColumn]:
-    """Return the columns with measured states and inputs as named, where any are named."""
+def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:
+    """Return the columns with measured states and inputs as named, where any are named, else as proposed."""
     decided = list(columns)
     freed = {ColumnPart.MEASURED: ColumnPart.STATE, ColumnPart.INPUT: ColumnPart.LEFT_OUT}
-    for part, names in ((ColumnPart.MEASURED, measured), (ColumnPart.INPUT, inputs)):
+    for part, names in ((ColumnPart.MEASURED, wanted.measured), (ColumnPart.INPUT, wanted.inputs)):
         places = [_place(decided, name) for name in names]
         if places:
             decided = [replace(c, part=freed[part]) if c.part is part else c for c in decided]
         for i in places:
             decided[i] = replace(decided[i], part=part, why="as named")
-    return decided
+    needed = {ColumnPart.MEASURED: ("a measured state", "--measured"), ColumnPart.INPUT: ("an input", "--input")}
+    for part, (what, option) in needed.items():
+        if not any(c.part is part for c in decided):
+            free = [c for c in decided if c.part is not ColumnPart.TIME]
+            known = ", ".join(c.name if c.name == c.header else f"{c.name} ({c.header!r})" for c in free)
+            problem = f"no column is {what} by its name; name it, {option} NAME"
+            raise ConfigError(f"Roles: {problem}. The columns are {known}.")
+    if any(c.part is ColumnPart.STATE for c in decided):
+        return decided
+    return [replace(c, part=ColumnPart.STATE) if c.why == UNKNOWN else c for c in decided]  # to be estimated
 
 
 def _place(columns: Sequence[TableColumn], name: str) -> int:
@@ -272,44 +246,42 @@ def _examined(
 ) -> Discovery:
     """Look at every episode, leave out what cannot be used, and complete the description."""
     population, mapping, notes = draft.population, draft.mapping, dict(draft.notes)
-    examined = examine(population, work)
-    wrong = dict(examined.wrong)
-    if not examined.counts:
-        key, why = next(iter(wrong.items()), (next(iter(examined.nan), ""), "no number in some samples"))
-        raise DataError(f"Looking at {source}: none of {len(population.episodes)} episodes can be used; {key}: {why}.")
-    few = [group for group, n in examined.counts.items() if n < 2]
-    if few and 2 * len(few) > len(examined.counts) and examined.shortest >= RULE.pieces * RULE.shortest_piece:
+    looks = examine(population, work)
+    wrong, good = {s.key: s.wrong for s in looks if s.wrong}, [s for s in looks if not s.wrong]
+    nan, counts = [s.nan for s in good if s.nan], Counter((s.key.unit, s.key.condition) for s in good if not s.nan)
+    if not counts:
+        why = f"{looks[0].key}: {looks[0].wrong or looks[0].nan}"
+        raise DataError(f"Looking at {source}: none of {len(looks)} episodes can be used; {why}.")
+    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()] + nan
+    few = [group for group, n in counts.items() if n < 2]
+    if 2 * len(few) > len(counts) and min(s.n_samples for s in good) >= RULE.pieces * RULE.shortest_piece:
         mapping = mapping | {"pieces": RULE.pieces}
         notes["pieces"] = "there is one recording for most units and conditions: each is cut into so many episodes"
         few = []
-    findings += [f"left out, {_relative(population, source, key)}: {why}" for key, why in wrong.items()]
-    findings += examined.doubts
     for unit, condition in few:
         wrong |= dict.fromkeys(population.keys(unit, condition), "the only episode of its unit and condition")
         findings.append(f"left out, unit {unit} ({condition}) has 1 episode that can be used, and two are needed")
-    if examined.nan:
-        first = f"{examined.nan[0]} the first"
-        findings.append(f"{len(examined.nan)} episodes hold NaN or infinity and are dropped, {first}")
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
-    prepare: tuple[dict[str, Any], ...] = ()
-    if examined.resample_s is not None:
-        step = {"step": "resample", "period_s": examined.resample_s, "max_gap_s": examined.max_gap_s}
-        prepare = ({key: value for key, value in step.items() if value is not None},)
-        findings.append(_unevenness(population, source, examined))
-    findings = [*findings, *_too_few(retained)]
-    reading, nan = _reading(retained, source), bool(examined.nan)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), nan, reading)
+    prepare, text = _resampling(population, source, good)
+    findings += [*text, *_lacking(retained)]
+    reading = _reading(retained, source)
+    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), bool(nan), reading)
 
 
-def _unevenness(population: Population, source: Path, examined: Examined) -> str:
-    """Return a sentence on uneven time."""
+def _resampling(
+    population: Population, source: Path, looks: Sequence[EpisodeLook]
+) -> tuple[tuple[dict[str, Any], ...], list[str]]:
+    """Return the step that brings uneven time to one period, and a sentence about it; nothing where time is even."""
+    median, worst = median_period(looks), max(looks, key=lambda s: s.uneven)
+    period_s, uneven = float(f"{median:.3g}"), worst.uneven[0] > CHECK.time
+    if not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks):
+        return (), []
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"time is uneven: everything is brought to a period of {examined.resample_s:g} s {recorded}"
-    if examined.uneven is None:
-        return text
-    key, sample = examined.uneven
-    return f"{text}, the worst step in {_relative(population, source, key)} at sample {sample}"
+    text = f"time is uneven: everything is brought to a period of {period_s:g} s {recorded}"
+    if uneven:
+        text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
+    return ({"step": "resample", "period_s": period_s},), [text]
 
 
 def _reading(population: Population, source: Path) -> str:
@@ -329,22 +301,9 @@ def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
     return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
 
 
-def _too_few(population: Population) -> list[str]:
-    """Report what there is too little of."""
-    units, counts = population.unit_ids, {(u, c): len(keys) for u, c, keys in population.groups()}
-    texts = []
-    if len(units) < 2:
-        until = "models can be identified (kros run ... --until identify), and a population takes at least two"
-        texts.append(f"one unit ({units[0]}): {until}")
-    elif len(units) < 4:
-        known = "what differs between units is hardly known from so few, and no outlier can be told"
-        texts.append(f"{len(units)} units: {known}")
-    (unit, condition), fewest = min(counts.items(), key=lambda item: item[1])
-    if fewest < 4:
-        texts.append(f"few episodes: unit {unit} ({condition}) has {fewest}, one of them for testing")
-    lacking = {u: [c for c in population.conditions if (u, c) not in counts] for u in units}
+def _lacking(population: Population) -> list[str]:
+    """Report units that were not recorded in every condition."""
+    recorded = {(u, c) for u, c, _ in population.groups()}
+    lacking = {u: [c for c in population.conditions if (u, c) not in recorded] for u in population.unit_ids}
     lacks = [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]
-    if lacks:
-        more = f"; {len(lacks) - 4} more units" if len(lacks) > 4 else ""
-        texts.append(f"not every unit was recorded in every condition: {'; '.join(lacks[:4])}{more}")
-    return texts
+    return [f"not every unit was recorded in every condition: {some(lacks)}"] if lacks else []

@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 from ..population import OUTLIERS
 
@@ -35,6 +36,7 @@ _DATE = re.compile(r"^(?:19|20)\d{6}(?:T?\d{4,6})?$")
 _DATE_PARTS = (r"(?:19|20)\d\d", r"[01]\d", r"[0-3]\d\D*.*")  # 2024-05-31
 _ENDING = re.compile(r"(.*?)((?:\.(?:csv|tsv|txt|dat|parquet))(?:\.gz)?)$", re.IGNORECASE)
 Roles = list[str | None]
+Cut = list[list[str]]  # words of every path, with what is between them
 
 
 @dataclass(frozen=True)
@@ -42,16 +44,7 @@ class FileNames:
     """What the paths of a folder say."""
 
     pattern: str  # regular expression with the groups `unit`, `condition`, `episode` and `group`, those that are there
-    sure: bool  # whether words in the names decided; false where places alone did
     other: str | None = None  # a second expression that fits as well: episodes of one unit in place of units
-
-
-class _Cut:
-    """Paths cut into words: `rows` with a word for every place, `marks` with what is between places, path by path."""
-
-    def __init__(self, parts: Sequence[Sequence[str]]) -> None:
-        self.rows, self.marks = [p[::2] for p in parts], [p[1::2] for p in parts]
-        self.columns = list(zip(*self.rows, strict=True))
 
 
 def infer_names(paths: Sequence[str]) -> FileNames:
@@ -63,42 +56,43 @@ def infer_names(paths: Sequence[str]) -> FileNames:
     for cut in (_words(stems), _aligned(stems)):
         if cut is None:
             continue
-        roles, sure = _roles(cut.columns)
+        columns = list(zip(*(p[::2] for p in cut), strict=True))
+        roles, sure = _roles(columns)
         pattern = _pattern(cut, roles, ending)
         if _tells_apart(pattern, paths):
             alone = not sure and roles.count(UNIT) == 1 and not {EPISODE, GROUP} & set(roles)
-            numbered = alone and _counts(cut.columns[roles.index(UNIT)])
+            numbered = alone and _counts(columns[roles.index(UNIT)])
             episodes: Roles = [EPISODE if role == UNIT else role for role in roles]
-            return FileNames(pattern, sure, _pattern(cut, episodes, ending) if numbered else None)
-    return FileNames(rf"^(?P<unit>.+){ending}$", False)
+            return FileNames(pattern, _pattern(cut, episodes, ending) if numbered else None)
+    return FileNames(rf"^(?P<unit>.+){ending}$")
 
 
 def _counts(words: Sequence[str]) -> bool:
     """Tell whether words are one text with the numbers from 0 or 1 on, which may number units or episodes."""
-    matches = [match for w in words if (match := re.fullmatch(r"(\D*)(\d+)", w))]
-    numbers = sorted({int(match[2]) for match in matches})
-    alike = len(matches) == len(words) and len({match[1] for match in matches}) == 1
-    return alike and len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
+    matches = [re.fullmatch(r"(\D*)(\d+)", w) for w in words]
+    if not all(matches) or len({match[1] for match in matches if match}) > 1:
+        return False
+    numbers = sorted({int(match[2]) for match in matches if match})
+    return len(numbers) > 1 and numbers[0] in (0, 1) and numbers[-1] - numbers[0] == len(numbers) - 1
 
 
-def _words(stems: Sequence[str]) -> _Cut | None:
+def _words(stems: Sequence[str]) -> Cut | None:
     """Cut into words; a number with a decimal point, or a version, stays whole."""
     for marks in (r"([/_\-. ]+)", r"([/_\- ]+)", r"([/_ ]+)"):
         parts = [re.split(marks, s) for s in stems]
         if len(set(map(len, parts))) == 1 and not ("." in marks and any(re.search(r"\w\.\d", s) for s in stems)):
-            return _Cut(parts)
+            return parts
     return None
 
 
-def _aligned(stems: Sequence[str]) -> _Cut | None:
+def _aligned(stems: Sequence[str]) -> Cut | None:
     """Cut into words where some paths have more: what all begin with, and as many words at the end as all have."""
     parts = [re.split(r"([/_ ]+)", s) for s in stems]
     fewest, head = min(map(len, parts)), 0
     while head + 1 < fewest and len({tuple(p[head : head + 2]) for p in parts}) == 1:
         head += 2
     tail = fewest - head - 1
-    cut = [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts]
-    return _Cut(cut) if tail > 0 else None
+    return [[*p[:head], "".join(p[head : len(p) - tail]), *p[len(p) - tail :]] for p in parts] if tail > 0 else None
 
 
 def _roles(columns: list[tuple[str, ...]]) -> tuple[Roles, bool]:
@@ -190,32 +184,29 @@ def quoted(text: str) -> str:
     return re.sub(r"\\([^\w\s.^$*+?{}\[\]|()\\])|\\ ", lambda m: m[1] or " ", re.escape(text))
 
 
-def _pattern(cut: _Cut, roles: Roles, ending: str) -> str:
+def _pattern(cut: Cut, roles: Roles, ending: str) -> str:
     """Write the expression, with places of one role side by side in one group."""
-    text, start = "^", 0
-    while start < len(roles):
-        stop = start + 1
-        while roles[start] is not None and stop < len(roles) and roles[stop] == roles[start]:
-            stop += 1
-        text += _group(cut, roles[start], start, stop)
-        between = {mark[stop - 1] for mark in cut.marks} if stop < len(roles) else {""}
+    text = "^"
+    for _, stretch in groupby(range(len(roles)), key=lambda i: roles[i] or i):
+        first, *others = stretch
+        last = others[-1] if others else first
+        values = {"".join(p[2 * first : 2 * last + 1]) for p in cut}
+        between = {"".join(p[2 * last + 1 : 2 * last + 2]) for p in cut}
+        text += _group(roles[first], values, len(others) > 0)
         text += quoted(between.pop()) if len(between) == 1 else r"[/_\-. ]+"
-        start = stop
     return f"{text}{ending}$"
 
 
-def _group(cut: _Cut, role: str | None, start: int, stop: int) -> str:
-    """Return the expression of some places."""
+def _group(role: str | None, values: set[str], several: bool) -> str:
+    """Return the expression of the words at one place or at several."""
     if role is None:
-        return quoted(cut.rows[0][start])
+        return quoted(next(iter(values)))
     if role == "other":
         return r"[^/]+?"
-    marked = ([*zip(row, [*mark, ""], strict=True)] for row, mark in zip(cut.rows, cut.marks, strict=True))
-    values = {"".join(map("".join, pairs[start : stop - 1])) + pairs[stop - 1][0] for pairs in marked}
     if all(v.isdecimal() for v in values):
         return rf"(?P<{role}>\d+)"
     apart = ".+?" if any("_" in v or "/" in v for v in values) else "[^/_]+"
-    return f"(?P<{role}>{'.+' if stop - start > 1 else apart})"
+    return f"(?P<{role}>{'.+' if several else apart})"
 
 
 def _tells_apart(pattern: str, paths: Sequence[str]) -> bool:

@@ -67,12 +67,10 @@ def from_arrays(
 
     Parameters
     ----------
-    data : mapping or sequence
-        One of: ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; the same with a mapping from
-        episode id in place of a list; ``{EpisodeKey: episode}``; or a list in place of the outer mapping, which
-        numbers the units from zero. An episode is an array of shape (n_samples, n_channels) with states, then inputs,
-        as columns; a pair (states, inputs); or a mapping from the name of a channel to its samples, shape
-        (n_samples,).
+    data : mapping
+        One of: ``{unit: [episode, ...]}``; ``{unit: {condition: [episode, ...]}}``; ``{EpisodeKey: episode}``. An
+        episode is an array of shape (n_samples, n_channels) with states, then inputs, as columns; a pair (states,
+        inputs); or a mapping from the name of a channel to its samples, shape (n_samples,).
     channels : sequence of Channel, optional
         In place of `states`, `inputs` and `measured`, with units of measure, in the order of the columns.
     sample_period_s : float, s
@@ -108,10 +106,8 @@ def from_arrays(
     declared = declare_channels(channels, states, inputs, measured, "from_arrays")
     columns = columns_in_order(declared)
     order = [declared.index(c) for c in columns]
-    places = {
-        key: (np.ascontiguousarray(_samples(key, episode, declared)[:, order]), None)
-        for key, episode in _episodes(data, {c.name for c in declared})
-    }
+    episodes = _episodes(data)
+    places = {key: (np.ascontiguousarray(_samples(key, one, declared)[:, order]), None) for key, one in episodes}
     return assemble(ArrayRecordings(places), columns, units, sample_period_s, metadata)
 
 
@@ -125,31 +121,25 @@ def as_numbers(values: Any) -> Array:
     return np.asarray(array, dtype=float)
 
 
-def _named(items: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the items of a mapping or a list, with their keys or numbers."""
-    if isinstance(items, Mapping):
-        yield from items.items()
-    elif isinstance(items, Iterable) and not isinstance(items, str | bytes) and getattr(items, "shape", True):
-        yield from ((str(i), item) for i, item in enumerate(items))
-    else:
-        needs = "from_arrays needs mappings or lists of episodes"
-        raise DataError(f"{needs}, found {shortened(repr(items))}; see its documentation.")
-
-
-def _episodes(data: Any, channels: set[str]) -> Iterator[tuple[EpisodeKey, Any]]:
-    """Yield every episode; a mapping is an episode where it names a channel."""
-
-    def holds_episodes(item: Any) -> bool:
-        return isinstance(item, list) or (isinstance(item, Mapping) and not channels & set(item))
-
-    for unit, of_unit in _named(data):
+def _episodes(data: Any) -> Iterator[tuple[EpisodeKey, Any]]:
+    """Yield every episode of a mapping from units, from units and conditions, or from keys."""
+    if not isinstance(data, Mapping):
+        actual = f"found {shortened(repr(data))}"
+        raise DataError(
+            f"from_arrays needs a mapping from units to lists of episodes, {actual}; see its documentation."
+        )
+    for unit, of_unit in data.items():
         if isinstance(unit, EpisodeKey):
             yield unit, of_unit
             continue
-        conditions = of_unit if isinstance(of_unit, Mapping) and any(map(holds_episodes, of_unit.values())) else None
-        for condition, episodes in (conditions or {DEFAULT_CONDITION: of_unit}).items():
-            for name, episode in _named(episodes):
-                yield EpisodeKey(str(unit), str(condition), str(name)), episode
+        conditions = of_unit if isinstance(of_unit, Mapping) else {DEFAULT_CONDITION: of_unit}
+        for condition, episodes in conditions.items():
+            if isinstance(episodes, str | bytes | Mapping) or not isinstance(episodes, Iterable):
+                actual = f"found {shortened(repr(episodes))}"
+                raise DataError(
+                    f"from_arrays: unit {unit} ({condition}) needs a list of episodes, {actual}; correct it."
+                )
+            yield from ((EpisodeKey(str(unit), str(condition), str(i)), one) for i, one in enumerate(episodes))
 
 
 def _samples(key: EpisodeKey, episode: Any, channels: Sequence[Channel]) -> Array:
@@ -185,8 +175,6 @@ def from_frame(
     unit: str = "unit",
     condition: str | None = "condition",
     episode: str | None = "episode",
-    units: Iterable[Unit] = (),
-    metadata: Mapping[str, Any] | None = None,
 ) -> Population:
     """Make a population from a long pandas DataFrame, one row a sample.
 
@@ -194,7 +182,7 @@ def from_frame(
     ----------
     frame : pandas.DataFrame
         Rows of an episode in order of time.
-    channels, states, inputs, measured, units, metadata
+    channels, states, inputs, measured
         As in `from_arrays`.
     time : str, optional
         Column of time, s; or give `sample_period_s`.
@@ -227,52 +215,40 @@ def from_frame(
         actual = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
         raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
     ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
-    _check_columns(frame, [unit, *([time] if time else []), *(c.name for c in ordered)], [condition, episode])
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
-    ids = _ids(frame, unit, ""), _ids(frame, condition, DEFAULT_CONDITION), _ids(frame, episode, "0")
-    rows = _rows_of(map(EpisodeKey, *ids))
+    columns: list[tuple[str | None, str | None]] = [(unit, None), (condition, DEFAULT_CONDITION), (episode, "0")]
+    rows: dict[EpisodeKey, list[int]] = {}  # they need not stand together
+    for row, key in enumerate(map(EpisodeKey, *(_ids(frame, *column) for column in columns))):
+        rows.setdefault(key, []).append(row)
     places = {key: (numbers[at], None if times is None else times[at]) for key, at in rows.items()}
-    return assemble(ArrayRecordings(places), ordered, units, sample_period_s, metadata)
+    return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)
 
 
-def _check_columns(frame: Any, required: Sequence[str], optional: Sequence[str | None]) -> None:
-    """Refuse a frame in which a column is missing or occurs twice."""
-    columns = list(frame.columns)
-    for name in (name for name in (*required, *optional) if name is not None):
-        count = columns.count(name)
-        if count > 1 or (count == 0 and name in required):
-            problem = f"occurs {count} times in" if count else "is missing, found"
-            raise DataError(f"from_frame: column {name!r} {problem} {columns}; rename a column or correct the names.")
+def _series(frame: Any, name: str) -> Any:
+    """Return a column that occurs once."""
+    count = list(frame.columns).count(name)
+    if count != 1:
+        problem = f"occurs {count} times in" if count else "is missing, found"
+        raise DataError(f"from_frame: column {name!r} {problem} {list(frame.columns)}; rename a column or the names.")
+    return frame[name]
 
 
-def _ids(frame: Any, column: str | None, default: str) -> list[str]:
+def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:
     """Return the names of a column, row by row."""
-    if column is None or column not in frame.columns:
+    if default is not None and column not in frame.columns:
         return [default] * len(frame)
-    values = frame[column].to_numpy(dtype=object)
-    bad = next((v for v in values if not _is_name(v)), None)
+    values = _series(frame, str(column)).to_numpy(dtype=object)
+    bad = next((v for v in values if isinstance(v, bool) or not isinstance(v, (str, int, np.integer))), None)
     if bad is not None:
         wanted = f"column {column!r} should hold text or whole numbers, found {bad!r}"
         raise DataError(f"from_frame: {wanted}; convert it with astype(str), keeping leading zeros.")
     return [str(v) for v in values]
 
 
-def _is_name(value: Any) -> bool:
-    return isinstance(value, (str, int, np.integer)) and not isinstance(value, bool)
-
-
-def _rows_of(keys: Iterable[EpisodeKey]) -> dict[EpisodeKey, list[int]]:
-    """Return the rows of every episode, in their order; they need not stand together."""
-    rows: dict[EpisodeKey, list[int]] = {}
-    for row, key in enumerate(keys):
-        rows.setdefault(key, []).append(row)
-    return rows
-
-
 def _column(frame: Any, name: str) -> Array:
     """Return a column of numbers."""
-    column = frame[name]
+    column = _series(frame, name)
     try:
         missing = {"dtype": float, "na_value": np.nan} if column.dtype.kind in "biuf" else {}
         return as_numbers(column.to_numpy(**missing))
@@ -292,9 +268,8 @@ def from_pykoop(
     Parameters
     ----------
     X : array_like, shape (n_samples, 1 + n_states + n_inputs), or mapping from unit id to such arrays
-        First column the episode, then states, then inputs. One array is one unit, named ``0``. Episodes are whole
-        numbers; in an array of objects they may be text. Rows of an episode need not stand together and keep their
-        order.
+        First column the episode, a whole number, then states, then inputs. One array is one unit, named ``0``. Rows of
+        an episode need not stand together and keep their order.
     n_inputs : int
         How many of the last columns are inputs.
     sample_period_s : float
@@ -318,13 +293,13 @@ def from_pykoop(
     Population(2 units, 1 condition, 4 episodes every 0.01 s; states x0 (measured); inputs u0)
     """
     try:
-        arrays = {str(u): np.asarray(x) for u, x in (X if isinstance(X, Mapping) else {"0": X}).items()}
+        arrays = {str(u): as_numbers(x) for u, x in (X if isinstance(X, Mapping) else {"0": X}).items()}
     except (TypeError, ValueError, RecursionError) as error:
-        needs = "needs an array (n_samples, n_columns) a unit"
+        needs = "needs an array of numbers (n_samples, n_columns) a unit"
         raise DataError(f"from_pykoop: {needs}, found something else ({error}); correct it.") from error
-    if not arrays:
-        raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
     shapes = [x.shape for x in arrays.values()]
+    if not shapes:
+        raise DataError("from_pykoop: the mapping is empty; give one array per unit.")
     n_states = shapes[0][-1] - 1 - n_inputs if {(len(s), s[-1:]) for s in shapes} == {(2, shapes[0][-1:])} else 0
     if not isinstance(n_inputs, (int, np.integer)) or n_inputs < 0 or n_states < 1:
         needs = f"needs arrays (n_samples, 1 + states + {n_inputs}) of one width"
@@ -332,23 +307,16 @@ def from_pykoop(
     if channels is None:
         states = [Channel(f"x{i}", Role.STATE, measured=True) for i in range(n_states)]
         channels = [*states, *(Channel(f"u{i}", Role.INPUT) for i in range(n_inputs))]
-    episodes: dict[EpisodeKey, Any] = {}
+    episodes: dict[EpisodeKey, Array] = {}
     for unit, x in arrays.items():
-        names = [_episode(value, row, unit) for row, value in enumerate(x[:, 0].tolist())]
-        rows = _rows_of(EpisodeKey(unit, DEFAULT_CONDITION, name) for name in names)
-        episodes |= {key: x[at, 1:] for key, at in rows.items()}
+        ids = x[:, 0]
+        bad = np.flatnonzero((ids % 1 != 0) | (np.abs(ids) >= 2.0**53))
+        if bad.size:
+            wanted = "the first column should number the episodes (below 2**53)"
+            actual = f"found {ids[bad[0]]} in row {bad[0]} of unit {unit}"
+            raise DataError(f"from_pykoop: {wanted}, {actual}; correct it.")
+        episodes |= {EpisodeKey(unit, DEFAULT_CONDITION, str(int(i))): x[ids == i, 1:] for i in np.unique(ids)}
     return from_arrays(episodes, channels, sample_period_s)
-
-
-def _episode(value: Any, row: int, unit: str) -> str:
-    """Return the name of a row's episode; whole numbers are written without a point."""
-    if isinstance(value, float) and value.is_integer() and abs(value) < 2.0**53:
-        return str(int(value))
-    if not _is_name(value):
-        wanted = "the first column should number the episodes (as floating-point numbers below 2**53)"
-        actual = f"found {value!r} in row {row} of unit {unit}"
-        raise DataError(f"from_pykoop: {wanted}, {actual}; use an integer or object array.")
-    return str(value)
 
 
 def to_pykoop(population: Population) -> Array:

@@ -170,14 +170,12 @@ def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping
 
 def _position(path: Path, fields: list[str], column: Column) -> int:
     """Return the position of a column by its name or number."""
-    if isinstance(column, int) and column <= len(fields):
-        return column - 1
-    if fields.count(str(column)) == 1 and isinstance(column, str):
-        return fields.index(column)
+    places = [i for i, field in enumerate(fields) if column in (field, i + 1)]
+    if len(places) == 1:
+        return places[0]
+    problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"
     if isinstance(column, int):
         problem = f"column {column} is asked for, found {len(fields)} columns"
-    elif column in fields:
-        problem = f"column {column!r} occurs {fields.count(column)} times, found {fields}"
-    else:
-        problem = f"column {column!r} is missing{did_you_mean(column, fields) or ','} found {fields}"
+    elif places:
+        problem = f"column {column!r} occurs {len(places)} times, found {fields}"
     raise DataError(f"Reading {path}: {problem}; correct the mapping or the file.")

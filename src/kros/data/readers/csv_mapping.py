@@ -13,7 +13,8 @@ from pydantic import ConfigDict, Field, field_validator, model_validator
 from ...core.files import read_toml
 from ...core.settings import Settings
 from ..population import Channel, Role, Scaling, columns_in_order
-from ..steps import Scale, Step, parse_steps
+from ..prepare import parse_steps
+from ..steps import Scale, Step
 from .tables import Dialect
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1

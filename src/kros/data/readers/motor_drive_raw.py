@@ -10,9 +10,9 @@ declares the preparation.
 from __future__ import annotations
 
 import io
-import logging
 import math
 import re
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -23,14 +23,11 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.files import whole_folder
-from ..arrow import from_numpy
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import ChannelMapping, CsvMapping
-from .parquet import in_threads
-
-logger = logging.getLogger(__name__)
+from .tables import from_numpy
 
 
 @dataclass(frozen=True)
@@ -110,57 +107,19 @@ def read_motor_drive_raw(source: Path | str) -> Population:
         wanted = "<YYYYmmddTHHMMSS>_<serial, 6 digits>_<load|noload>/*_<episode, 3 digits>.csv"
         raise DataError(f"{what}: file {root / strange} should be named {wanted}; rename it or move it away.")
     population = read_csv_folder(root, MAPPING)
-    period = population.sample_period_s
-    scale = next((s for s in (1.0, 1e-3, 1e-6) if math.isclose(period * s, LAYOUT.period_s, rel_tol=0.01)), None)
-    if scale is None:
-        text = "The raw layout is sampled at 1 kHz, found steps of %g in %s; rest and offset are counted in samples."
-        logger.warning(text, period, population.episodes[0])
-    if scale in (None, 1.0):
-        return population
-    return read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
+    steps = ((scale, population.sample_period_s * scale) for scale in (1e-3, 1e-6))
+    scale = next((scale for scale, step in steps if math.isclose(step, LAYOUT.period_s, rel_tol=0.01)), None)
+    return population if scale is None else read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
 
 
 def write_raw(population: Population, out: Path | str) -> None:
-    """Write the paper's raw layout, ``<out>/batch_b/<group>/<stamp>_<serial>_<load|noload>/*_<episode>.csv``.
+    """Write recordings before preparation, in the reader's channels and units, as a folder that is whole or not there.
 
-    Parameters
-    ----------
-    population : Population
-        Drives *before* preparation, in the reader's channels and units (rad and rad/s at the gear output, fraction of
-        full scale): episodes still hold the 1000 samples at rest and the offset of the position. Targets are written
-        one row later than the measurements they belong to, so reading back gives one sample less (and 1000 less at
-        rest).
-    out : Path
-        Folder to make, whole or not at all.
-
-    Raises
-    ------
-    DataError
-        Other channels, or names that the layout cannot hold.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> from tempfile import TemporaryDirectory
-    >>> from kros.data import write_raw
-    >>> from kros.plants import HarmonicDrivePopulation
-    >>> drives = HarmonicDrivePopulation(n_units=2, n_episodes=1, seconds=2.0, conditions=("noload",))
-    >>> with TemporaryDirectory() as folder:
-    ...     write_raw(drives.simulate().raw, f"{folder}/raw")  # as recorded, before preparation
-    ...     print(len(list(Path(folder).rglob("*.csv"))))
-    2
+    Targets are written one row later than the measurements that they belong to, so reading back gives one sample less
+    (and 1000 less at rest).
     """
-    names, expected = tuple(c.name for c in population.channels), tuple(c.name for c in CHANNELS)
-    if names != expected:
-        needs = f"needs the channels {expected}, found {names}"
-        raise DataError(f"Writing the raw layout of motor drives {needs}; write Parquet instead.")
-    for key in population.episodes:
-        named = re.fullmatch("[0-9]{6}", key.unit) and re.fullmatch("[0-9]{1,3}", key.episode)
-        if not named or key.condition not in ("load", "noload"):
-            needs = "needs a unit of six digits, a condition load or noload and an episode below 1000"
-            raise DataError(f"Writing the raw layout: {needs}, found {key}; rename it or write Parquet instead.")
-    with whole_folder(Path(out)) as folder:
-        in_threads(lambda group: _write_folder(population, folder, *group), enumerate(population.groups()))
+    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
+        list(pool.map(lambda group: _write_folder(population, folder, *group), enumerate(population.groups())))
 
 
 def _write_folder(population: Population, folder: Path, index: int, keys_of: tuple[str, str, Any]) -> None:

@@ -8,19 +8,15 @@ from typing import Any
 
 from ...core.errors import ConfigError, DataError
 from ..population import Population
+from ..prepare import parse_steps
 from ..prepare import prepare as prepared
-from ..steps import Step, parse_steps
+from ..steps import Step
 from .csv_folder import csv_files, read_csv_folder
 from .csv_mapping import CsvMapping
 from .motor_drive_raw import is_raw_layout, read_motor_drive_raw
 from .parquet import INDEX, read_parquet
 
-LOOKS = {
-    "motor-drive-raw": "holds a folder 'population' or 'outliers'",
-    "parquet": "holds population.json",
-    "csv": "holds CSV files",
-}
-READERS = tuple(LOOKS)
+READERS = ("motor-drive-raw", "parquet", "csv")
 
 
 def detect_reader(source: Path | str) -> str | None:
@@ -65,7 +61,7 @@ def read(
     ConfigError
         Unknown reader or option, invalid mapping or step.
     DataError
-        No such folder, an empty one, one that another reader fits, or recordings that cannot be used.
+        No such folder, an empty one, or recordings that cannot be used.
 
     Examples
     --------
@@ -96,7 +92,7 @@ def read(
 
 
 def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
-    """Return the reader to use, after checking that the folder fits it."""
+    """Return the reader to use, after checking that there is a folder."""
     reading = f"Reading {source}"
     if not source.exists():
         raise DataError(f"{reading}: there is no such folder; check data.source (relative to the study file).")
@@ -104,13 +100,8 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
         raise DataError(f"{reading}: this is a file, and recordings are a folder; give the folder that holds it.")
     if not any(source.iterdir()):
         raise DataError(f"{reading}: the folder is empty; check data.source or record something.")
-    if reader == "csv" or (reader is None and with_mapping):
-        return "csv"  # a mapping may describe any layout
-    fitting = detect_reader(source)
-    if fitting is None:
+    chosen = "csv" if reader is None and with_mapping else reader or detect_reader(source)  # a mapping takes any layout
+    if chosen is None:
         problem = "it has neither population.json, nor 'population' and 'outliers', nor CSV files"
         raise DataError(f"{reading}: no reader fits; {problem}; check data.source.")
-    if reader not in (None, fitting):
-        looks = f"the folder {LOOKS[fitting]}, so it looks like {fitting}"
-        raise DataError(f'{reading} as {reader}: {looks}; set data.reader = "{fitting}", or check data.source.')
-    return fitting
+    return chosen

@@ -14,36 +14,35 @@ import logging
 import os
 import sys
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened, whole_folder
-from ..arrow import fill, from_numpy, repeated
-from ..checks import Look, check_period, check_structure, refuse_copies, usable_episodes
-from ..population import Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
+from ..checks import check_structure, refuse_copies, usable_episodes
+from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings
-from .tables import BLOCK
+from .tables import BLOCK, from_numpy, repeated, to_numpy
 
 logger = logging.getLogger(__name__)
 
-T = TypeVar("T")
 Array = npt.NDArray[np.float64]
-Version = tuple[int, int, int]
 Place = tuple[str, int, int]
+Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # with their samples and digests
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
 AGAIN = "convert the recordings again"
@@ -55,25 +54,23 @@ _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 
 
 class ArrayCache:
-    """Read-only arrays by key, the latest asked for, at most so many bytes in all."""
+    """Read-only arrays by key, the latest ones, at most so many bytes in all."""
 
     def __init__(self, limit: int) -> None:
-        self.limit, self.size = limit, 0
+        self.limit, self.size, self.lock = limit, 0, Lock()
         self.arrays: OrderedDict[Hashable, Array] = OrderedDict()
-        self._lock = Lock()
 
     def take(self, key: Hashable, read: Callable[[], Array]) -> Array:
         """Return the array of a key, read where it is not there."""
-        with self._lock:
+        with self.lock:
             if key in self.arrays:
                 self.arrays.move_to_end(key)
                 return self.arrays[key]
         array = read()
         array.flags.writeable = False
-        with self._lock:
-            if array.nbytes <= self.limit and key not in self.arrays:
-                self.arrays[key] = array
-                self.size += array.nbytes
+        with self.lock:
+            self.size += array.nbytes - (self.arrays[key].nbytes if key in self.arrays else 0)
+            self.arrays[key] = array
             while self.size > self.limit:
                 self.size -= self.arrays.popitem(last=False)[1].nbytes
         return array
@@ -95,156 +92,97 @@ class ParquetRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: Place) -> Recording:
         """Return one episode."""
-        path = self.file(place)
-        require_regular(path, sys.maxsize)
-        status = path.stat()
-        version = (status.st_ino, status.st_size, status.st_mtime_ns)  # a file written anew is read anew
-        known_by = (str(path), version, place, key, self.columns)
-        return Recording(key, _CACHE.take(known_by, lambda: next(self._values(key, path, version, place))))
+        file = _Group(self.file(place), place, key)
+        return Recording(key, _CACHE.take((file, self.columns), lambda: next(file.read(self.columns))))
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
         """Return the samples of an episode in blocks, read one after the other."""
-        path, status = self.file(self.places[key]), self.file(self.places[key]).stat()
-        return self._values(key, path, (status.st_ino, status.st_size, status.st_mtime_ns), self.places[key], rows)
+        return _Group(self.file(self.places[key]), self.places[key], key).read(self.columns, rows)
 
-    def _values(
-        self, key: EpisodeKey, path: Path, version: Version, place: Place, rows: int | None = None
-    ) -> Iterator[Array]:
-        """Return the samples of an episode from its file, whole or in blocks."""
+
+@dataclass(frozen=True)
+class _Group:
+    """A row group of a file, which is read anew where the file was written anew."""
+
+    path: Path
+    place: Place
+    key: EpisodeKey
+    version: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        require_regular(self.path, sys.maxsize)
+        status = self.path.stat()
+        object.__setattr__(self, "version", (status.st_ino, status.st_size, status.st_mtime_ns))
+
+    def read(self, columns: tuple[str, ...], rows: int | None = None) -> Iterator[Array]:
+        """Return the samples, shape (n_samples, n_columns), whole or in blocks of `rows`."""
         try:
-            for table in _read_group(path, version, place, [*KEYS, *self.columns], rows):
-                values = np.empty((table.num_rows, len(self.columns)))
-                for column, channel in enumerate(self.columns):
-                    fill(values[:, column], table.column(channel))
+            for table in self._tables([*KEYS, *columns], rows):
                 table.select(KEYS).validate(full=True)
                 for name in KEYS:
-                    wanted, actual = getattr(key, name), table.column(name).unique().to_pylist()
-                    _require(actual == [wanted], path, f"the index says {name} {wanted!r}, the samples say {actual!r}")
-                yield values
+                    wanted, actual = getattr(self.key, name), table.column(name).unique().to_pylist()
+                    self._require(actual == [wanted], f"the index says {name} {wanted!r}, the samples say {actual!r}")
+                yield np.column_stack([to_numpy(table.column(channel)) for channel in columns])
         except DataError:
             raise
         except _ARROW_ERRORS as error:
-            pass_on_shortage(error, path)
-            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
+            pass_on_shortage(error, self.path)
+            raise DataError(f"Reading {self.key} from {self.path}: {shortened(str(error))}; {AGAIN}.") from error
+
+    def _tables(self, columns: list[str], rows: int | None) -> Iterator[Any]:
+        """Read columns after the checks of length and types, pages against their checksums."""
+        import pyarrow as pa
+        from pyarrow import parquet
+
+        _, group, samples = self.place
+        options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+        options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
+        with parquet.ParquetFile(self.path, metadata=_metadata(self.path, self.version), **options) as file:
+            actual = file.metadata.row_group(group).num_rows
+            self._require(actual == samples, f"{samples} samples are expected in row group {group}, found {actual}")
+            if samples > limits.MAX_SAMPLES:
+                advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
+                raise DataError(f"Reading {self.path}: an episode has {samples} samples; {advice}.")
+            for name in columns:
+                kind, label = str(file.schema_arrow.field(name).type), name in KEYS
+                wanted = "text" if label else "numbers of type double"
+                fits = "string" in kind if label else kind == "double"
+                self._require(fits, f"column {name!r} should hold {wanted}, found {kind}")
+            if rows is None:
+                yield file.read_row_group(group, columns=columns, use_threads=False)
+                return
+            for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+                yield pa.Table.from_batches([part])
+
+    def _require(self, condition: bool, problem: str) -> None:
+        if not condition:
+            raise DataError(f"Reading {self.path}: {shortened(problem)}; files were changed, {AGAIN}.")
 
 
 @lru_cache(maxsize=64)
-def _metadata(path: Path, version: Version) -> Any:
+def _metadata(path: Path, version: tuple[int, ...]) -> Any:
     """Return the description of all row groups of a file, which are read one by one."""
     from pyarrow import parquet
 
     return parquet.read_metadata(path)
 
 
-def _read_group(path: Path, version: Version, place: Place, columns: list[str], rows: int | None) -> Iterator[Any]:
-    """Read one row group, perhaps in blocks, after its length and the types of its columns, pages against checksums."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    _, group, samples = place
-    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
-    options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
-    with parquet.ParquetFile(path, metadata=_metadata(path, version), **options) as file:
-        actual = file.metadata.row_group(group).num_rows
-        _require(actual == samples, path, f"{samples} samples are expected in row group {group}, found {actual}")
-        if samples > limits.MAX_SAMPLES:
-            advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
-            raise DataError(f"Reading {path}: an episode has {samples} samples; {advice}.")
-        for name in columns:
-            kind, wanted = str(file.schema_arrow.field(name).type), "text" if name in KEYS else "numbers of type double"
-            fits = "string" in kind if name in KEYS else kind == "double"
-            _require(fits, path, f"column {name!r} should hold {wanted}, found {kind}")
-        if rows is None:
-            yield file.read_row_group(group, columns=columns, use_threads=False)
-            return
-        for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
-            yield pa.Table.from_batches([part])
-
-
-def _require(condition: bool, path: Path, problem: str) -> None:
-    if not condition:
-        raise DataError(f"Reading {path}: {shortened(problem)}; files were changed, {AGAIN}.")
-
-
 def read_parquet(folder: Path | str) -> Population:
-    """Read a population that `write_parquet` wrote.
-
-    Parameters
-    ----------
-    folder : Path
-        Holds `population.json`.
-
-    Returns
-    -------
-    Population
-        Lazy: only `population.json` is read.
-
-    Raises
-    ------
-    DataError
-        No population there, or one of another schema.
-
-    Examples
-    --------
-    >>> from tempfile import TemporaryDirectory
-    >>> import numpy as np
-    >>> import kros
-    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
-    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, sample_period_s=0.01, **names)
-    >>> with TemporaryDirectory() as folder:
-    ...     kros.data.write_parquet(population, f"{folder}/recordings")
-    ...     print(kros.data.read_parquet(f"{folder}/recordings"))
-    Population(1 unit, 1 condition, 1 episode every 0.01 s; states x (measured); inputs u)
-    """
+    """Return a population that `write_parquet` wrote; only `population.json` is read at once."""
     folder = Path(folder)
     content, _ = load_artifact(folder, INDEX)
-    what = f"Reading {folder / 'population.json'}"
     try:
-        columns = [_channel(c) for c in (*content["channels"], *content.get("truths", ()))]
-        units = [Unit(_text(u["id"]), _text(u["group"]), dict(u["metadata"])) for u in content["units"]]
-        places = _places(content["groups"])
-        period = check_period(content["sample_period_s"], what)
-        metadata = dict(content["metadata"])
-        scaling = {name: Scaling(**scale) for name, scale in content.get("scaling", {}).items()}
-    except DataError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError) as error:
-        raise DataError(f"{what}: not as kros writes it ({error!r}); {AGAIN}.") from error
+        index = TypeAdapter(_Index).validate_python(content)
+        places = _places(index.groups)
+    except ValueError as error:
+        what = f"Reading {folder / 'population.json'}: not as kros writes it"
+        raise DataError(f"{what} ({shortened(str(error))}); {AGAIN}.") from error
     missing = sorted({name for name, _, _ in places.values() if not (folder / name).is_file()})
     if missing:
         raise DataError(f"Reading {folder}: {len(missing)} files are missing, the first {missing[0]}; {AGAIN}.")
-    channels = columns_in_order(columns)
+    channels = columns_in_order((*index.channels, *index.truths))
     recordings = ParquetRecordings(places, str(folder), tuple(c.name for c in channels))
-    return assemble(recordings, channels, units, period, metadata, scaling=scaling)
-
-
-def _channel(row: Mapping[str, Any]) -> Channel:
-    """Return a channel of the index."""
-    of = _text(row.get("of", ""))
-    return Channel(_text(row["name"]), Role(row["role"]), _text(row["unit"]), row.get("measured") is True, of)
-
-
-def _places(groups: Iterable[Mapping[str, Any]]) -> dict[EpisodeKey, Place]:
-    """Return where every episode is."""
-    places: dict[EpisodeKey, Place] = {}
-    for g in groups:
-        unit, condition, name = _text(g["unit"]), _text(g["condition"]), _text(g["file"])
-        if name in ("", ".", "..") or Path(name).name != name:
-            raise ValueError(f"the file {name!r} is not beside the index")
-        for row_group, (episode, samples) in enumerate(zip(g["episodes"], g["samples"], strict=True)):
-            key = EpisodeKey(unit, condition, _text(episode))
-            if key in places:
-                raise ValueError(f"{key} occurs twice")
-            if type(samples) is not int or samples < 0:
-                raise TypeError(f"{samples!r} is no number of samples")
-            places[key] = name, row_group, samples
-    return places
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{value!r} should be text")
-    return value
+    return assemble(recordings, channels, index.units, index.sample_period_s, index.metadata, scaling=index.scaling)
 
 
 @dataclass(frozen=True)
@@ -265,22 +203,43 @@ class GroupRecord:
         return list(zip(keys, self.digests, strict=True)) if self.digests else []
 
 
+@dataclass(frozen=True)
+class _Index:
+    """Content of `population.json`."""
+
+    sample_period_s: float
+    channels: tuple[Channel, ...]
+    units: tuple[Unit, ...]
+    metadata: dict[str, Any]
+    groups: tuple[GroupRecord, ...]
+    truths: tuple[Channel, ...] = ()
+    scaling: dict[str, Scaling] = field(default_factory=dict)
+
+
+def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
+    """Return where every episode is."""
+    places: dict[EpisodeKey, Place] = {}
+    for g in groups:
+        if g.file in ("", ".", "..") or Path(g.file).name != g.file:
+            raise ValueError(f"the file {g.file!r} is not beside the index")
+        for row_group, (episode, samples) in enumerate(zip(g.episodes, g.samples, strict=True)):
+            key = EpisodeKey(g.unit, g.condition, episode)
+            if key in places or samples < 0:
+                raise ValueError(f"{key} occurs twice, or has {samples} samples")
+            places[key] = g.file, row_group, samples
+    return places
+
+
 def write_group(
-    population: Population,
-    unit: str,
-    condition: str,
-    folder: Path | str,
-    on_nan: str = "error",
-    look: Look | None = None,
+    population: Population, unit: str, condition: str, folder: Path | str, episodes: Episodes | None = None
 ) -> GroupRecord:
-    """Read, prepare, check and write all episodes of one unit and condition."""
+    """Write the usable episodes of one unit and condition; by default they are read, prepared and checked here."""
     keys = population.keys(unit, condition)
-    if not keys:
-        raise DataError(f"Asked to write unit {unit} ({condition}); the population has no episode of it.")
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        written = list(_write_episodes(population, keys, temporary, on_nan, look))
+        usable = usable_episodes(population, keys) if episodes is None else episodes
+        written = list(_write_episodes(population, usable, temporary))
         if not written:
             text = "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN."
             logger.warning(text, unit, condition, len(keys))
@@ -288,8 +247,8 @@ def write_group(
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    episodes, samples, digests = zip(*written, strict=True)
-    return GroupRecord(unit, condition, path.name, episodes, samples, digests)
+    names, samples, digests = zip(*written, strict=True)
+    return GroupRecord(unit, condition, path.name, names, samples, digests)
 
 
 def group_file(unit: str, condition: str) -> str:
@@ -300,9 +259,7 @@ def group_file(unit: str, condition: str) -> str:
     return f"{name}.parquet"
 
 
-def _write_episodes(
-    population: Population, keys: Sequence[EpisodeKey], path: Path, on_nan: str, look: Look | None
-) -> Iterator[tuple[str, int, str]]:
+def _write_episodes(population: Population, episodes: Episodes, path: Path) -> Iterator[tuple[str, int, str]]:
     """Write usable episodes one behind the other; yield episode, number of samples and digest."""
     import pyarrow as pa
     from pyarrow import parquet
@@ -321,7 +278,7 @@ def _write_episodes(
         "write_page_checksum": True,
     }
     with parquet.ParquetWriter(path, schema, **options) as writer:
-        for key, values, digest in usable_episodes(population, keys, on_nan, look):
+        for key, values, digest in episodes:
             n = len(values)
             signals = [from_numpy(column) for column in (np.arange(n, dtype=np.int64), *values.T)]
             arrays = [*(repeated(getattr(key, name), n) for name in KEYS), *signals]
@@ -380,17 +337,6 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
     ...     print(sorted(path.name for path in Path(folder, "recordings").iterdir()))
     ['a@default.parquet', 'population.json']
     """
-    with whole_folder(Path(out)) as folder:
-        groups = list(population.groups())
-        records = in_threads(lambda group: write_group(population, group[0], group[1], folder), groups)
-        write_index(population, records, folder, converted)
-
-
-def in_threads(function: Callable[[Any], T], tasks: Iterable[Any]) -> list[T]:
-    """Map a function over tasks in threads, one per processor; what has not begun when one fails is left."""
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        futures = [pool.submit(function, task) for task in tasks]
-        try:
-            return [future.result() for future in futures]
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
+    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
+        groups = [pool.submit(write_group, population, unit, c, folder) for unit, c, _ in population.groups()]
+        write_index(population, [group.result() for group in groups], folder, converted)

@@ -20,7 +20,6 @@ import numpy.typing as npt
 from ...core import limits
 from ...core.errors import DataError
 from ...core.files import pass_on_shortage, require_regular, shortened
-from ..arrow import fill
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -72,29 +71,24 @@ def read_columns(
 
     try:
         table = (_parquet_table if path.suffix == PARQUET else _text_table)(path, names, wanted, dialect, timestamp)
+        columns = [table.column(name) for name in wanted]
+        first = [] if timestamp is None else [seconds_of(columns.pop(0), timestamp)]
+        return np.array([*first, *map(to_numpy, columns)]).reshape(len(wanted), table.num_rows)
     except DataError:
         raise
     except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
         pass_on_shortage(error, path)
         raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file, or the mapping.") from error
-    values = np.empty((len(wanted), 0 if table is None else table.num_rows))
-    for i, name in enumerate(wanted if table is not None else ()):
-        column = table.column(name)
-        if i > 0 or timestamp is None:
-            fill(values[i], column)
-        else:
-            values[i] = seconds_of(column, timestamp) if path.suffix != PARQUET else _since_first(column)
-    return values
 
 
 def _text_table(
     path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, timestamp: str | None
 ) -> Any:
-    """Read columns of a text file; None where it has no rows."""
+    """Read columns of a text file as numbers, but for the first one with `timestamp`."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 
-    kinds = {name: pa.float64() for name in wanted} | ({} if timestamp is None else {wanted[0]: pa.string()})
+    kinds = dict.fromkeys(wanted, pa.float64()) | ({} if timestamp is None else {wanted[0]: pa.string()})
     options = (
         arrow.ReadOptions(use_threads=False, column_names=list(names), block_size=BLOCK),
         arrow.ParseOptions(delimiter=dialect.delimiter),
@@ -112,7 +106,7 @@ def _text_table(
             return arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
         except pa.ArrowInvalid as error:
             if "Empty CSV" in str(error):
-                return None
+                return pa.schema(kinds).empty_table()
             raise
 
 
@@ -128,10 +122,10 @@ def _parquet_table(
     if file.metadata.num_rows > limits.MAX_SAMPLES:
         advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
         raise DataError(f"Reading {path}: has more than {limits.MAX_SAMPLES} rows; {advice}.")
-    fields = {name: file.schema_arrow.names[list(names).index(name)] for name in wanted}
-    table = file.read(columns=list(fields.values()), use_threads=False).select(list(fields.values()))
-    kinds = dict.fromkeys(fields, pa.float64()) | ({} if timestamp is None else {wanted[0]: pa.timestamp("ns")})
-    return table.rename_columns(list(fields)).cast(pa.schema(kinds))
+    fields = [file.schema_arrow.names[list(names).index(name)] for name in wanted]
+    kinds = dict.fromkeys(wanted, pa.float64()) | ({} if timestamp is None else {wanted[0]: pa.timestamp("ns")})
+    table = file.read(columns=fields, use_threads=False).select(fields)
+    return table.rename_columns(list(wanted)).cast(pa.schema(kinds))
 
 
 def parquet_head(path: Path, rows: int) -> tuple[list[str], list[tuple[str, ...]]]:
@@ -178,13 +172,12 @@ class LimitedFile:
 
     def _counted(self, content: bytes) -> bytes:
         self._given += len(content)
-        more = f"Reading {self._path}: unpacks to more than"
-        if self._given > limits.MAX_TEXT_BYTES:
-            advice = "split it, or raise MAX_TEXT_BYTES in kros.core.limits"
-            raise DataError(f"{more} {limits.MAX_TEXT_BYTES} bytes; {advice}.")
-        if self._given > max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size):
-            advice = "which recordings never do; unpack it, or raise MAX_RATIO in kros.core.limits"
-            raise DataError(f"{more} {limits.MAX_RATIO} times its {self._size} bytes, {advice}.")
+        limit = min(limits.MAX_TEXT_BYTES, max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size))
+        if self._given > limit:
+            advice = "split or unpack it, or raise MAX_TEXT_BYTES or MAX_RATIO in kros.core.limits"
+            ratio = limit / max(self._size, 1)
+            problem = f"unpacks to more than {limit} bytes, {ratio:.3g} times its {self._size} bytes"
+            raise DataError(f"Reading {self._path}: {problem}; {advice}.")
         return content
 
 
@@ -260,20 +253,14 @@ def timestamp_pattern(order: str) -> str:
     return rf"^\s*(?:{DATES[order]}[T ]\s*)?{CLOCK}\s*$"
 
 
-def _since_first(column: Any) -> Array:
-    """Return times of a Parquet file as seconds since the first one, shape (n_rows,), s."""
-    import pyarrow as pa
-    import pyarrow.compute as pc
-
-    since = pc.subtract(column.cast(pa.int64()), pc.min(column.cast(pa.int64())))
-    return np.asarray(1e-9 * since.cast(pa.float64()).to_numpy())
-
-
 def seconds_of(column: Any, order: str) -> Array:
-    """Return timestamps as seconds since the first one, NaN where a cell holds none, shape (n_rows,), s."""
+    """Return timestamps, perhaps as text, as seconds since the first one, NaN where there is none, shape (n_rows,)."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
+    if pa.types.is_timestamp(column.type):
+        count = column.cast(pa.int64())
+        return 1e-9 * to_numpy(pc.subtract(count, pc.min(count)).cast(pa.float64()))
     parts = pc.extract_regex(column.combine_chunks(), pattern=timestamp_pattern(order))
     bad = parts.is_null().to_numpy(zero_copy_only=False)
 
@@ -289,3 +276,33 @@ def seconds_of(column: Any, order: str) -> Array:
     good = np.flatnonzero(~bad)
     since = 10**9 * (whole - (whole[good[0]] if good.size else 0)) + number("fraction")
     return np.where(bad, np.nan, 1e-9 * since)
+
+
+# Between NumPy and Arrow through bare buffers: the ways of pyarrow import pandas, which costs half a second.
+
+
+def from_numpy(values: npt.NDArray[Any]) -> Any:
+    """Return an Arrow array without nulls that shares the memory of contiguous numbers."""
+    import pyarrow as pa
+
+    return pa.Array.from_buffers(
+        pa.from_numpy_dtype(values.dtype), len(values), [None, pa.py_buffer(np.ascontiguousarray(values))]
+    )
+
+
+def repeated(text: str, count: int) -> Any:
+    """Return a dictionary-encoded Arrow array that holds one text `count` times."""
+    import pyarrow as pa
+
+    content = text.encode()
+    offsets = np.array([0, len(content)], np.int32)
+    dictionary = pa.StringArray.from_buffers(1, pa.py_buffer(offsets), pa.py_buffer(content))
+    return pa.DictionaryArray.from_arrays(from_numpy(np.zeros(count, np.int32)), dictionary)
+
+
+def to_numpy(column: Any) -> npt.NDArray[np.float64]:
+    """Return the numbers of a float64 Arrow column, NaN for nulls."""
+    import pyarrow.compute as pc
+
+    missing = from_numpy(np.array([np.nan]))[0]
+    return np.asarray(np.from_dlpack(pc.fill_null(column, missing).combine_chunks()))

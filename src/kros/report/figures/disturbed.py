@@ -28,7 +28,7 @@ def robustness(run: RunFolder) -> tuple[Figure, str]:
     names = [n for n in tried if n == run.deployed or split_observer(n)[0] in (model, "")]
     names = sorted((n for n in names if any(channel in c for c in tried[n].values())), key=lambda n: n == run.deployed)
     kinds = [kind for kind in AXES if any(kind in tried[n] for n in names)]
-    figure, axes = grid(-(-len(kinds) // 4), min(4, len(kinds)), 1.75, sharey=True)
+    figure, axes = grid(-(-len(kinds) // 4), min(4, len(kinds)), sharey=True)
     panels = axes.ravel()
     for panel, kind in zip(panels, kinds, strict=False):
         lines = {n: tried[n][kind][channel] for n in names if channel in tried[n].get(kind, {})}
@@ -59,8 +59,17 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
         look, main = method_look(name), name == deployed
         errors = np.where(curve.errors < DRAWING.diverged_percent, curve.errors, np.nan)
         label = method_label(name) + (" (deployed)" if main else "")
-        panel.plot(x, errors, look.style, color=look.colour, lw=2.4 if main else 1.2, marker="o", ms=2.4, label=label)
-    panel.set_title(axis.title.replace(" (", "\n("), size=8)
+        panel.plot(
+            x,
+            errors,
+            look.style,
+            color=look.colour,
+            lw=DRAWING.broad if main else None,
+            marker="o",
+            ms=2.4,
+            label=label,
+        )
+    panel.set_title(axis.title.replace(" (", "\n("), size="small")
     if axis.logarithmic:
         low, high = float(severities[1]), float(severities[-1])
         ticks = [10.0**k for k in range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)][::2]
@@ -79,7 +88,7 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
     ways = [(label, names) for label, names in ways if names]
     truth = arrays["truth"].astype(float)
     times = np.arange(len(truth)) * run.sample_period_s
-    figure, axes = grid(len(ways), 2, 1.7, width_ratios=(1.6, 1), sharex="col")
+    figure, axes = grid(len(ways), 2, width_ratios=(3, 2), sharex="col")
     freqs, density = error_spectrum(truth, run.sample_period_s, 4 * DRAWING.segment)
     for (label, names), (time, spectrum) in zip(ways, axes, strict=True):
         draw_lines(time, times, {"declared load": (truth, TRUTH)})

@@ -56,7 +56,7 @@ def entries_figure(
     together = sum(columns for _, columns in sizes.values()) <= DRAWING.states
     rows = (max if together else sum)(p for p, _ in sizes.values())
     columns = (sum if together else max)(m for _, m in sizes.values())
-    figure, axes = grid(rows, columns, 1.45, sharex=True, sharey=True)
+    figure, axes = grid(rows, columns, sharex=True, sharey=True)
     for panel in axes.ravel():
         panel.axis("off")
     top, left = 0, 0
@@ -77,12 +77,14 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
         for j, panel in enumerate(row):
             panel.axis("on")
             lines_of_units(panel, freqs, levels[inside][..., i, j], Tone.BLUE.light, "units", units)
-            panel.plot(freqs, bound[:, i, j], color=Tone.BLUE.light, lw=2.6, alpha=0.45, label="largest")
-            panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, lw=1.1, label="fitted weight")
+            panel.plot(
+                freqs, bound[:, i, j], color=Tone.BLUE.light, lw=DRAWING.broad, alpha=DRAWING.shade, label="largest"
+            )
+            panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, label="fitted weight")
             _mark_unit(panel, residuals, levels[..., i, j], alarm)
             frequency_axis(panel, freqs, "", 4)
             order = f"order {residuals.entry_orders[i, j]}"
-            note(panel, order, (0, 0), (3, 3), size=7, color=Tone.SOFT.light)
+            note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
         row[0].set_ylabel(f"to {short(names[0][i])}\n(dB)")
     for j, panel in enumerate(block[0]):
         panel.set_title(f"{label},\nfrom {short(names[1][j])}")
@@ -93,4 +95,4 @@ def _mark_unit(axes: Axes, residuals: UnitResiduals, levels: Array, alarm: str |
     """Draw the unit that stands out in red."""
     if alarm in residuals.unit_ids:
         line = levels[residuals.unit_ids.index(str(alarm))]
-        axes.plot(residuals.freqs_hz, line, color=Tone.ALARM.light, lw=1.5, label=f"unit {alarm}")
+        axes.plot(residuals.freqs_hz, line, color=Tone.ALARM.light, label=f"unit {alarm}")

@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...core.errors import ConfigError
 from ...data import EpisodeBatch
 from ...data.population import Channel, Role
+from ...design import Design
 from ...evaluate.errors import error_spectrum
 from ...evaluate.sensor import as_shown
 from ...identify.identified import IdentifiedModels
-from ...observer import Observer, run_observer
+from ...observer import run_observer
 from ..canvas import Array, Axes, Figure, frequency_axis, grid, label_below, legend, logarithmic, thin
 from ..names import (
     Look,
@@ -50,7 +52,7 @@ class Signals:
     @classmethod
     def of(cls, run: RunFolder) -> Signals:
         """Return those of a run; the enlarged part has some turns of the gearbox, else an eighth of the episode."""
-        size = DRAWING.zoom if run.calibrated else len(run.shown[0].time_s) // 8
+        size = DRAWING.zoom if run.has("calibration/calibration.json") else len(run.shown[0].time_s) // 8
         band = run.evaluation.get("band_hz")
         return cls(run.channels, run.sample_period_s, size, None if band is None else tuple(band))
 
@@ -123,7 +125,7 @@ def _figure(run: RunFolder, blocks: Sequence[Block], text: str) -> tuple[Figure,
 
 def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
     """Draw a row a state: the episode, a part of it, the error over time, and the error's power spectral density."""
-    figure, axes = grid(sum(len(block.states) for block in blocks), 4, 1.05, width_ratios=(1.2, 1, 1.2, 1))
+    figure, axes = grid(sum(len(block.states) for block in blocks), 4)
     first = 0
     for block in blocks:
         panels = axes[first : first + len(block.states)]
@@ -156,10 +158,10 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
         if np.isfinite(error).all() and np.abs(error[start:]).max() < DRAWING.diverged * np.ptp(recorded):
             draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
             freqs, density = error_spectrum(error, signals.sample_period_s)
-            row[3].plot(freqs[1:], density[1:], look.style, color=look.colour, lw=1.0)
+            row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
             frequency_axis(row[3], freqs, "", 4)
     logarithmic(row[3])
-    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size=7)
+    row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size="small")
     if signals.band_hz is not None:
         row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 
@@ -228,9 +230,11 @@ def steady_stretches(speed: Array) -> list[tuple[int, int]]:
     return sorted(stretches)
 
 
-def estimate_figure(observer: Observer, models: IdentifiedModels) -> Figure:
-    """Draw estimates on the first held-out episode of the units behind the models."""
-    facts = models.facts
+def design_figure(design: Design, models: IdentifiedModels | None = None) -> Figure:
+    """Draw estimates of an observer on the first held-out episode of the units behind its models."""
+    if models is None:
+        raise ConfigError("Plot of a design: give models= the identified models, whose recordings it runs on.")
+    observer, facts = design.observer, models.facts
     key = next(k for k in facts.keys("test", condition=facts.identify_on) if k.unit in facts.pooled)
     batch = EpisodeBatch.read(models.population, [key], parameters=models.parameters)
     y = as_shown(batch, observer.sensor, models.population.states).measurements(observer.measured)

@@ -31,14 +31,14 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
     response = models.systems().frequency_response(freqs) * (models.input_scale / models.output_scale[:, None])
     rows, inputs = min(response.shape[2], DRAWING.states), min(response.shape[3], 2)
     values = (decibel(response), np.degrees(np.unwrap(np.angle(response), axis=1)))
-    figure, axes = grid(rows, 2 * inputs, 1.25 if rows > 2 else 1.8, sharex=True)
+    figure, axes = grid(rows, 2 * inputs, sharex=True)
     for i, row in enumerate(axes):
         for j, panel in enumerate(row):
             lines = values[j % 2][:, :, i, j // 2]
             lines_of_units(panel, freqs, lines, model_look(models.name).colour, f"{len(lines)} units", models.unit_ids)
             if nominal in models.unit_ids:
                 line = lines[models.index(nominal)]
-                panel.plot(freqs, line, color=Tone.INK.light, lw=1.1, label=f"nominal, unit {nominal}")
+                panel.plot(freqs, line, color=Tone.INK.light, label=f"nominal, unit {nominal}")
             frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "", 4)
             panel.locator_params(axis="y", nbins=5)
         name = words(models.lifting.names[i])

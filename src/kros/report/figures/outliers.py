@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ...data.population import natural_key
+from ...data.recording import some
 from ...uncertainty import OutlierModel
 from ..canvas import Axes, Figure, grid, name_units, note, units_axis
-from ..names import condition_label, number, some_of, words
+from ..names import condition_label, number, words
 from ..run_folder import RunFolder
-from ..theme import Tone
+from ..theme import DRAWING, Tone
 
 
 def scores(run: RunFolder) -> tuple[Figure, str]:
-    """Draw one point a unit with its range, flagged ones in the colour of alarm."""
+    """Draw one point a unit with its range, flagged ones in the colour of alarm, a column a condition."""
     models = {c: run.outlier_models[c] for c in sorted(run.outlier_models, key=natural_key)}
     first = next(iter(models.values()))
     flagged = sorted({s.unit for m in models.values() for s in m.scores if s.outlier}, key=natural_key)
@@ -26,22 +25,17 @@ def scores(run: RunFolder) -> tuple[Figure, str]:
     rate = number(100 * first.false_alarm_rate, 2)
     text = f"{about}. The threshold has a false-alarm rate of {rate} % for a good unit"
     text += "; with so few units the rate rests on an exponential tail. " if first.extrapolated else ". "
-    text += f"Above it: {some_of(flagged)}." if flagged else "No unit is above it."
+    text += f"Above it: {some(flagged)}." if flagged else "No unit is above it."
     if not any(np.isfinite(m.threshold_db) for m in models.values()):
         text = f"{about}. There is no threshold with fewer than eight units."
-    return scores_figure(models), text
-
-
-def scores_figure(conditions: Mapping[str, OutlierModel]) -> Figure:
-    """Draw scores with their ranges, a column a condition."""
-    units = sorted({s.unit for m in conditions.values() for s in m.scores}, key=natural_key)
-    figure, axes = grid(1, len(conditions), 1.9, sharey=True)
-    for panel, (condition, model) in zip(axes[0], conditions.items(), strict=True):
+    units = sorted({s.unit for m in models.values() for s in m.scores}, key=natural_key)
+    figure, axes = grid(1, len(models), sharey=True)
+    for panel, (condition, model) in zip(axes[0], models.items(), strict=True):
         _panel(panel, model, units)
         panel.set_title(condition_label(condition))
         units_axis(panel, units)
     axes[0, 0].set_ylabel("score (dB)")
-    return figure
+    return figure, text
 
 
 def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
@@ -50,13 +44,13 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         tone, place = Tone.ALARM if score.outlier else Tone.BLUE, places[score.unit]
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = [score.lowest_db + shift, score.highest_db + shift]
-        axes.plot([place, place], ends, color=tone.light, lw=3.5, alpha=0.3, solid_capstyle="butt")
+        axes.plot([place, place], ends, color=tone.light, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
         (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
             note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
     if np.isfinite(model.threshold_db):
-        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=0.9, ls="--")
+        axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
     axes.margins(y=0.15)

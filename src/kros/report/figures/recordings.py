@@ -6,10 +6,11 @@ import numpy as np
 
 from ...core.errors import ConfigError
 from ...data.population import OUTLIERS, EpisodeKey, Population, Role
+from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
 from ..canvas import Array, Figure, grid, label_below, legend, logarithmic, name_units, note, units_axis
-from ..names import Look, episode_title, minus, some_of, squared, words
+from ..names import Look, episode_title, minus, squared, words
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
@@ -38,7 +39,7 @@ def _read(run: RunFolder, key: EpisodeKey) -> Shown:
 def signals(run: RunFolder) -> tuple[Figure, str]:
     """Draw one episode in at most two conditions, side by side, with references."""
     shown, channels, targets = recorded_episodes(run)[:2], run.states[:5], references(run.channels)
-    figure, axes = grid(len(channels), len(shown), 1.1, sharey="row", sharex="col")
+    figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
     for column, episode in zip(axes.T, shown, strict=True):
         for i, channel in enumerate(channels):
             if channel.name in targets:
@@ -60,7 +61,7 @@ def population_figure(population: Population) -> Figure:
         raise ConfigError("Plot: the population has no episodes; read some first.")
     key = population.episodes[0]
     values = population.read(key)
-    figure, axes = grid(len(population.channels), 1, 1.1, sharex=True)
+    figure, axes = grid(len(population.channels), 1, sharex=True)
     time_s = np.arange(len(values)) * population.sample_period_s
     for panel, channel, line in zip(axes[:, 0], population.channels, values.T, strict=True):
         draw_lines(panel, time_s, {channel.name: (line, _RECORDED if channel.role is Role.STATE else _REFERENCE)})
@@ -73,7 +74,7 @@ def population_figure(population: Population) -> Figure:
 def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     """Draw the spectrum of the tracking error at constant speed in every condition (the paper's Figure 4)."""
     spec = run.calibration.spec
-    figure, axes = grid(1, 1, 2.3)
+    figure, axes = grid(1, 1)
     panel, frequency = axes[0, 0], 0.0
     for shown, tone in zip(recorded_episodes(run), (Tone.BLUE, Tone.GOLD, Tone.GREEN), strict=False):
         freqs, density, frequency = _tracking(run, shown)
@@ -82,7 +83,7 @@ def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
     top = 0.5 / run.sample_period_s
     for multiple in range(1, min(6, int(top / frequency)) + 1):
         place = multiple * frequency
-        panel.axvline(place, color=Tone.SOFT.light, lw=0.7, ls=":", zorder=1)
+        panel.axvline(place, color=Tone.SOFT.light, lw=DRAWING.thin, ls=":", zorder=1)
         note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
     panel.set_xlim(0, min(top, 6.6 * frequency))
     panel.set_xlabel("frequency (Hz)")
@@ -116,7 +117,7 @@ def phase(run: RunFolder) -> tuple[Figure, str]:
     weak = [u for u, c in calibration.units.items() if c.concentration < DRAWING.concentrated]
     mean, low, high = (minus(f"{value:.0f}°") for value in (np.mean(lags), lags.min(), lags.max()))
     text = f"The lag of the loop is {mean} in the mean, from {low} to {high}."
-    text += f" Concentration below {DRAWING.concentrated:g}: {some_of(weak)}." if weak else ""
+    text += f" Concentration below {DRAWING.concentrated:g}: {some(weak)}." if weak else ""
     return phase_figure(calibration, run.set_aside), text
 
 
@@ -124,7 +125,7 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
     """Draw phase, lag and concentration of every unit; units that are set aside are drawn hollow."""
     units = list(calibration.units)
     values = [calibration.units[u] for u in units]
-    figure, axes = grid(1, 3, 1.9)
+    figure, axes = grid(1, 3)
     columns = (
         (np.degrees([v.phase_rad for v in values]), "phase (°)"),
         (np.degrees([v.lag_rad for v in values]), "lag (°)"),
@@ -139,7 +140,7 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
         units_axis(panel, units)
     axes[0, 0].set_ylim(-12, 372)
     axes[0, 0].set_yticks([0, 90, 180, 270, 360])
-    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=0.8, ls="--")
-    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=0.8, ls="--")
+    axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
+    axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
     axes[0, 2].set_ylim(min(0.7, columns[2][0].min() - 0.02), 1.03)
     return figure

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -50,11 +50,11 @@ def forms(run: RunFolder) -> tuple[Figure, str]:
     used = words(next(iter(chosen.values())).form.value)
     text = f"Largest residual over all units with the nominal unit that suits each form best. Thick: in use, {used}."
     text += " Dashed: the output forms as published, at least 0 dB whatever the units are." if published else ""
-    figure, axes = grid(1, len(chosen), 2.6, sharey=True)
+    figure, axes = grid(1, len(chosen), sharey=True)
     for panel, (name, model) in zip(axes[0], chosen.items(), strict=True):
         draw_forms(panel, model)
         for form, (freqs, bound) in published.get(name, {}).items():
-            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light, lw=1.0)
+            panel.plot(freqs, decibel(bound), "--", color=FORM_TONES[form].light)
         panel.set_title(model_label(name))
     axes[0, 0].set_ylabel("largest residual (dB)")
     legend(figure, axes[0, 0], 3)
@@ -74,34 +74,51 @@ def published_bounds(model: UncertainModel, models: ModelSet) -> dict[Form, tupl
 def draw_forms(axes: Axes, model: UncertainModel) -> None:
     """Draw the bounds of all forms over frequency, the form in use thick."""
     for form, bound in model.bounds.items():
-        width, label = 2.4 if form is model.form else 1.2, words(form.value)
+        width, label = DRAWING.broad if form is model.form else None, words(form.value)
         style = ":" if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else "-"  # it often hides output multiplicative
         axes.plot(model.freqs_hz, decibel(bound), style, color=FORM_TONES[form].light, lw=width, label=label)
-    axes.axhline(0, color=Tone.SOFT.light, lw=0.7)
+    axes.axhline(0, color=Tone.SOFT.light, lw=DRAWING.thin)
     frequency_axis(axes, model.freqs_hz)
 
 
 def weights(run: RunFolder) -> tuple[Figure, str]:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
     chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
-    figure, axes = grid(len(chosen), 3, 2.0, sharex=True)
-    for row, (name, model) in zip(axes, chosen.items(), strict=True):
-        _weights_row(row, model, run.models[name])
-        ratio_panel(row[2], run.unit_residuals[name])
-        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
-    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
-        panel.set_title(title)
-    label_below(axes[-1])
+    rows = {n: (model, run.models[n], run.unit_residuals[n]) for n, model in chosen.items()}
     parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
-    return figure, (
+    return weights_figure(rows), (
         "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free "
         f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
     )
 
 
-def _weights_row(row: Sequence[Axes], model: UncertainModel, models: ModelSet | None) -> None:
-    """Draw left weights and right weights."""
-    names = models.inputs if models is not None and model.form in _INPUT_SIDE else ()
+def weights_figure(rows: Mapping[str, tuple[UncertainModel, ModelSet, UnitResiduals]]) -> Figure:
+    """Draw the weights of a kind of model, and every unit relative to them, a row a kind."""
+    figure, axes = grid(len(rows), 3, sharex=True)
+    for row, (name, (model, models, residuals)) in zip(axes, rows.items(), strict=True):
+        _draw_weights(row, model, models.inputs if model.form in _INPUT_SIDE else ())
+        ratio_panel(row[2], residuals)
+        row[0].set_ylabel(f"{model_label(name)}\nmagnitude (dB)")
+    for panel, title in zip(axes[0], ("left weight", "right weight", "units relative to the weights"), strict=True):
+        panel.set_title(title)
+    label_below(axes[-1])
+    return figure
+
+
+def uncertain_figure(model: UncertainModel) -> Figure:
+    """Draw the weights of an uncertain model, and its largest residual in every form."""
+    figure, axes = grid(1, 3, sharex=True)
+    _draw_weights(axes[0], model)
+    draw_forms(axes[0, 2], model)
+    legend(figure, axes[0, 2], 3)
+    for panel, title in zip(axes[0], ("left weight (dB)", "right weight (dB)", "largest residual (dB)"), strict=True):
+        panel.set_title(title)
+    label_below(axes[0])
+    return figure
+
+
+def _draw_weights(row: Sequence[Axes], model: UncertainModel, names: Sequence[str] = ()) -> None:
+    """Draw left and right weights over the optimal bound."""
     fitted = model.weight.magnitudes(model.freqs_hz)
     cover = in_gauge(model.cover, fitted)
     _side(row[0], model.freqs_hz, fitted.left, cover.left, names)
@@ -135,9 +152,9 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     names = [residuals.unit_ids[k] for k in rows]
     lines_of_units(axes, freqs, levels, Tone.BLUE.light, "units", names)
     first = int(np.nanargmax(np.nanmax(np.where(np.isfinite(levels), levels, -np.inf), axis=1)))
-    axes.plot(freqs, levels[first], color=Tone.INK.light, lw=1.1)
+    axes.plot(freqs, levels[first], color=Tone.INK.light)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
-    axes.axhline(0, color=Tone.ALARM.light, lw=0.9, ls="--")
+    axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
     frequency_axis(axes, freqs, "", 4)
 
 
@@ -164,31 +181,10 @@ def outlier_residuals(run: RunFolder) -> tuple[Figure, str]:
     return entries_figure(chosen, names, alarm=unit), text + f"all units but {unit}."
 
 
-def uncertain_figure(model: UncertainModel, models: ModelSet | None = None, entries: bool = False) -> Figure:
-    """Draw forms and weights of an uncertain model, and with its models every unit relative to the weights."""
-    if entries:
-        if models is None:
-            raise ConfigError("Plot of an uncertain model: entries need models= the ModelSet that it was made of.")
-        return entries_figure({models.name: beside(model, models)}, {models.name: entry_names(model.form, models)})
-    figure, axes = grid(2, 2, 2.4, sharex=True)
-    draw_forms(axes[0, 0], model)
-    legend(figure, axes[0, 0], 3)
-    _weights_row(axes[1], model, models)
-    if models is None:
-        axes[0, 1].remove()
-    else:
-        ratio_panel(axes[0, 1], beside(model, models))
-        axes[0, 1].set_title("units relative to the weights (dB)")
-    axes[0, 0].set_title(f"largest residual (dB), nominal {model.nominal_id}")
-    axes[1, 0].set_title("left weight (dB)")
-    axes[1, 1].set_title("right weight (dB)")
-    label_below(axes[1])
-    return figure
-
-
-def sets_figure(models: UncertainModels, kind: str | None = None, entries: bool = False) -> Figure:
-    """Draw the uncertain model of one kind, the first by default."""
+def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
+    """Draw the weights of one kind of model, the first by default."""
     name = kind or next(iter(models.sets))
     if name not in models.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
-    return uncertain_figure(models.sets[name], models.models.models(name), entries)
+    model, identified = models.sets[name], models.models.models(name)
+    return weights_figure({name: (model, identified, beside(model, identified))})

@@ -21,7 +21,8 @@ _TEXT = (
 _ASSUMED = (
     "The recorded units represent those to come: another batch and wear are not covered.",
     "The recorded signals depended on no estimate: the certificates do not hold if a controller uses the estimate.",
-    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form.",
+    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form. It says "
+    "how units differ, not how models differ from units.",
     "The recorded signals: residuals have at most the recorded power in every band of frequency.",
     "Errors are those relative to the recorded sensors, unless the true signal is known.",
 )

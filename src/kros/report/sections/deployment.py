@@ -10,6 +10,7 @@ from ..content import Section
 from ..disturbances import doublings
 from ..facts import Facts
 from ..names import axis_label, joined, number, observer_about, words
+from .evidence import limit_text
 
 _NEEDS = {
     Kind.NOISE: "noise of {} % of the largest value",
@@ -46,7 +47,7 @@ def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequen
 
     hidden = [axis_label(n, facts.unit(n)) for n in entry["estimates"] if n not in entry["measured"]]
     delay = f"a measurement delay of {late} samples is assumed" if late else "no measurement delay is assumed"
-    limits = [f"{words(c)}: {_ends(limit)}." for c, limit in facts.study.get("limits", {}).items()]
+    limits = [f"{words(c)}: {limit_text(limit)}." for c, limit in facts.study.get("limits", {}).items()]
     return [
         ("Reads", [f"Measured: {named(entry['measured'])}. Inputs: {named(entry['inputs'])}."]),
         ("Estimates", [f"{joined(hidden)}, for the next sample; {delay}."]),
@@ -65,13 +66,6 @@ def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> lis
     first = next(iter(parameters))
     how = f", from recordings at constant speed in both directions, or --track {first}" if calibrated else ""
     return [f"{values}; every unit has its own value: --parameter UNIT.{first}=VALUE{how}."]
-
-
-def _ends(limit: Mapping[str, Any]) -> str:
-    """Return the ends of a limit in words."""
-    ends = [(limit["lower"], "at least"), (limit["upper"], "at most")]
-    text = joined([f"{word} {number(value)}" for value, word in ends if value is not None])
-    return f"{text}, estimated from the recordings"
 
 
 def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str]:

@@ -9,11 +9,12 @@ from importlib import import_module
 from typing import Any
 
 from ...core.linalg import radius_text
+from ...data.recording import some
 from ...evaluate import Kind
 from ..content import Column, Section, build
 from ..disturbances import AXES, doublings
 from ..facts import Facts
-from ..names import in_condition, minus, model_label, number, observer_label, some_of, split_observer, words
+from ..names import in_condition, minus, model_label, number, observer_label, split_observer, words
 
 _PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
 
@@ -28,36 +29,29 @@ def recordings(facts: Facts) -> Section:
     text = f"{study['units']} units, sampled every {study['sample_period_s']:g} s."
     text += f" Episodes: {'; '.join(counts)}." if counts else ""
     aside = [row["unit"] for row in facts.get("units", []) if row.get("group") == "outliers"]
-    text += f" Set aside as outliers: {some_of(aside)}." if aside else ""
-    text += f" Dropped for bad samples: {some_of(study['dropped'])}." if study.get("dropped") else ""
+    text += f" Set aside as outliers: {some(aside)}." if aside else ""
+    text += f" Dropped for bad samples: {some(study['dropped'])}." if study.get("dropped") else ""
     channels, sensor = study.get("channels", {}), study.get("sensor", {})
-    roles = [_role(c, facts) for c in channels]
+    roles = dict.fromkeys(study.get("inputs", ()), "input") | dict.fromkeys(facts.measured, "measured")
     declared = [", ".join(f"{words(k)} {v:g}" for k, v in sensor.get(c, {}).items() if v) for c in channels]
     columns = [
         Column("channel", [words(c) for c in channels]),
         Column("unit", [u or "–" for u in channels.values()]),
-        Column("role", roles),
+        Column("role", [roles.get(c, "estimated") for c in channels]),
         Column("resolution", [study.get("resolution", {}).get(c) for c in channels]),
         Column("declared sensor", declared),
-        Column("limits", [_limit(study.get("limits", {}).get(c)) for c in channels]),
+        Column("limits", [limit_text(study.get("limits", {}).get(c)) for c in channels]),
     ]
     return Section("recordings", "Recordings", [text], tables=[build("Channels", columns)], figure="signals")
 
 
-def _role(channel: str, facts: Facts) -> str:
-    """Return whether a channel is an input, measured at run time or estimated."""
-    if channel in facts.study.get("inputs", ()):
-        return "input"
-    return "measured" if channel in facts.measured else "estimated"
-
-
-def _limit(limit: Mapping[str, Any] | None) -> str:
+def limit_text(limit: Mapping[str, Any] | None) -> str:
     """Return a limit and where units were seen at it."""
     if limit is None:
         return ""
     ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
     seen = (limit.get("seen") or {}).get("units")
-    return f"{ends}, estimated, reached by {some_of(seen, 3)}" if seen else f"{ends}, estimated"
+    return f"{ends}, estimated, reached by {some(seen, 3)}" if seen else f"{ends}, estimated"
 
 
 def calibration(facts: Facts) -> Section | None:
@@ -71,7 +65,7 @@ def calibration(facts: Facts) -> Section | None:
         f"apart. Mean lag of the loop: {minus(format(math.degrees(entry['lag_rad']), '.1f'))}°."
     )
     missing = [row["unit"] for row in facts.get("units", []) if row["status"] == "not calibrated"]
-    more = [f"Not calibrated, and without models: {some_of(missing)}."] if missing else []
+    more = [f"Not calibrated, and without models: {some(missing)}."] if missing else []
     return Section("calibration", "Phase calibration", [text, *more], figure="phase")
 
 
@@ -167,5 +161,4 @@ def run(facts: Facts) -> Section:
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
     text = "metrics.json holds all numbers of this page, study.json all settings; the same results come again with "
     text += f"{', '.join(versions)} and Python {platform.python_version()}."
-    table = build("Time; a stage that was up to date counts with its own time", times)
-    return Section("run", "Run", [text], tables=[table])
+    return Section("run", "Run", [text], tables=[build("Time; a stage that was up to date counts in full", times)])

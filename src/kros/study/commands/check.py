@@ -62,7 +62,7 @@ def check_units(run: Path, data: Path, workers: int = 1, same_unit: bool = False
 def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_unit: bool = False) -> Rows:
     """Score the units of some recordings against a run that is open."""
     pattern = re.compile("outliers/([^/]+)/outlier_model.json")
-    folders = [store.path("outliers", m[1]) for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
+    names = [m[1] for name in sorted(store.files()) if (m := pattern.fullmatch(name))]
     observer = Observer.load(store.path(*DEPLOYED)) if store.holds(*DEPLOYED) else None
     population = open_data(config, data, hidden_states(observer) if observer else ())
     check_population(population, allow_single=True)
@@ -75,21 +75,21 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
         if hidden:
             return watched
         check_channels(population, observer)
-    if not folders:
+    if not names:
         advice = "run the study until quantify, with at least three units"
         raise ConfigError(f"Run {store.folder}: has no outlier scores to compare with; {advice}.")
-    sets = {folder: ModelSet.load(store.path("models", folder.name)) for folder in folders}
-    known = {folder: models for folder, models in sets.items() if models.condition in population.conditions}
+    sets = {name: ModelSet.load(store.path("models", name)) for name in names}
+    known = {name: models for name, models in sets.items() if models.condition in population.conditions}
     if not known:
-        modelled = ", ".join(models.condition for models in sets.values())
-        recorded = f"the recordings have the conditions {', '.join(population.conditions)}"
-        both = f"{recorded}, and the run has models of {modelled} alone"
+        modelled, there = (", ".join(c) for c in ([m.condition for m in sets.values()], population.conditions))
+        both = f"the recordings have the conditions {there}, and the run has models of {modelled} alone"
         raise DataError(f"Checking {data}: {both}; name the condition, as in the study.")
     levels = {(r["unit"], r["condition"]): {k: r[k] for k in r if k.startswith("level_")} for r in watched}
     rows: Rows = []
     with open_executor(workers) as executor:
-        for folder, models in known.items():
-            rows += score_condition(store, population, models, OutlierModel.load(folder), executor, same_unit)
+        for name, models in known.items():
+            outliers = OutlierModel.load(store.path("outliers", name))
+            rows += score_condition(store, population, models, outliers, executor, same_unit)
     return [row | levels.get((row["unit"], row["condition"]), {}) for row in rows]
 
 
@@ -147,12 +147,12 @@ def monitored(recordings: FieldRecordings) -> Rows:
                 judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
         level = highest_level(monitor, judged)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
-        row: dict[str, Any] = {"unit": unit, "condition": condition, "outlier": outlier, "level_db": level}
-        row |= dict.fromkeys(("score", "threshold", "detectable"))
-        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "episodes": len(keys), "left_out": []}
-        row |= {"recorded_s": samples * population.sample_period_s, "missing": missing}
+        row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))
+        row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
+        row |= {"status": Status.OUTLIER if outlier else Status.CANNOT_TELL, "missing": missing, "level_db": level}
         row |= {"level_rate": monitor and monitor.false_alarm_rate, "level_units": monitor and monitor.units}
-        rows.append(row | {"samples": counts, "parameters": recordings.sources.get(unit)})
+        row |= {"recorded_s": samples * population.sample_period_s, "samples": counts}
+        rows.append(row | {"parameters": recordings.sources.get(unit)})
     return rows
 
 

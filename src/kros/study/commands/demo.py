@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
 
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError
 from ...core.store import digest_of
 from ...core.work import Progress
-from ...data import write_parquet, write_raw
+from ...data import write_parquet
+from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
 from ..engine.executors import open_executor
@@ -43,16 +43,15 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
     from ...plants import PLANTS
 
     plant, raw = simulation.plant, simulation.format == "raw"
-    for name, allowed in (("plant", tuple(PLANTS)), ("format", ("parquet", "raw")), ("loop", ("stiff", "soft"))):
+    for name, allowed in (("plant", tuple(PLANTS)), ("format", ("parquet", "raw"))):
         if (value := getattr(simulation, name)) not in allowed:
             raise ConfigError(f"--{name} {value!r}: choose one of {', '.join(allowed)}.")
     if raw and plant != HARMONIC_DRIVE:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    names = ("n_units", "n_episodes", "seconds", "seed", "spread", "outlier")
-    settings = {name: getattr(simulation, name) for name in (*names, *(("loop",) if plant == HARMONIC_DRIVE else ()))}
-    simulated = PLANTS[plant](**settings).simulate()
+    names = ("n_units", "n_episodes", "seconds", "seed", "spread", "outlier", *(["loop"] * (plant == HARMONIC_DRIVE)))
+    simulated = PLANTS[plant](**{name: getattr(simulation, name) for name in names}).simulate()
     if out.exists():
         out.rmdir()
     if raw:
@@ -74,7 +73,6 @@ def run_demo(
         if (artefact := store.stored(digest)) is not None:
             store.add(_STAGE, artefact)
         else:
-            executor.map(_load, range(workers))  # worker processes begin with it meanwhile
             progress.start(_STAGE, None)
             began = time.perf_counter()
             with store.drafting() as draft:
@@ -82,9 +80,3 @@ def run_demo(
                 draft.commit(_STAGE, digest, time.perf_counter() - began)
         require_usable(config, Stage.REPORT)
         return run_in(store, config, Stage.REPORT, executor, progress)
-
-
-def _load(_: int) -> None:
-    """In a worker: load what takes long to load and every study needs."""
-    for name in ("kros.study.pipeline", "pyarrow.parquet", "scipy.optimize", "sympy"):
-        import_module(name)

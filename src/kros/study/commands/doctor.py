@@ -6,7 +6,7 @@ import platform
 import shutil
 from importlib import metadata
 
-_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "rich", "jinja2", "matplotlib")
+_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib")
 _OPTIONAL = {
     "distributed": "maps over units on a cluster (kros run --scheduler)",
     "pandas": "reading long data frames",
@@ -18,21 +18,16 @@ _OPTIONAL = {
 
 def diagnose() -> list[str]:
     """Return lines for people."""
-    lines = [
-        f"kros {_version('kros') or 'not installed as a package'}   Python {platform.python_version()} on "
-        f"{platform.platform(terse=True)}"
-    ]
-    lines += [f"  {name:<16} {_version(name) or 'MISSING: install kros again'}" for name in _REQUIRED]
-    lines.append("optional")
-    lines += [f"  {name:<16} {_version(name) or 'not installed'}   {purpose}" for name, purpose in _OPTIONAL.items()]
-    lines.append(
-        f"C compiler        {shutil.which('cc') or shutil.which('gcc') or 'none'}   for checking exported C code"
-    )
-    return lines
+    system = f"Python {platform.python_version()} on {platform.platform(terse=True)}"
+    lines = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
+    lines += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
+    lines += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
+    compiler = shutil.which("cc") or shutil.which("gcc") or "none"
+    return [*lines, f"C compiler        {compiler}   for checking exported C code"]
 
 
-def _version(name: str) -> str | None:
+def _version(name: str, otherwise: str) -> str:
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
-        return None
+        return otherwise

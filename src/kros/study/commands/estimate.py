@@ -73,57 +73,32 @@ def facts_of(recordings: FieldRecordings) -> dict[str, Any]:
 @contextmanager
 def writer(out: Path, facts: dict[str, Any]) -> Iterator[Write]:
     """Give a function that writes an episode's estimates from a sample on; the file appears whole or not at all."""
+    import pyarrow as pa
+    from pyarrow import csv, parquet
+
+    labels = [pa.field(name, pa.int64() if name == "k" else pa.string()) for name in KEYS]
+    units = {name: {"unit": unit} if unit else None for name, unit in facts["columns"].items()}
+    columns = [pa.field(name, pa.float64(), metadata=unit) for name, unit in units.items()]
+    about = {n: v if isinstance(v, str) else json.dumps(v) for n, v in facts.items() if v is not None}
+    schema, text = pa.schema([*labels, *columns], metadata=about), out.suffix == ".csv"
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.partial")
     try:
-        with (_csv if out.suffix == ".csv" else _parquet)(temporary, facts) as write:
+        with (
+            csv.CSVWriter(temporary, schema)
+            if text
+            else parquet.ParquetWriter(temporary, schema, write_page_checksum=True)
+        ) as file:
+
+            def write(key: EpisodeKey, start: int, values: Array) -> None:
+                names = [pa.repeat(name, len(values)) for name in (key.unit, key.condition, key.episode)]
+                samples = pa.array(np.arange(start, start + len(values)))
+                numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
+                file.write_table(pa.Table.from_arrays([*names, samples, *numbers], schema=schema), max(len(values), 1))
+
             yield write
-        if out.suffix == ".csv":
+        if text:
             write_json(out.with_name(f"{out.name}-metadata.json"), facts)
         temporary.replace(out)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-@contextmanager
-def _csv(path: Path, facts: dict[str, Any]) -> Iterator[Write]:
-    import csv
-
-    with path.open("w", newline="") as file:
-        rows = csv.writer(file)
-        rows.writerow([*KEYS, *facts["columns"]])
-        yield lambda key, start, values: rows.writerows(
-            [key.unit, key.condition, key.episode, k, *map(repr, row)] for k, row in enumerate(values.tolist(), start)
-        )
-
-
-@contextmanager
-def _parquet(path: Path, facts: dict[str, Any]) -> Iterator[Write]:
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    text = pa.dictionary(pa.int32(), pa.string())
-    columns = [
-        pa.field(name, pa.float64(), metadata={"unit": unit} if unit else None)
-        for name, unit in facts["columns"].items()
-    ]
-    labels = [pa.field(name, pa.int64() if name == "k" else text) for name in KEYS]
-    metadata = {
-        name: value if isinstance(value, str) else json.dumps(value)
-        for name, value in facts.items()
-        if value is not None
-    }
-    schema = pa.schema([*labels, *columns], metadata=metadata)
-    with parquet.ParquetWriter(path, schema, write_page_checksum=True) as file:
-
-        def write(key: EpisodeKey, start: int, values: Array) -> None:
-            zeros = pa.array(np.zeros(len(values), np.int32))
-            labelled = [
-                pa.DictionaryArray.from_arrays(zeros, pa.array([t])) for t in (key.unit, key.condition, key.episode)
-            ]
-            numbers = [pa.array(np.ascontiguousarray(column)) for column in values.T]
-            samples = pa.array(np.arange(start, start + len(values)))
-            table = pa.Table.from_arrays([*labelled, samples, *numbers], schema=schema)
-            file.write_table(table, row_group_size=max(len(table), 1))
-
-        yield write

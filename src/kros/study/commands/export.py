@@ -31,19 +31,18 @@ def export_run(
     """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default."""
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
+        places = {name: store.path("observers", f"{name}.json") for name in names}
         loads = {
-            f"{kind}/{LOAD}": f"{kind}.json" for kind in ("koopman", "linear") if store.holds(LOAD, f"{kind}.json")
+            f"{k}/{LOAD}": store.path(LOAD, f"{k}.json")
+            for k in ("koopman", "linear")
+            if store.holds(LOAD, f"{k}.json")
         }
-        known = (*names, *loads)
-        if observer not in known:
-            raise ConfigError(
-                f"Run {run}: has no observer {observer!r}{did_you_mean(observer, known) or ';'} "
-                f"known are {', '.join(known)}."
-            )
-        path = store.path(LOAD, loads[observer]) if observer in loads else store.path("observers", f"{observer}.json")
-        chosen, name = Observer.load(path), name or identifier(config.name)
+        if observer not in (known := places | loads):
+            hint = f"{did_you_mean(observer, known) or ';'} known are {', '.join(known)}"
+            raise ConfigError(f"Run {run}: has no observer {observer!r}{hint}.")
+        chosen, name = Observer.load(known[observer]), name or identifier(config.name)
         if not chosen.about:  # that of a load: its channels are those of the observer that is deployed
-            about = Observer.load(store.path("observers", f"{DEPLOYED}.json")).about
+            about = Observer.load(places[DEPLOYED]).about
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track)

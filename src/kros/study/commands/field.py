@@ -19,7 +19,7 @@ from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
 from ...data.survey import RecordingFacts
-from ...evaluate.arriving import Arriving, arriving
+from ...evaluate.sensor import Arriving, arriving
 from ...identify import PhaseCalibration
 from ...identify.calibration import segments_of
 from ...observer import Observer
@@ -33,6 +33,7 @@ from ..stages.read import ARRAYS
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
 Values = dict[str, dict[str, float]]  # lifting parameters by unit
+Texts = dict[str, str]  # by unit
 # Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
@@ -68,10 +69,8 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
     needed = (*(observer.lifting.states[i] for i in observer.measured), *observer.inputs)
     names = [*population.states, *population.inputs]
     if not hidden and (missing := [name for name in needed if name not in names]):
-        absent = f"{', '.join(missing)} is missing from the recordings, which have {', '.join(names)}"
-        raise DataError(
-            f"Channels: the observer needs {', '.join(needed)}; {absent}; record it, or correct the mapping."
-        )
+        absent = f"{', '.join(missing)} is missing, which the observer reads; there are {', '.join(names)}"
+        raise DataError(f"Channels: {absent}; record it, or correct the mapping.")
     if hidden and expected != there:
         both = f"the run has states and inputs {expected}, the recordings {there}"
         raise DataError(f"Channels: {both}; read them the same way.")
@@ -104,49 +103,43 @@ def training_keys(population: Population) -> dict[tuple[str, str], tuple[Episode
     return groups | {group: split.train for group, split in splits.items()}
 
 
-@dataclass(frozen=True)
-class UnitValues:
-    """Lifting parameters of every unit, where each came from, and why one is unknown."""
-
-    values: Values
-    sources: dict[str, str] = field(default_factory=dict)
-    reasons: dict[str, str] = field(default_factory=dict)
-
-
 def unit_values(
     population: Population, calibration: PhaseCalibration | None, prefer: str, given: Values | None = None
-) -> UnitValues:
-    """Return every unit's lifting parameters: given, calibrated in a condition, or those of the run."""
-    units = UnitValues({unit: dict((given or {}).get(unit, {})) for unit in population.unit_ids})
+) -> tuple[Values, Texts, Texts]:
+    """Return the lifting parameters of units, where each came from, and why one is unknown.
+
+    They are given, calibrated in a condition, or those of the run.
+    """
+    known, sources, reasons = {u: dict((given or {}).get(u, {})) for u in population.unit_ids}, Texts(), Texts()
     if calibration is None:
-        return units
+        return known, sources, reasons
     training, spec = training_keys(population), calibration.spec
     derived = "" if spec.measured in population.states else f" on the derivative of {spec.angle}"
-    for unit, values in units.values.items():
+    for unit, values in known.items():
         if spec.parameter in values:
-            units.sources[unit] = "given"
+            sources[unit] = "given"
             continue
         by_condition = {condition: keys for (u, condition), keys in training.items() if u == unit}
+        keys = by_condition.get(prefer) or next(iter(by_condition.values()))
         try:
-            keys = by_condition.get(prefer) or next(iter(by_condition.values()))
             phase = calibration.calibrate(segments_of((population, keys, spec)), unit)
-            units.sources[unit] = f"calibrated{derived}"
+            sources[unit] = f"calibrated{derived}"
         except IdentificationError as error:
             if unit not in calibration.units:
-                units.sources[unit], units.reasons[unit] = "unknown", str(error)
+                sources[unit], reasons[unit] = "unknown", str(error)
                 continue
-            phase, units.sources[unit] = calibration.units[unit], "of the run"
+            phase, sources[unit] = calibration.units[unit], "of the run"
             log.info("unit %s: its recordings do not show the phase, that of the run is taken", unit)
         values[spec.parameter] = phase.phase_rad
-    return units
+    return known, sources, reasons
 
 
 def unit_parameters(population: Population, calibration: PhaseCalibration | None, prefer: str) -> Values:
     """Return every unit's lifting parameters, as `unit_values` finds them; refuse one that is unknown."""
-    units = unit_values(population, calibration, prefer)
-    for reason in units.reasons.values():
+    values, _, reasons = unit_values(population, calibration, prefer)
+    for reason in reasons.values():
         raise IdentificationError(reason)
-    return units.values
+    return values
 
 
 def parse_given(texts: Collection[str], units: Collection[str], known: Collection[str]) -> Values:
@@ -175,8 +168,7 @@ class FieldRecordings:
     population: Population
     values: Values
     sources: Mapping[str, str] = field(default_factory=dict)
-    followed: frozenset[str] = frozenset()  # units whose parameter is followed
-    name: str | None = None  # of that parameter
+    name: str | None = None  # of the parameter that a phase-locked loop follows
 
     @classmethod
     def open(
@@ -191,32 +183,24 @@ class FieldRecordings:
             raise ConfigError(f"--track {track}: the observer's parameters are {', '.join(known) or 'none'}.")
         population = with_gaps(open_data(config, data, hidden_states(observer)))
         check_channels(population, observer, hidden=False)
-        calibration = load_calibration(store)
-        units = unit_values(population, calibration, identify_on(store), parse_given(given, population.unit_ids, known))
-        phase = None if calibration is None else calibration.spec.parameter
-        return cls(observer, population, units.values, units.sources)._tracking(units.reasons, track, phase)
+        chosen = parse_given(given, population.unit_ids, known)
+        values, sources, reasons = unit_values(population, load_calibration(store), identify_on(store), chosen)
+        return cls(observer, population, values, sources, track)._settled(reasons)
 
-    def _tracking(self, reasons: Mapping[str, str], track: str | None, phase: str | None) -> FieldRecordings:
-        """Return the same with parameters that are followed, by option or since they are unknown."""
-        unknown = {u: [p for p in self.observer.lifting.parameters if p not in v] for u, v in self.values.items()}
-        name = track or next((p for missing in unknown.values() for p in missing), "")
-        values, sources, followed = {u: dict(v) for u, v in self.values.items()}, dict(self.sources), set[str]()
-        for unit, missing in unknown.items():
-            if track is None and not missing:
-                continue
-            if set(missing) - {name} or not _trackable(self.observer, name):
-                reason = reasons.get(unit, "it was not calibrated.")
-                loop = "a phase-locked loop either, which needs one unknown parameter and an observer without delays"
-                follow = f"It cannot be followed by {loop}; give it, --parameter {unit}.{name}=VALUE."
-                raise IdentificationError(f"Parameter {', '.join(missing) or name} of unit {unit}: {reason} {follow}")
-            source = f"value that is {sources.get(unit)}"
-            if name in missing:
-                source = "value of the smallest innovation" if name == phase else "value of the nominal unit"
-            if name in missing and name == phase:
-                values[unit][name] = self._start(unit, name)
-            sources[unit] = f"tracked from the {source}"
-            followed.add(unit)
-        return replace(self, values=values, sources=sources, followed=frozenset(followed), name=name or None)
+    def _settled(self, reasons: Texts) -> FieldRecordings:
+        """Return the same with all parameters that the observer needs; one that is followed begins anywhere."""
+        values, sources = {unit: dict(known) for unit, known in self.values.items()}, dict(self.sources)
+        for unit, known in values.items():
+            missing = [name for name in self.observer.lifting.parameters if name not in known]
+            if set(missing) - {self.name}:
+                reason, first = reasons.get(unit, "it was not calibrated."), missing[0]
+                advice = f"Give it, --parameter {unit}.{first}=VALUE, or let it be followed, --track {first}."
+                raise IdentificationError(f"Parameter {', '.join(missing)} of unit {unit}: {reason} {advice}")
+            if self.name is not None:
+                known[self.name] = self._start(unit, self.name) if missing else known[self.name]
+                start = "of the smallest innovation" if missing else f"that is {sources.get(unit)}"
+                sources[unit] = f"tracked from the value {start}"
+        return replace(self, values=values, sources=sources)
 
     def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
@@ -250,8 +234,7 @@ class FieldRecordings:
             blocks = self.population.blocks(key, _BLOCK)
             first, second = next(blocks), next(blocks, None)
             full = (len(short) + 1) * max(len(first), *map(len, short.values()), 0) > _SAMPLES or len(short) == _BATCH
-            others = any((key.unit in self.followed) != (other.unit in self.followed) for other in short)
-            if short and (second is not None or full or others):
+            if short and (second is not None or full):
                 yield from self._run(tuple(short), [list(short.values())])
                 short = {}
             if second is None:
@@ -264,7 +247,7 @@ class FieldRecordings:
     def _run(self, keys: tuple[EpisodeKey, ...], blocks: Iterable[list[Array]]) -> Iterator[Estimated]:
         """Run over episodes, block by block, each behind the samples that late measurements are read from."""
         observer, n, start, course = self.observer, len(self.observer.recorded), 0, None
-        loop = PhaseLockedLoop(observer, str(self.name), len(keys)) if keys[0].unit in self.followed else None
+        loop = None if self.name is None else PhaseLockedLoop(observer, self.name, len(keys))
         late = math.ceil(max((s.delay_samples for s in observer.sensor.values()), default=0))
         before = [np.empty((0, len(self.population.channels)))] * len(keys)
         for block in blocks:
@@ -273,9 +256,9 @@ class FieldRecordings:
             course = course or Course(observer, len(keys), arrived.parameters(observer), loop)
             run = course.take(arrived.y[lead:], arrived.u[lead:])
             columns = run.estimates[..., :n]
-            if self.name is not None:
-                known = arrived.batch.parameters[self.name] if loop is None else run.followed
-                columns = np.concatenate([columns, np.broadcast_to(known, columns.shape[:2])[..., None]], axis=-1)
+            if loop is not None:
+                followed = np.broadcast_to(run.followed, columns.shape[:2])
+                columns = np.concatenate([columns, followed[..., None]], axis=-1)
             for i, key in enumerate(keys):
                 yield key, start, columns[: len(block[i]), i], run.status[: len(block[i]), i]
             start, before = start + len(block[0]), [part[max(0, len(part) - late) :] for part in values]
@@ -286,11 +269,3 @@ def count_status(counts: dict[str, int], status: Bits) -> None:
     for bit in SampleStatus:
         if number := int(np.count_nonzero(status & bit)):
             counts[str(bit.name)] = counts.get(str(bit.name), 0) + number
-
-
-def _trackable(observer: Observer, name: str) -> bool:
-    try:
-        PhaseLockedLoop(observer, name, 1)
-    except ConfigError:
-        return False
-    return True

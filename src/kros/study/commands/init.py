@@ -6,7 +6,6 @@ import logging
 import os
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +14,16 @@ from ...core.files import parse_toml
 from ...core.work import Progress, Work
 from ...data import Population, Role
 from ...data.checks import check_population
-from ...data.discovery.discover import Ask, Discovery, Wanted, discover
+from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
-from ...data.readers.opening import LOOKS, detect_reader
+from ...data.readers.opening import detect_reader
 from ...data.recording import some
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibration import calibrate
 from ...identify.periodic import PeriodicTerm, periodic_term
 from ...identify.presets import HARMONIC_DRIVE
-from ..config import StudyConfig, validate_config
+from ..config import validate_config
 from ..stages.read import FEWEST, open_source
 from .study_text import LiftingProposal, study_text
 
@@ -34,17 +33,8 @@ _UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty 
 NO_LOAD = _UNLOADED_WORDS.split()
 
 
-@dataclass(frozen=True)
-class Initialised:
-    """What `kros init` wrote, and what it says."""
-
-    study: Path
-    lines: tuple[str, ...]
-    findings: tuple[str, ...]
-
-
-def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progress: Progress) -> Initialised:
-    """Write a study for a folder of recordings."""
+def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> list[str]:
+    """Write a study for a folder of recordings; return what people read at the terminal."""
     if out.exists():
         raise ConfigError(f"Output {out}: exists; name another file, --out FILE, or remove it.")
     if not source.is_dir():
@@ -53,27 +43,31 @@ def init_study(source: Path, out: Path, wanted: Wanted, ask: Ask | None, progres
     reader, discovery = detect_reader(source), None
     if reader in ("parquet", "motor-drive-raw"):
         if wanted != Wanted():
-            says = f"it {LOOKS[reader]}, which says what channels are"
+            says = f"these are {reader} recordings, which say what channels are"
             raise ConfigError(f"Looking at {source}: {says}; leave out --measured, --input, --files and --period.")
         data: dict[str, Any] = {"source": _source(source, out), "reader": reader}
     else:
-        discovery = discover(source, wanted, ask, work)
+        discovery = discover(source, wanted, work)
         data = {"source": _source(source, out), "reader": "csv", "csv": discovery.mapping}
         data |= {"on_nan": "drop_episode"} if discovery.drop_nan else {}
         data |= {"prepare": list(discovery.prepare)} if discovery.prepare else {}
     folder = out.parent.absolute()
-    unloaded = _unloaded(open_source(validate_config({"data": dict(data)}, folder, str(out))))
+    population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
+    unloaded = _unloaded(population)
     data |= {} if unloaded is None else {"identify_on": unloaded}
-    config = validate_config({"data": dict(data)}, folder, str(out))
-    population, facts, refused = _surveyed(config, work)
-    proposal = LiftingProposal(why="not looked for") if facts is None else propose_lifting(population, facts)
-    findings = [*(discovery.findings if discovery else ()), *(facts.alerts if facts else ())]
-    findings += [f"kros run would refuse this: {refused}"] if refused else []
+    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not looked for")
+    try:
+        check_population(population, allow_single=True)
+        population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
+        findings += facts.alerts
+        proposal = propose_lifting(population, facts)
+    except DataError as error:
+        findings.append(f"kros run would refuse this: {error}")
     text = study_text(source, data, discovery, proposal, findings)
     validate_config(parse_toml(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    return Initialised(out, tuple(_lines(population, discovery, proposal, findings, out)), tuple(findings))
+    return _lines(population, discovery, proposal, findings, out)
 
 
 def _source(source: Path, out: Path) -> str:
@@ -90,17 +84,6 @@ def _unloaded(population: Population) -> str | None:
         return None
     named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD]
     return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
-
-
-def _surveyed(config: StudyConfig, work: Work) -> tuple[Population, RecordingFacts | None, str]:
-    """Open and check the recordings as a study does; return what it would refuse them for in place of the facts."""
-    population = open_source(config)
-    try:
-        check_population(population, allow_single=True)
-        data = config.data
-        return *survey(population, work, identify_on=data.identify_on, on_nan=data.on_nan), ""
-    except DataError as error:
-        return population, None, str(error)
 
 
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
@@ -161,9 +144,8 @@ def _lines(
     functions = "; ".join(proposal.lifting.get("functions", ()))
     lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
     lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
-    if len(findings) > MOST_FINDINGS:
-        more = f"{len(findings) - MOST_FINDINGS} further points, which are written at the start of the study"
-        lines.append(f"looks wrong: {more}")
+    more = len(findings) - MOST_FINDINGS
+    lines += [f"looks wrong: {more} further points, which are written at the start of the study"] if more > 0 else []
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

@@ -11,21 +11,7 @@ from typing import Any
 
 from ...data.discovery.discover import Discovery
 from ...data.discovery.roles import ColumnPart, TableColumn
-
-COMMENTS = {
-    "files": "what a file is: a regular expression on its path with the groups unit, condition, episode and group",
-    "exclude": "left out; the reasons are above",
-    "time": "column of time",
-    "time_scale": "from the column of time to seconds",
-    "timestamp": "time is written as dates and times of day",
-    "sample_period_s": "there is no column of time",
-    "decimal": "decimal comma",
-    "encoding": "of the text",
-    "skip_rows": "lines before the header",
-    "unit_rows": "lines between the header and the numbers",
-    "header": "the first line holds numbers already",
-    "pieces": "episodes that every file is cut into",
-}
+from ...data.readers.csv_mapping import CsvMapping
 
 
 @dataclass(frozen=True)
@@ -76,7 +62,8 @@ def _mapping(discovery: Discovery) -> Iterator[str]:
     for key, value in discovery.mapping.items():
         if key != "channel":
             yield from _comment(discovery.reading) if key == "files" else ()
-            yield _line(key, value, discovery.notes.get(key, COMMENTS.get(key, "")))
+            known = "" if key == "files" else CsvMapping.model_fields[key].description or ""
+            yield _line(key, value, discovery.notes.get(key, known))
     by_name = {c.name: c for c in discovery.columns}
     for channel in discovery.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...core.artifacts import load_artifact, read_json
+from ...core.artifacts import load_artifact
 from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.verdict import judge
 from ..config import Stage
 from ..engine.run_folder import open_finished
+from ..engine.store import METRICS
 from ..pipeline import RunResult
 
 
@@ -31,21 +32,18 @@ def ranking(facts: Facts) -> list[str]:
     if table is None:
         return []
     hidden = table.hidden(facts.measured)
-    names = sorted(table.cells, key=lambda name: table.mean(name, hidden))
-    width, wide = max(map(len, names)), {c: max(12, len(c) + 2) for c in hidden}
-    head = f"{'':<{width}}  " + "".join(f"{c:>{wide[c]}}" for c in hidden)
-    lines = ["observers by mean error on held-out episodes, percent of the largest value:", head]
-    for name in names:
-        cells = [table.cells[name].get(c) for c in hidden]
-        texts = ["–" if c is None else _error(c) for c in cells]
+    rows = [("", list(hidden), "")]
+    for name in sorted(table.cells, key=lambda name: table.mean(name, hidden)):
         mark = "  <- deployed" if name == facts.deployed else ""
-        lines.append(
-            f"{name:<{width}}  " + "".join(f"{t:>{wide[c]}}" for t, c in zip(texts, hidden, strict=True)) + mark
-        )
-    return lines
+        rows.append((name, [_error(table.cells[name].get(channel)) for channel in hidden], mark))
+    width, wide = max(len(name) for name, _, _ in rows), max(12, *(len(c) + 2 for c in hidden))
+    lines = [f"{name:<{width}}  " + "".join(f"{t:>{wide}}" for t in texts) + mark for name, texts, mark in rows]
+    return ["observers by mean error on held-out episodes, percent of the largest value:", *lines]
 
 
-def _error(cell: ErrorCell) -> str:
+def _error(cell: ErrorCell | None) -> str:
+    if cell is None:
+        return "–"
     return "diverged" if cell.mean is None else f"{cell.mean:.4g}"
 
 
@@ -55,8 +53,8 @@ def list_run(run: Path) -> list[str]:
         records = {stage.value: store.record(stage) for stage in Stage}
         done = [f"{name} {record.seconds:.3g} s" for name, record in records.items() if record is not None]
         lines = [f"study {config.name} of {config.data.source}", f"stages done: {', '.join(done) or 'none'}"]
-        if store.is_kept("metrics.json"):
-            result = RunResult(store.folder, read_json(store.path("metrics.json")))
+        if store.path(METRICS).exists():
+            result = RunResult(store.folder, store.metrics())
             return lines + ranking(Facts(result.metrics)) + summary_lines(result)
         if store.record(Stage.SYNTHESIZE) is not None:
             names = load_artifact(store.path("observers"), "observers")[0]["names"]

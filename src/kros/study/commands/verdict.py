@@ -20,35 +20,29 @@ class Verdict(StrEnum):
     FAIL = "FAIL"
 
 
-_ORDER = list(Verdict)
-
-
 def with_verdict(row: dict[str, Any]) -> dict[str, Any]:
     """Return a row of scores with its verdict and the reason in words."""
     verdict = Verdict.PASS if row["status"] == Status.OK else Verdict.UNDECIDED
-    verdict = Verdict.FAIL if row["outlier"] else verdict
-    return row | {"verdict": verdict, "reason": "; ".join(_reasons(row))}
+    return row | {"verdict": Verdict.FAIL if row["outlier"] else verdict, "reason": "; ".join(_reasons(row))}
 
 
-def by_unit(rows: Sequence[dict[str, Any]]) -> dict[str, list[dict[str, Any]]]:
-    """Return the rows of every unit."""
+def by_unit(rows: Sequence[dict[str, Any]]) -> dict[str, tuple[Verdict, list[str]]]:
+    """Return the verdict on every unit, and the reason of every condition."""
     units: dict[str, list[dict[str, Any]]] = {}
     for row in rows:
         units.setdefault(row["unit"], []).append(row)
-    return units
+    return {u: (worst(of), [f"{row['condition']}: {row['reason']}" for row in of]) for u, of in units.items()}
 
 
 def worst(rows: Sequence[dict[str, Any]]) -> Verdict:
     """Return the verdict of rows together: FAIL before UNDECIDED before PASS."""
-    return max((Verdict(row["verdict"]) for row in rows), key=_ORDER.index)
+    return max((Verdict(row["verdict"]) for row in rows), key=list(Verdict).index)
 
 
 def verdict_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return the word and the name of every unit, each followed by an indented line for every condition."""
-    lines = []
-    for unit, of_unit in by_unit(rows).items():
-        lines += [f"{worst(of_unit):<9}  {unit}", *(f"  {row['condition']}: {row['reason']}" for row in of_unit)]
-    return lines
+    units = by_unit(rows).items()
+    return [line for u, (v, reasons) in units for line in (f"{v:<9}  {u}", *(f"  {text}" for text in reasons))]
 
 
 def require_folder(path: Path) -> None:
@@ -59,19 +53,15 @@ def require_folder(path: Path) -> None:
 
 def junit_text(rows: Sequence[dict[str, Any]]) -> str:
     """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
-    units, cases = by_unit(rows), []
-    for unit, of_unit in units.items():
-        tag = {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}.get(worst(of_unit))
-        text = "; ".join(f"{row['condition']}: {row['reason']}" for row in of_unit)
-        inside = "" if tag is None else f"<{tag} type={_quoted(worst(of_unit))} message={_quoted(text)}/>"
-        cases.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
-    counts = {tag: sum(worst(of_unit) is verdict for of_unit in units.values()) for tag, verdict in _COUNTED.items()}
-    numbers = f'tests="{len(units)}" failures="{counts["failures"]}" errors="{counts["errors"]}"'
-    head = f'<testsuite name="kros check" {numbers}>'
-    return "\n".join(['<?xml version="1.0" encoding="UTF-8"?>', head, *cases, "</testsuite>", ""])
-
-
-_COUNTED = {"failures": Verdict.FAIL, "errors": Verdict.UNDECIDED}
+    units, tags = by_unit(rows), {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}
+    counts = {tag: sum(v is verdict for v, _ in units.values()) for verdict, tag in tags.items()}
+    numbers = f'tests="{len(units)}" failures="{counts["failure"]}" errors="{counts["error"]}"'
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<testsuite name="kros check" {numbers}>']
+    for unit, (verdict, reasons) in units.items():
+        message = f"type={_quoted(verdict)} message={_quoted('; '.join(reasons))}"
+        inside = f"<{tags[verdict]} {message}/>" if verdict in tags else ""
+        lines.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
+    return "\n".join([*lines, "</testsuite>", ""])
 
 
 def _quoted(text: str) -> str:

@@ -68,9 +68,8 @@ class DaskExecutor(Executor):
             missing = error if isinstance(error, ImportError) else error.__cause__
             if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
                 raise
-            raise self._error(
-                f"there or on a worker a package is not installed ({missing}); install kros[dask]."
-            ) from error
+            problem = f"there or on a worker a package is not installed ({missing})"
+            raise self._error(f"{problem}; install kros[dask].") from error
 
     def _error(self, text: str) -> KrosError:
         return KrosError(f"Dask scheduler {self._address}: {text}")
@@ -87,10 +86,8 @@ def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> l
         try:
             return [function(task) for task in tasks]
         except FileNotFoundError as error:
-            raise KrosError(
-                f"{worker}: finds no {error.filename}; recordings and run folder must be in a shared folder, the same "
-                "path on every worker."
-            ) from error
+            needed = "recordings and run folder must be in a shared folder, the same path on every worker"
+            raise KrosError(f"{worker}: finds no {error.filename}; {needed}.") from error
 
 
 @contextmanager
@@ -114,16 +111,13 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         from distributed import Client
         from distributed.comm.addressing import get_address_host_port
     except ImportError as error:
-        raise MissingDependencyError(
-            f"--scheduler {address} needs Dask; install it with: pip install 'kros[dask]'."
-        ) from error
+        raise MissingDependencyError(f"--scheduler {address} needs Dask: pip install 'kros[dask]'.") from error
     try:
         get_address_host_port(address)  # a client made with something else goes on trying
         client = Client(address, set_as_default=False)
     except (OSError, ValueError) as error:
-        raise ConfigError(
-            f"--scheduler {address}: no Dask scheduler of this version answers there ({error}); correct the address."
-        ) from error
+        problem = f"no Dask scheduler of this version answers there ({error})"
+        raise ConfigError(f"--scheduler {address}: {problem}; correct the address.") from error
     threads = client.nthreads()
     if not threads:
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any, TypeVar
 
 from ...core.errors import ConfigError, KrosError
-from ...core.work import Executor, keep_freed_memory
+from ...core.work import Executor
 from .cluster import open_dask, single_threaded
 
 T = TypeVar("T")
@@ -38,10 +38,8 @@ def _results(results: Iterator[T]) -> Iterator[T]:
     try:
         yield from results
     except BrokenProcessPool as error:
-        raise KrosError(
-            "A worker process ended: memory ran out, or a script that asks for workers has no "
-            '`if __name__ == "__main__":` around what it does. Run again with fewer workers, or add that line.'
-        ) from error
+        reason = 'memory ran out, or a script that asks for workers has no `if __name__ == "__main__":` in it'
+        raise KrosError(f"A worker process ended: {reason}. Run again with fewer workers, or add that.") from error
 
 
 @contextmanager
@@ -81,8 +79,6 @@ def _begin(pipe: Any) -> None:
     """In a worker: end when the other end of a pipe is closed; the parent handles interrupts from the keyboard."""
     import signal
     from threading import Thread
-
-    keep_freed_memory()
 
     def watch() -> None:
         with suppress(EOFError, OSError):

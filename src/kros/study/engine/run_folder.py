@@ -7,14 +7,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import read_json
+from ...core.artifacts import read_json, write_json
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import TEMPORARY
 from ...core.locks import locked
 from ..config import Stage, StudyConfig, stored_config
-from .store import Store
-
-STUDY = "study.json"
+from .store import STUDY, Store
 
 
 def require_own(out: Path, config: StudyConfig) -> bool:
@@ -27,10 +25,8 @@ def require_own(out: Path, config: StudyConfig) -> bool:
         raise ConfigError(f"Output {out}: is a folder with other content; name a new folder or an earlier run.")
     there, this = _identity(_read_study(out)), _identity(config.dump())
     if there != this:
-        raise ConfigError(
-            f"Output {out}: holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}; "
-            "name another folder, or remove this one if it is not needed any more."
-        )
+        both = f"holds the study {there[0]!r} of {there[1]}, and this is {this[0]!r} of {this[1]}"
+        raise ConfigError(f"Output {out}: {both}; name another folder, or remove this one if it is not needed.")
     return False
 
 
@@ -61,7 +57,7 @@ def open_run(out: Path, config: StudyConfig) -> Iterator[Store]:
             store.tidy()
             try:
                 if fresh:
-                    store.keep(STUDY, config.dump())
+                    write_json(store.path(STUDY), config.dump())
                 yield store
             except (ConfigError, DataError, DimensionError):
                 if fresh and store.record(Stage.READ) is None:

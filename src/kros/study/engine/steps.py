@@ -11,13 +11,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ...core.artifacts import write_json
 from ...core.store import digest_of
 from ...core.work import Results
 from ...data.checks import NonFiniteError
 from ...data.population import EpisodeKey, Population
 from ..config import Stage, StudyConfig
 from .context import Context
-from .store import code_key
+from .store import METRICS, STUDY, code_key
 
 log = logging.getLogger(__name__)
 
@@ -35,48 +36,43 @@ class StageStep:
 def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> None:
     """Run steps up to a stage; what later ones left goes where it does not follow from the study any more."""
     digests = stage_digests(context, steps)
-    stages = [step.stage for step in steps]
-    for step in steps[: stages.index(until) + 1]:
+    for step in steps[: [step.stage for step in steps].index(until) + 1]:
         if step.stage in digests:
-            _run_step(context, step, digests, stages)
-    _outdate(context, digests, stages)
-    context.store.keep("study.json", context.config.dump())
+            _run_step(context, step, digests)
+    _outdate(context, digests)
 
 
-def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
+def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str]) -> None:
     """Run a step, or find it done."""
-    store, digest = context.store, digests[step.stage]
-    artefact, record = store.stored(digest), store.record(step.stage)
-    if artefact is not None:
+    store, digest, progress = context.store, digests[step.stage], context.work.progress
+    if (artefact := store.stored(digest)) is not None:
+        record = store.record(step.stage)
         if record is None or record.digest != digest:
-            _outdate(context, digests, stages)
+            _outdate(context, digests)
         store.add(step.stage, artefact)
-        context.work.progress.finish(step.stage, artefact.seconds, skipped=True)
+        progress.finish(step.stage, artefact.seconds, skipped=True)
         return
     began = time.perf_counter()
-    context.work.progress.start(step.stage, None)
+    progress.start(step.stage, None)
     with store.drafting() as draft:
-        results = Results(store.artefacts.folder, code_key())
+        results = Results(store.artefacts, code_key())
         step.run(replace(context, store=draft, work=replace(context.work, results=results)))
         seconds = time.perf_counter() - began
-        store.discard("metrics.json")
-        _outdate(context, digests, stages)
+        _outdate(context, digests)
+        store.path(METRICS).unlink(missing_ok=True)
         draft.commit(step.stage, digest, seconds, results.used)
-    context.work.progress.finish(step.stage, seconds, skipped=False)
+    progress.finish(step.stage, seconds, skipped=False)
     log.info("%s: %.2f s", step.stage, seconds)
 
 
-def _outdate(context: Context, digests: Mapping[Stage, str], stages: Sequence[Stage]) -> None:
+def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
     """Remove what does not follow from the study any more; the run folder is that of the study as it is now."""
     store, manifest = context.store, context.store.manifest
-    outdated = [stage for stage in stages if stage in manifest and manifest[stage].digest != digests.get(stage)]
-    unwanted = [run for stage in stages if stage not in digests for run in store.runs(stage)]
-    if outdated or unwanted:
-        store.discard("metrics.json")
+    outdated = [stage for stage in Stage if stage in manifest and manifest[stage].digest != digests.get(stage)]
+    if outdated:
+        store.path(METRICS).unlink(missing_ok=True)
         store.drop(*outdated)
-        for run in unwanted:
-            run.remove()
-        store.keep("study.json", context.config.dump())
+    write_json(store.path(STUDY), context.config.dump())
 
 
 def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:

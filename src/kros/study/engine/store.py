@@ -3,7 +3,7 @@
     <run>/manifest.json          which artefact every stage has, with digests of all files
     <run>/store/<digest>/        artefacts, and results of single units; see `core.store`
     <run>/models/ ...            the files of the artefacts, for people and for all that reads a run
-    <run>/<stage>/<name>/        a run that a stage made, with another manifest and the same store
+    <run>/<stage>/<name>/        a run that a stage made, among its files, with another manifest and the same store
 
 A stage writes a draft, which becomes an artefact, which the manifest names. So an interrupted stage leaves nothing that
 counts, and nothing is removed from the run folder that the manifest does not list with the content it has.
@@ -12,6 +12,7 @@ counts, and nothing is removed from the run folder that the manifest does not li
 from __future__ import annotations
 
 import logging
+import shutil
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -20,28 +21,27 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import json_bytes
-from ...core.errors import DataError
-from ...core.files import TEMPORARY, is_file, write_bytes
+from ...core.artifacts import read_json, with_checksum, write_json
+from ...core.errors import ConfigError, DataError
+from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...core.locks import NAME as LOCK
 from ...core.store import (
+    INDEX,
     MANIFEST,
     Artefact,
-    ArtefactStore,
-    Described,
     describe,
     digest_of,
     file_digest,
     place,
     read_manifest,
     recorded_files,
-    remove,
     write_manifest,
 )
 
 log = logging.getLogger(__name__)
 
-STORE, OWN = "store", "run"
+STORE = "store"
+STUDY, METRICS = "study.json", "metrics.json"  # of a run, and of no stage
 
 
 @dataclass(frozen=True)
@@ -53,9 +53,9 @@ class Store:
     shared: Path | None = None
 
     @property
-    def artefacts(self) -> ArtefactStore:
-        """What was computed, for this run or another one that shares its store."""
-        return ArtefactStore(self.shared or self.folder / STORE)
+    def artefacts(self) -> Path:
+        """The folder of what was computed, for this run or another one that shares its store."""
+        return self.shared or self.folder / STORE
 
     @property
     def manifest(self) -> dict[str, Artefact]:
@@ -66,11 +66,6 @@ class Store:
             log.warning("%s", error)
             return {}
 
-    @property
-    def digest(self) -> str:
-        """A digest of all stages of this run."""
-        return digest_of(sorted((str(stage), artefact.digest) for stage, artefact in self.manifest.items()))
-
     def path(self, *parts: str) -> Path:
         """Return where something that earlier stages wrote is read from."""
         return self.folder.joinpath(*parts)
@@ -79,14 +74,9 @@ class Store:
         """Return where the running stage writes something; it will be found at `path` once the stage is done."""
         return (self.place or self.folder).joinpath(*parts)
 
-    def nested(self, stage: str, name: str) -> Store:
-        """Return the run folder of a study that a stage makes inside this one."""
-        return Store(self.path(stage, name), shared=self.artefacts.folder)
-
-    def runs(self, stage: str = "*") -> list[Store]:
-        """Return the runs in the folder of a stage, or all."""
-        inside = sorted(path.parent for path in self.folder.glob(f"{stage}/*/{MANIFEST}"))
-        return [self.nested(*folder.parts[-2:]) for folder in inside if not folder.is_symlink()]
+    def nested(self, *parts: str) -> Store:
+        """Return the run folder of a study that the running stage makes in its draft."""
+        return Store(self.draft(*parts), shared=self.artefacts)
 
     def record(self, stage: str) -> Artefact | None:
         """Return the artefact of a finished stage, or None."""
@@ -101,49 +91,50 @@ class Store:
         name = "/".join(parts)
         return any(f == name or f.startswith(f"{name}/") for f in self.files())
 
+    def metrics(self) -> dict[str, Any]:
+        """Return the metrics of the run."""
+        content = read_json(self.path(METRICS))
+        if not isinstance(content, dict) or not {"study", "units"} <= set(content):
+            raise DataError(f"Run: {self.path(METRICS)} holds no metrics; run the study again.")
+        return content
+
     def verify(self, *stages: str) -> None:
-        """Make sure that what finished stages wrote is as they left it, and the study and its metrics too."""
+        """Make sure that what some finished stages, or all, wrote is as they left it."""
         manifest = read_manifest(self.folder)
-        for stage in (*stages, OWN) if stages else manifest:
-            if stage in manifest:
-                self._verify(stage, manifest[stage])
-
-    def _verify(self, stage: str, artefact: Artefact) -> None:
-        for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
-            reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
-            raise DataError(f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again.")
-        self._verify_runs(artefact)
-
-    def _verify_runs(self, artefact: Artefact) -> None:
-        for name, digest in artefact.runs.items():
-            run = Store(place(self.folder, name))
-            run.verify()
-            if run.digest != digest:
-                raise DataError(f"Run {run.folder}: is missing or another one; run the study again.")
+        for stage in [stage for stage in stages or manifest if stage in manifest]:
+            artefact = manifest[stage]
+            for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
+                reason = "was changed or damaged since" if self.path(name).exists() else "is missing"
+                raise DataError(f"Run: {self.path(name)}, which stage {stage} wrote, {reason}; run the study again.")
 
     def stored(self, digest: str) -> Artefact | None:
-        """Return an artefact that is in the store, whole, as are the runs that were made with it."""
-        artefact = self.artefacts.load(digest)
+        """Return an artefact that is in the store, whole."""
+        folder = self.artefacts / digest
         try:
-            self._verify_runs(artefact or Artefact(digest=""))
-        except DataError:
+            artefact = Artefact.read(folder / INDEX)
+            whole = artefact.digest == digest and all(artefact.matches(folder, name) for name in artefact.files)
+        except (ConfigError, DataError, AttributeError, TypeError):
             return None
-        return artefact
+        return artefact if whole else None
 
     @contextmanager
     def drafting(self) -> Iterator[Store]:
         """Give a store whose drafts are elsewhere until `commit`; what is not committed goes."""
-        with self.artefacts.draft() as draft:
+        with draft_beside(self.artefacts) as draft:
             yield replace(self, place=draft)
 
     def commit(self, stage: str, digest: str, seconds: float, results: Collection[str] = ()) -> None:
-        """Make an artefact of the draft of the running stage, and add it."""
-        draft, runs = self.draft(), {f"{stage}/{run.folder.name}": run.digest for run in self.runs(stage)}
+        """Move the draft of the running stage into the store, in place of one that is not whole, and name it."""
+        draft = self.draft()
         draft.mkdir(exist_ok=True)
         paths = sorted(path for path in draft.rglob("*") if is_file(path))
         files = {path.relative_to(draft).as_posix(): describe(path) for path in paths}
-        artefact = Artefact(digest=digest, seconds=seconds, files=files, runs=runs, results=tuple(sorted(results)))
-        self.artefacts.put(draft, artefact)
+        artefact = Artefact(digest=digest, seconds=seconds, files=files, results=tuple(sorted(results)))
+        write_json(draft / INDEX, with_checksum(artefact.model_dump()))
+        target = self.artefacts / digest
+        if target.exists():
+            target.replace(draft.with_name("earlier"))
+        draft.replace(target)
         self.add(stage, artefact)
 
     def add(self, stage: str, artefact: Artefact) -> None:
@@ -153,14 +144,24 @@ class Store:
             if earlier is not None and earlier.digest != entry.digest:
                 self.drop(stage)
             write_manifest(self.folder, self.manifest | {stage: entry})
-        for name in artefact.files:
-            self.artefacts.link(artefact, name, self.folder)
+        for name in (name for name in artefact.files if not artefact.matches(self.folder, name)):
+            self._link(self.artefacts / artefact.digest / name, place(self.folder, name))
+
+    def _link(self, source: Path, target: Path) -> None:
+        """Put a file of an artefact into the run folder too: the same file where the file system can, else a copy."""
+        beside = self.artefacts / f"{TEMPORARY}link"
+        try:
+            target.parent.mkdir(parents=True, exist_ok=True)
+            link_or_copy(source, beside)
+            beside.replace(target)
+        except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:
+            obstacle = f"{error.filename2 or error.filename} is in the place of a result"
+            raise ConfigError(f"Run folder {self.folder}: {obstacle}; move it away.") from error
 
     def drop(self, *stages: str) -> None:
-        """Forget stages and their files in the run folder that are as written; artefacts and runs inside stay."""
+        """Forget stages and their files in the run folder that are as written; artefacts stay."""
         manifest = self.manifest
-        for stage in stages:
-            artefact = manifest.pop(stage, Artefact(digest=""))
+        for artefact in [manifest.pop(stage) for stage in stages if stage in manifest]:
             for name in artefact.files:
                 if artefact.matches(self.folder, name):
                     self.path(name).unlink()
@@ -171,54 +172,45 @@ class Store:
 
     def remove(self) -> None:
         """Remove a run as far as its manifest lists it, and its folder where nothing else is in it."""
-        for run in self.runs():
-            run.remove()
         self.drop(*self.manifest)
-        self.path(MANIFEST).unlink(missing_ok=True)
-        if self.shared is None:
-            self.artefacts.sweep(())
-            _prune(self.artefacts.folder, self.folder)
-        _prune(self.folder, self.folder.parent)
+        for name in (MANIFEST, STUDY, METRICS):
+            self.path(name).unlink(missing_ok=True)
+        _sweep(self.artefacts, ())
+        for folder in (self.artefacts, self.folder):
+            _prune(folder, self.folder.parent)
 
     def tidy(self) -> None:
         """Remove what a killed process left half done."""
-        for folder in (self.folder, self.artefacts.folder):
-            for path in folder.glob(f"{TEMPORARY}*"):
-                if path.name != LOCK:
-                    remove(path)
+        for path in (*self.folder.glob(f"{TEMPORARY}*"), *self.artefacts.glob(f"{TEMPORARY}*")):
+            if path.name != LOCK:
+                _remove(path)
 
     def sweep(self) -> None:
         """Remove what the run does not use any more from its store."""
-        self.artefacts.sweep(self._named())
+        _sweep(self.artefacts, self._named())
 
     def _named(self) -> set[str]:
         """Digests of all artefacts of this run and of those inside, and of results that they were computed from."""
-        stored = [self.artefacts.load(artefact.digest) for artefact in self.manifest.values()]
-        named = {digest for artefact in stored if artefact for digest in (artefact.digest, *artefact.results)}
-        return named.union(*(run._named() for run in self.runs()))
+        inside = [replace(self, folder=path.parent) for path in self.folder.glob(f"*/*/{MANIFEST}")]
+        digests = {artefact.digest for run in (self, *inside) for artefact in run.manifest.values()}
+        stored = [artefact for artefact in map(self.stored, digests) if artefact is not None]
+        return {digest for artefact in stored for digest in (artefact.digest, *artefact.results)}
 
-    def keep(self, name: str, content: Any) -> None:
-        """Write a file of the run that is of no stage as JSON, where it is not there already."""
-        text, free = json_bytes(content), self.record(OWN) or Artefact(digest="")
-        if self.is_kept(name) and free.files[name][0] == sha256(text).hexdigest():
-            return
-        write_bytes(place(self.folder, name), text)
-        self._write_own(free.files | {name: describe(self.path(name))})
 
-    def is_kept(self, name: str) -> bool:
-        """Tell whether a file of the run that is of no stage is there as it was written."""
-        free = self.record(OWN)
-        return free is not None and name in free.files and free.matches(self.folder, name)
+def _sweep(folder: Path, named: Collection[str]) -> None:
+    """Remove artefacts, results and drafts of a store that are not named."""
+    for path in folder.iterdir() if folder.is_dir() else ():
+        ours = len(path.stem) == sha256().digest_size * 2 or path.name.startswith(TEMPORARY)
+        if ours and path.stem not in named:
+            _remove(path)
 
-    def discard(self, name: str) -> None:
-        """Remove a file of the run that is of no stage."""
-        free = self.record(OWN)
-        if free is not None and name in free.files:
-            self._write_own({n: about for n, about in free.files.items() if n != name})
-        place(self.folder, name).unlink(missing_ok=True)
 
-    def _write_own(self, files: dict[str, Described]) -> None:
-        write_manifest(self.folder, self.manifest | {OWN: Artefact(digest="", files=files)})
+def _remove(path: Path) -> None:
+    """Remove a file or a folder."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _prune(folder: Path, root: Path) -> None:

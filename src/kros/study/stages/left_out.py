@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -25,6 +25,7 @@ from ...data.population import OUTLIERS, Population, split_episodes
 from ...data.survey import RecordingFacts
 from ...design.task import is_robust
 from ...evaluate import next_unit_bound
+from ...evaluate.held_out import HeldOut, Outcome
 from ...evaluate.next_unit import fewest_units
 from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
@@ -34,7 +35,6 @@ from ..engine.context import Context
 from ..engine.steps import StageStep, run_steps
 from ..learning import LEARNING
 from .evaluate import band_hz, estimation, facts_of, outcomes
-from .held_out import HeldOut, Outcome
 from .read import FEWEST
 
 log = logging.getLogger(__name__)
@@ -58,16 +58,10 @@ def check_folds(config: StudyConfig, population: Population) -> None:
 
 def parted(units: Sequence[str], folds: int) -> list[list[str]]:
     """Return the units of every fold."""
-    if folds > len(units):
-        raise ConfigError(
-            f"evaluate.folds = {folds}: there are {len(units)} units to leave out; ask for at most that many folds."
-        )
     parts = [list(units[fold::folds]) for fold in range(folds)]
-    if len(units) - len(parts[0]) < FEWEST:
-        raise ConfigError(
-            f"evaluate.folds = {folds}: leaves {len(units) - len(parts[0])} of {len(units)} units to learn from, and a "
-            f"population needs {FEWEST}; ask for more folds, or record more units."
-        )
+    if folds > len(units) or len(units) - len(parts[0]) < FEWEST:
+        problem = f"of {len(units)} units each fold needs one, and leaves at least {FEWEST} to learn from"
+        raise ConfigError(f"evaluate.folds = {folds}: {problem}; ask for another number, or record more units.")
     return parts
 
 
@@ -75,13 +69,10 @@ def run(context: Context) -> None:
     """Make the study once for every fold, and run the deployed observer on the units in reserve."""
     models, wanted_folds = context.identified.models(), context.config.evaluate.folds
     folds = parted([u for u in context.facts.pooled if u in models.unit_ids], wanted_folds) if wanted_folds else []
-    for surplus in context.store.runs(FOLDER):
-        if surplus.folder.name not in map(str, range(len(folds))):
-            surplus.remove()
     if context.facts.reserve:
         save_artifact(context.store.draft(NEXT), NEXT, next_unit(context))
     if folds:
-        run_folds(context, folds)
+        save_artifact(context.store.draft(FOLDER), KIND, of_folds(context, folds))
 
 
 def results(context: Context) -> dict[str, Any]:
@@ -90,53 +81,43 @@ def results(context: Context) -> dict[str, Any]:
     return {name: load_artifact(context.store.path(name), name)[0] for name, n in parts.items() if n}
 
 
-def run_folds(context: Context, folds: Sequence[Sequence[str]]) -> None:
-    """Make the study once for every fold."""
-    results = [run_fold(context, number, held, len(folds)) for number, held in enumerate(folds)]
-    content = {
+def of_folds(context: Context, folds: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """Make the study once for every fold; return the errors on the units that took no part in it."""
+    results = []
+    context.work.progress.start("left out", len(folds))
+    for number, units in enumerate(folds):
+        results.append(run_fold(context, number, units))
+        context.work.progress.advance()
+    return {
         "folds": folds,
         "errors": "empirical",  # of these units: folds share what they learn from, so nothing follows for the next one
         "failed": {str(number): fold["failed"] for number, fold in enumerate(results) if "failed" in fold},
         "rows": [{"fold": number, **row} for number, fold in enumerate(results) for row in fold.get("rows", [])],
         "observers": facts_of_folds([fold.get("observers", {}) for fold in results]),
     }
-    save_artifact(context.store.draft(FOLDER), KIND, content)
 
 
-def run_fold(whole: Context, number: int, held: Sequence[str], folds: int) -> dict[str, Any]:
+def run_fold(whole: Context, number: int, units: Sequence[str]) -> dict[str, Any]:
     """Make the study without some units, and run its observers on these; return the reason where it fails."""
-    progress = Fold(whole.work.progress, f"{number + 1}/{folds} ")
     store = whole.store.nested(FOLDER, str(number))  # which shares results: factors of the same episodes are the same
-    context = Context(without(whole, held), store, replace(whole.work, progress=progress))
-    steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, held), ()))
+    context = Context(without(whole, units), store, replace(whole.work, progress=Progress()))
+    steps = (*LEARNING, StageStep(Stage.EVALUATE, partial(estimate_held, whole, units), ()))
     try:
         run_steps(context, steps, Stage.EVALUATE)
     except KrosError as error:
-        log.warning("fold %d of %d: %s", number + 1, folds, error)
+        log.warning("fold %d: %s", number + 1, error)
         return {"failed": str(error)}
     return load_artifact(context.store.path("evaluation"), KIND)[0]
 
 
 def without(whole: Context, held: Sequence[str]) -> StudyConfig:
     """Return the study on the prepared recordings of all other units."""
-    config = whole.config
-    prepared = {
-        "source": recordings_path(whole.store.folder).absolute(),
-        "reader": "parquet",
-        "prepare": (),
-        "csv": None,
-    }
-    data = config.data.model_copy(
-        update={**prepared, "identify_on": whole.facts.identify_on, "exclude": (*absent(whole), *held)}
-    )
-    changes: dict[str, Any] = {"data": data}
-    changes["evaluate"] = config.evaluate.model_copy(update={"reserve": 0})
-    return config.model_copy(update=changes)
-
-
-def absent(whole: Context) -> tuple[str, ...]:
-    """Return units that the study itself excludes or reserves, where their recordings are still there."""
-    return tuple(unit for unit in recordings_of(whole.store.folder).unit_ids if unit not in whole.facts.groups)
+    config, source = whole.config, recordings_path(whole.store.folder).absolute()
+    absent = [unit for unit in recordings_of(whole.store.folder).unit_ids if unit not in whole.facts.groups]
+    changes = {"source": source, "reader": "parquet", "prepare": (), "csv": None, "exclude": (*absent, *held)}
+    data = config.data.model_copy(update={**changes, "identify_on": whole.facts.identify_on})
+    evaluate = config.evaluate.model_copy(update={"reserve": 0})
+    return config.model_copy(update={"data": data, "evaluate": evaluate})
 
 
 def estimate_held(whole: Context, held: Sequence[str], context: Context) -> None:
@@ -171,10 +152,10 @@ def next_unit(context: Context) -> dict[str, Any]:
     rows, failed = reserve_rows(context, deployed)
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
-    bounds = {
-        c: bounds_of(_of_condition(rows, c), _of_condition(known, c), hidden, config.confidence)
-        for c in population.conditions
-    }
+    bounds = {}
+    for condition in population.conditions:
+        reserved, pooled = ([r for r in part if r["condition"] == condition] for part in (rows, known))
+        bounds[condition] = bounds_of(reserved, pooled, hidden, config.confidence)
     content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence}
     content |= {"observer": deployed, "jointly": True, "condition": facts.identify_on, **bounds.pop(facts.identify_on)}
     return content | {"others": bounds, "rows": rows, "failed": failed}
@@ -204,27 +185,22 @@ def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]
     return rows + [{**base, "unit": u, "condition": c, "channel": s} for u, c in lost for s in whole.states], failed
 
 
-def _of_condition(rows: Rows, condition: str) -> Rows:
-    return [row for row in rows if row["condition"] == condition]
-
-
 def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: float) -> dict[str, Any]:
     """Bound the next unit's errors in some channels, in percent and in RMS, all together."""
     places = [(c, m) for c in channels for m in _MEASURES]
     scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
     usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
     units, needed = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence)
-    reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
-    bound = None
     if not usable:
-        reason = "the observer has no finite error on the units that it was made from"
-    elif len(units) < needed:
+        return {"bounds": None, "reason": "the observer has no finite error on the units that it was made from"}
+    if len(units) < needed:
         reason = f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"
-    else:
-        errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-        of_units = [[errors[u, c, m] for c, m in usable] for u in units]
-        bound = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
+        return {"bounds": None, "reason": reason}
+    errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
+    of_units = [[errors[u, c, m] for c, m in usable] for u in units]
+    bound = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
     if bound is None or not np.isfinite(bound).all():
+        reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
         return {"bounds": None, "reason": reason}
     values = dict(zip(usable, bound.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
@@ -245,23 +221,3 @@ def facts_of_folds(folds: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict
             "reasons": sorted({str(e[key]) for e in entries for key in ("reason", "relift_reason") if e.get(key)}),
         }
     return facts
-
-
-@dataclass(frozen=True)
-class Fold(Progress):
-    """Tells a progress listener about the stages of a fold."""
-
-    listener: Progress
-    title: str
-
-    def start(self, stage: str, total: int | None) -> None:
-        """A stage of the fold begins."""
-        self.listener.start(self.title + stage, total)
-
-    def advance(self) -> None:
-        """One of its steps is done."""
-        self.listener.advance()
-
-    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
-        """A stage of the fold is done, or was found done."""
-        self.listener.finish(self.title + stage, seconds, skipped)

@@ -20,13 +20,12 @@ from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import ConfigError, KrosError
 from ...data import EpisodeBatch
 from ...data.flat_tops import FoundLimit
-from ...data.population import EpisodeKey
 from ...design.validation import seen_by
 from ...evaluate.sensor import as_arriving
 from ...lifting import Lifting
 from ...motor_drive import AngleLoad
 from ...motor_drive.observer import LoadSettings, load_observer
-from ...motor_drive.signals import TorqueScale, known_load, load_accuracy, low_passed
+from ...motor_drive.signals import TorqueScale, known_load, load_accuracy
 from ...observer import Observer, run_observer
 from ..engine.context import Context
 
@@ -44,6 +43,7 @@ class TrialSettings:
     current: str = "current"  # state that is the current
     level_s: float = 10.0  # time constant of the leak against drift of the load's level
     corner_hz: float = 20.0  # of the known load: what is faster, as vibrations of the gear, does not count
+    judged_hz: float = 5.0  # up to which errors of the load count
     settle_s: float = 2.0  # of an episode, which is not judged
     known: int = 2  # units on which the load is known, where the study names none
     unaware: str = "worst_case_h2"  # method whose observers estimate a load from the recorded current
@@ -76,12 +76,11 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             fact = {"status": "failed", "reason": str(error)}
             log.info("%s could not be made: %s", name, error)
         facts |= {name: fact} if fact else {}
-    content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
     shown = int(np.flatnonzero(trial.loaded)[0])
-    key, truth = trial.test.keys[shown], {"truth": trial.truth[1]}
-    content |= {"corner_hz": 5.0, "settle_s": trial.settings.settle_s, "estimates": list(curves)}
+    key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}
+    content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
+    content |= {"corner_hz": trial.settings.judged_hz, "settle_s": trial.settings.settle_s, "estimates": list(curves)}
     content["shown"] = [key.unit, key.condition, key.episode]
-    arrays = truth | {f"estimate/{name}": values for name, values in curves.items()}
     single = {name: values[:, shown].astype(np.float32) for name, values in arrays.items()}
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
 
@@ -140,46 +139,24 @@ class LoadTrial:
     @classmethod
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
-        facts, config, settings, population = context.facts, context.config.load, TrialSettings(), context.population
+        facts, settings, population = context.facts, TrialSettings(), context.population
         if missing := [name for name in (settings.angle, settings.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
-        phases = context.calibration
-        usable = [u for u in facts.pooled if phases is None or u in phases.units]
-        units = {u: {} if phases is None else {phases.spec.parameter: phases.units[u].phase_rad} for u in usable}
-        loaded = [u for u in usable if facts.keys("train", u, settings.condition)]
-        known = list(config.units) or loaded[: settings.known]
-        others = [u for u in usable if u not in known]
-        judged = any(facts.keys("test", u, settings.condition) for u in others)
-        if not set(known) <= set(usable) or not known or not judged:
-            raise ConfigError(
-                "Load: needs units with a known load and others to judge on, both recorded in condition "
-                f"{settings.condition!r}; known {', '.join(known) or 'none'}, others "
-                f"{', '.join(others[:10]) or 'none'}; see load.units."
-            )
-        free, with_load = facts.identify_on, {(u, settings.condition) for u in known}
-        train = [
-            k for k in facts.train if k.unit in usable and (k.condition == free or (k.unit, k.condition) in with_load)
-        ]
-        test = [k for k in facts.test if k.unit in others and k.condition in (free, settings.condition)]
-
-        def read(keys: list[EpisodeKey]) -> EpisodeBatch:
-            batch = EpisodeBatch.read(population, keys, parameters=units)
-            return batch.head(int(batch.lengths.min()))
-
-        def truth(batch: EpisodeBatch) -> Array:
-            position = batch.states[..., population.states.index(settings.angle)]
-            sizes = float(config.moment or 0.0), config.inertia
-            torque = known_load(position, population.sample_period_s, *sizes, corner_hz=settings.corner_hz)
-            return np.where([k.condition == settings.condition for k in batch.keys], torque, 0.0)
-
-        batches = read(train), read(test)
+        units = context.identified.parameters
+        usable = [u for u in facts.pooled if u in units]
+        known, others = _known(context, settings, usable)
+        free, loaded = facts.identify_on, settings.condition
+        places = {free: usable, loaded: [*known, *(usable if free == loaded else ())]}
+        train = [k for k in facts.train if k.unit in places.get(k.condition, ())]
+        test = [k for k in facts.test if k.unit in others and k.condition in (free, loaded)]
+        batches = (EpisodeBatch.read(population, keys, parameters=units) for keys in (train, test))
+        first, second = (batch.head(int(batch.lengths.min())) for batch in batches)
+        truth = _truth(context, settings, first), _truth(context, settings, second)
         linear = [("linear", Lifting(population.states))]
         liftings = [("koopman", context.lifting), *linear] if context.lifting.functions else linear
-        measured = context.identified.models(context.identified.kinds[0]).measured
-        truths = truth(batches[0]), truth(batches[1])
-        dt = population.sample_period_s
-        return cls(known, population.states, measured, *batches, truths, dt, facts.limits, liftings)
+        measured, dt = context.identified.models(context.identified.kinds[0]).measured, population.sample_period_s
+        return cls(known, population.states, measured, first, second, truth, dt, facts.limits, liftings)
 
     @property
     def places(self) -> tuple[int, int]:
@@ -193,10 +170,30 @@ class LoadTrial:
 
     def row(self, name: str, estimate: Array) -> dict[str, Any]:
         """Return errors of an estimate for the metrics."""
-        settings, loaded = self.settings, self.loaded
-        accuracy = load_accuracy(estimate, self.truth[1], self.dt, skip=round(settings.settle_s / self.dt))
-        fast = estimate - low_passed(estimate, settings.corner_hz, self.dt)
+        settings, skip = self.settings, round(self.settings.settle_s / self.dt)
+        accuracy = load_accuracy(estimate, self.truth[1], self.dt, settings.judged_hz, skip)
         row = {"observer": name} | {name: getattr(accuracy, name) for name in ("load_rms", "floor_rms", "error_rms")}
-        row |= {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
-        rms = {"unloaded": float(np.std(fast[:, ~loaded])), "loaded": float(np.std(fast[:, loaded]))}
-        return row | {"fast_rms": rms}
+        return row | {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
+
+
+def _known(context: Context, settings: TrialSettings, usable: list[str]) -> tuple[list[str], list[str]]:
+    """Return the units on which the load is known, and the others."""
+    facts, condition = context.facts, settings.condition
+    loaded = [u for u in usable if facts.keys("train", u, condition)]
+    known = list(context.config.load.units) or loaded[: settings.known]
+    others = [u for u in usable if u not in known]
+    if not set(known) <= set(usable) or not known or not any(facts.keys("test", u, condition) for u in others):
+        raise ConfigError(
+            f"Load: needs units with a known load and others to judge on, both recorded in condition {condition!r}; "
+            f"known {', '.join(known) or 'none'}, others {', '.join(others[:10]) or 'none'}; see load.units."
+        )
+    return known, others
+
+
+def _truth(context: Context, settings: TrialSettings, batch: EpisodeBatch) -> Array:
+    """Return the load that is declared, on episodes in its condition."""
+    config, population = context.config.load, context.population
+    position = batch.states[..., population.states.index(settings.angle)]
+    sizes = float(config.moment or 0.0), config.inertia
+    torque = known_load(position, population.sample_period_s, *sizes, corner_hz=settings.corner_hz)
+    return np.where([k.condition == settings.condition for k in batch.keys], torque, 0.0)

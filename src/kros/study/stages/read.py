@@ -6,8 +6,7 @@ from ...core.artifacts import save_artifact
 from ...core.errors import ConfigError, DataError
 from ...data import Population, read
 from ...data.population import OUTLIERS
-from ...data.prepare import prepare
-from ...data.steps import parse_steps
+from ...data.prepare import parse_steps, prepare
 from ...data.survey import Copy, check_usable, survey
 from ...evaluate.next_unit import draw_reserve
 from ...identify.presets import resolve_lifting, resolve_phase
@@ -25,21 +24,16 @@ def open_source(config: StudyConfig, given: Population | None = None) -> Populat
     data = config.data
     if given is not None:
         if data.csv is not None:
-            raise ConfigError(
-                "data.csv: maps the columns of CSV files, and the recordings are a population already; leave it out."
-            )
+            raise ConfigError("data.csv: maps columns of CSV files, and there is a population already; leave it out.")
         population = prepare(given, parse_steps(data.prepare))
     elif data.reader == ARRAYS:
-        raise ConfigError(
-            "Study of arrays: they are gone with the program that held them; give the population to kros.run again."
-        )
+        raise ConfigError("Study of arrays: they are not in the run folder; give the population to kros.run again.")
     else:
         population = read(data.source, data.reader, mapping=data.csv, prepare=data.prepare)
     unknown = [unit for unit in data.exclude if unit not in population.unit_ids]
     if unknown:
-        raise ConfigError(
-            f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {', '.join(population.unit_ids)}."
-        )
+        known = ", ".join(population.unit_ids)
+        raise ConfigError(f"data.exclude: the recordings have no unit {', '.join(unknown)}, only {known}.")
     return population.select([u for u in population.unit_ids if u not in data.exclude])
 
 
@@ -49,10 +43,8 @@ def draw(config: StudyConfig, population: Population) -> tuple[str, ...]:
     pooled = [u.id for u in population.units if u.group != OUTLIERS]
     free = [u for u in pooled if u not in named]
     if n and (n > len(free) or len(pooled) - n < FEWEST):
-        raise ConfigError(
-            f"evaluate.reserve = {n}: there are {len(pooled)} units, {len(pooled) - len(free)} named by the study, and "
-            f"a population needs at least {FEWEST}; reserve fewer, or record more units."
-        )
+        there = f"there are {len(pooled)} units, {len(pooled) - len(free)} named by the study"
+        raise ConfigError(f"evaluate.reserve = {n}: {there}, and a population needs {FEWEST}; reserve fewer.")
     return draw_reserve(free, n)
 
 

@@ -6,7 +6,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-from ...core.artifacts import read_json
 from ...core.store import digest_of
 from ...core.work import Progress
 from ..config import Stage
@@ -20,7 +19,7 @@ _SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]
 
 def run(context: Context) -> None:
     """Write report.html from the run folder and the metrics so far."""
-    from ...report import render
+    from ...report.html import render
     from ..metrics import collect_metrics
 
     metrics = collect_metrics(context, Stage.LEFT_OUT)
@@ -29,7 +28,7 @@ def run(context: Context) -> None:
 
 def render_run(folder: Path, workers: int = 1) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
-    from ...report import render
+    from ...report.html import render
 
     began = time.perf_counter()
     with (
@@ -37,7 +36,7 @@ def render_run(folder: Path, workers: int = 1) -> Path:
         store.drafting() as draft,
         open_executor(workers) as executor,
     ):
-        render(store.folder, read_json(store.path("metrics.json")), executor.map, draft.draft(REPORT))
+        render(store.folder, store.metrics(), executor.map, draft.draft(REPORT))
         record = store.record(Stage.REPORT)
         digest = digest_of(REPORT, [artefact.digest for artefact in store.manifest.values()])
         digest, seconds = (record.digest, record.seconds) if record else (digest, time.perf_counter() - began)
@@ -47,7 +46,7 @@ def render_run(folder: Path, workers: int = 1) -> Path:
 
 def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:
     """Write the figures of a finished run as PNG and PDF."""
-    from ... import report
+    from ...report import files
 
     with open_finished(folder, *_SHOWN):
-        return report.write_figures(folder, out, progress)
+        return files.write_figures(folder, out, progress)

@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, SynthesisError
 from ...core.linalg import balancing
-from ...core.lti import StateSpace, dense_response, gain
+from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import kalman, predictor_bound
@@ -237,7 +237,7 @@ class _Scaled:
     def unit_errors(self, K: StateSpace) -> Array:
         """Variance of every state's error on every unit, from the units' own spectra; shape (unit, n)."""
         f, n = self.spectra.shape[1], len(self.A)
-        response = dense_response(self.error_system(K), np.linspace(0, 0.5 / self.dt, f))
+        response = self.error_system(K).frequency_response(np.linspace(0, 0.5 / self.dt, f))
         weight = circle_weights(f)
         drive, rest = response[..., :n], response[..., n:]
         driven = np.einsum("f,fia,ufab,fib->ui", weight, drive, self.spectra, drive.conj(), optimize=True).real

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.lti import StateSpace, dense_response
+from ...core.lti import StateSpace
 from .cover import Cover
 from .proof import Method
 
@@ -32,7 +32,7 @@ class Weight:
 
     def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
         """Return the magnitudes of the diagonals at some frequencies."""
-        left, right = (dense_response(side, freqs_hz) for side in (self.left, self.right))
+        left, right = (side.frequency_response(freqs_hz) for side in (self.left, self.right))
         return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
 
     def scaled(self, factor: float) -> Weight:

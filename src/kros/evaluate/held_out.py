@@ -1,4 +1,4 @@
-"""What observers, baselines and models do on held-out episodes: errors, and trajectories for figures."""
+"""Errors of observers, baselines and models on held-out episodes, disturbed or not, and trajectories for figures."""
 
 from __future__ import annotations
 
@@ -9,23 +9,44 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import KrosError
-from ...data import EpisodeBatch
-from ...data.population import EpisodeKey, Population
-from ...design.baselines import Baseline
-from ...evaluate import TrueErrors, true_errors
-from ...evaluate.errors import ErrorSummary, summarise_all
-from ...evaluate.sensor import as_shown
-from ...identify import ModelSet, free_run
-from ...observer import Observer
-from ...observer.sensor import Sensors
-from ...observer.simulate import run_observers
-from .disturbed import Trial
+from ..data import EpisodeBatch
+from ..data.population import EpisodeKey, Population
+from ..identify import ModelSet, free_run
+from ..observer import Observer
+from ..observer.sensor import Sensors
+from ..observer.simulate import run_observers
+from .disturb import Disturbance, Run, disturbed_errors
+from .errors import ErrorSummary, summarise
+from .sensor import as_shown
+from .truth import TrueErrors, true_errors
 
 Array = npt.NDArray[np.float64]
-Run = Callable[[EpisodeBatch], Iterable[Array]]
 SIDE_BY_SIDE = 32  # episodes
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
+
+
+def observers_run(observers: Sequence[Observer]) -> Run:
+    """Return what runs observers that `alike` puts together, as many at once as fill a memory."""
+
+    def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> Iterator[Array]:
+        count = max(1, _NUMBERS // (y.shape[0] * y.shape[1] * observers[0].lifting.n_states))
+        for start in range(0, len(observers), count):
+            yield run_observers(observers[start : start + count], y, u, observers[0].own(values))
+
+    return run
+
+
+def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
+    """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
+    groups: list[tuple[Any, list[Observer]]] = []
+    for observer in observers:
+        model = observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
+        group = next((g for of, g in groups if len(g) < together and of == model), None)
+        if group is None:
+            groups.append((model, [observer]))
+        else:
+            group.append(observer)
+    return [group for _, group in groups]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,28 +79,14 @@ class HeldOut:
     sensor: Sensors = field(default_factory=dict)
 
     def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
-        """Run observers that `disturbed.alike` puts together."""
-        first = observers[0]
+        """Run observers that `alike` puts together."""
+        return self.estimates(observers_run(observers), observers[0].measured)
 
-        def run(batch: EpisodeBatch) -> Iterator[Array]:
-            y, values = batch.measurements(first.measured), first.own(batch.parameters)
-            count = max(1, _NUMBERS // batch.states.size)  # estimates of all of them may fill a memory
-            groups = (observers[i : i + count] for i in range(0, len(observers), count))
-            return (run_observers(group, y, batch.inputs, values) for group in groups)
-
-        return self.outcomes(run)
-
-    def baseline(
-        self, make: Callable[[], Baseline], limits: tuple[Array, Array], trial: Trial | None = None
-    ) -> Outcome | str:
-        """Make a baseline and run it, on disturbed episodes too; return the reason where it cannot be made."""
-        try:
-            baseline = replace(make(), limits=limits)
-        except KrosError as error:
-            return str(error)
-        (outcome,) = self.outcomes(lambda batch: [baseline.run(batch, batch.parameters)[None]])
-        disturbed = None if trial is None else trial.errors_of_baseline(baseline)
-        return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
+    def estimates(self, run: Run, measured: Sequence[int]) -> list[Outcome]:
+        """Run estimators on what the sensor shows of the measured states."""
+        return self.outcomes(
+            lambda batch: run(batch.keys, batch.measurements(measured), batch.inputs, batch.parameters)
+        )
 
     def models(self, models: ModelSet) -> Outcome:
         """Run every unit's model freely from the true first state, with delays from the first recorded ones."""
@@ -94,11 +101,11 @@ class HeldOut:
         (outcome,) = replace(self, sensor={}).outcomes(run, truths=False)
         return outcome
 
-    def outcomes(self, run: Run, truths: bool = True) -> list[Outcome]:
+    def outcomes(self, run: Callable[[EpisodeBatch], Iterable[Array]], truths: bool = True) -> list[Outcome]:
         """Return the outcomes of estimates, (estimate, n_samples, batch, n or more), some episodes after others."""
         blocks, order = [], list[int]()
         for start in range(0, len(self.keys) or 1, SIDE_BY_SIDE):  # none at all are refused where they are read
-            batch = self._read(self.keys[start : start + SIDE_BY_SIDE], truths)
+            batch = self.read(self.keys[start : start + SIDE_BY_SIDE], truths)
             shown = [i for i in self.shown if start <= i < start + len(batch.keys)]
             order += shown
             rows = [i - start for i in shown]
@@ -106,8 +113,9 @@ class HeldOut:
         places = [order.index(i) for i in self.shown]
         return [Outcome.joined(parts, places) for parts in zip(*blocks, strict=True)]
 
-    def _read(self, keys: Sequence[EpisodeKey], truths: bool) -> EpisodeBatch:
-        batch = EpisodeBatch.read(self.population, keys, parameters=self.parameters, truths=truths)
+    def read(self, keys: Sequence[EpisodeKey], truths: bool = False, samples: int | None = None) -> EpisodeBatch:
+        """Read episodes as the sensor shows them, each at most some samples long."""
+        batch = EpisodeBatch.read(self.population, keys, samples, self.parameters, truths)
         batch = as_shown(batch, self.sensor, self.population.states)
         states = np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
         return replace(batch, states=states)
@@ -115,7 +123,7 @@ class HeldOut:
     def _of_block(self, estimates: Array, batch: EpisodeBatch, rows: Sequence[int]) -> list[Outcome]:
         n, lengths, dt = len(self.population.states), batch.lengths, self.population.sample_period_s
         outcomes = []
-        for summary, estimate in zip(summarise_all(estimates, batch.states, lengths, dt), estimates, strict=True):
+        for summary, estimate in zip(summarise(estimates, batch.states, lengths, dt), estimates, strict=True):
             shown = [estimate[: lengths[i], i, :n].copy() for i in rows]
             outcomes.append(Outcome(summary, shown, self.true(estimate[..., :n], batch)))
         return outcomes
@@ -146,8 +154,6 @@ class HeldOut:
                 row = {"observer": name, "unit": unit, "role": roles[unit], "condition": condition}
                 row |= {"channel": states[j], "rms": summary.rms[places, j].mean()}
                 row["error_percent"] = summary.percent[places, j].mean()
-                for part in ("start", "rest"):
-                    row[f"{part}_error_percent"] = getattr(summary, f"{part}_percent")[places, j].mean()
                 row |= {} if power is None else {"gearbox_band_power": power[places, j].mean()}
                 rows.append(row | _true_entry(outcome.true, places, j))
         return rows
@@ -171,3 +177,23 @@ def _true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) ->
         return {}
     at = true.states.index(state)
     return {f"true_{what}": float(v[episodes, at].mean()) for what, v in vars(true).items() if what != "states"}
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """The first held-out episodes of a few units, on which measurements are disturbed."""
+
+    episodes: HeldOut
+    measured: tuple[int, ...]
+    disturbances: tuple[Disturbance, ...]
+    kind: str  # of the models whose observers run
+    samples: int = 3_000  # of an episode, at most
+
+    def errors(self, run: Run) -> list[Array]:
+        """Return the errors of estimators, each of shape (1 + disturbance, episode, n)."""
+        batch = self.episodes.read(self.episodes.keys, samples=self.samples)
+        return disturbed_errors(batch, self.measured, self.disturbances, run)
+
+    def of_observers(self, observers: Sequence[Observer]) -> list[Array]:
+        """Return the errors of observers that `alike` puts together."""
+        return self.errors(observers_run(observers))

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays
-from kros.study.stages import held_out
-from kros.study.stages.held_out import HeldOut
+from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
+from kros.evaluate import held_out
+from kros.evaluate.held_out import HeldOut
 
 STATES = Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE)
 CHANNELS = (*STATES, Channel("u", Role.INPUT), Channel("v_true", Role.TRUTH, of="v"))
@@ -31,7 +31,7 @@ def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypat
     whole = episodes.outcomes(run)
     monkeypatch.setattr(held_out, "SIDE_BY_SIDE", at_once)
     for found, wanted, share in zip(episodes.outcomes(run), whole, (0.9, 1.2), strict=True):
-        for name in ("rms", "percent", "start_percent", "rest_percent", "spectra", "freqs_hz"):
+        for name in ("rms", "percent", "spectra", "freqs_hz"):
             np.testing.assert_allclose(getattr(found.summary, name), getattr(wanted.summary, name), rtol=1e-12)
         for name in ("states", "rms", "error_percent", "lag_s"):
             np.testing.assert_allclose(getattr(found.true, name), getattr(wanted.true, name), rtol=1e-9)
@@ -42,6 +42,12 @@ def test_outcomes_of_blocks_are_those_of_all_episodes_at_once(at_once, monkeypat
 def test_no_episodes_are_refused_with_a_reason():
     with pytest.raises(DataError, match="no episodes were named; check the split"):
         HeldOut(population_of(1), (), {}).outcomes(run)
+
+
+def test_an_episode_that_is_named_twice_is_refused():
+    population = population_of(1)
+    with pytest.raises(DataError, match=r"episode 0 of unit .* named more than once"):
+        EpisodeBatch.read(population, [population.episodes[0]] * 2)
 
 
 def test_an_episode_that_does_not_exist_is_named():

@@ -18,9 +18,8 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
-from .weights.cover import Cover
+from .weights.cover import Cover, Weight
 from .weights.proof import Method
-from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

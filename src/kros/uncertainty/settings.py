@@ -41,6 +41,7 @@ class FitRule:
     """Fit of diagonal weights and their covers; none of it bears on soundness, which the proof at the end decides."""
 
     points: int = 160  # frequencies of the joint fit: what is missed between them joins it
+    covered: int = 300  # frequencies at which optimal covers are computed, between which they are interpolated
     units: int = 4  # largest residuals of a frequency in cover and fit; the check has all
     temperatures: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003)  # nepers, of smoothed maxima; the last is 0.03 dB
     steps: int = 12  # at most, at each temperature, and of the search of a cover at each of its orders

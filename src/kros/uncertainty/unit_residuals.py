@@ -20,9 +20,8 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
 from .settings import SET
-from .weights.cover import Cover
+from .weights.cover import Cover, Weight
 from .weights.entries import fit_entries
-from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 

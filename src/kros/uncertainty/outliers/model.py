@@ -41,7 +41,7 @@ from .tail import LEAST_SCORES, margins, separate
 Array = npt.NDArray[Any]
 
 _ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
-_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate", "extrapolated")
+_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,6 @@ class OutlierModel:
         Infinity where there are too few units.
     false_alarm_rate : float
         Nominal rate per unit.
-    extrapolated : bool
-        Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone.
 
     Examples
     --------
@@ -85,7 +83,6 @@ class OutlierModel:
     scores: tuple[OutlierScore, ...]
     threshold_db: float
     false_alarm_rate: float
-    extrapolated: bool
 
     def score(
         self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
@@ -132,6 +129,11 @@ class OutlierModel:
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
         levels = scaled_levels(self.form, first, second, self._known, self.freqs_hz)
         return np.asarray(np.median(levels, axis=0) - 10 * np.log10(2.0))
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone."""
+        return self.false_alarm_rate < 1 / (len(self.unit_ids) + 1)
 
     @property
     def n_units(self) -> int:
@@ -235,7 +237,6 @@ def score_outliers(
         scores=comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist()))),
         threshold_db=parts.threshold_db,
         false_alarm_rate=rate,
-        extrapolated=rate < 1 / (len(inliers) + 1),
     )
 
 

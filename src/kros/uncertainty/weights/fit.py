@@ -16,11 +16,10 @@ import numpy.typing as npt
 from ...core.frequency import bilinear_squared, dense_grid
 from ...core.lti import block_diagonal, gain
 from ..settings import FIT, PROOF
-from .cover import Cover, optimal_cover
+from .cover import Cover, Weight, optimal_cover
 from .joint import JointProblem, fit_jointly, refit
 from .proof import Certificate, certify
 from .residuals import Residuals
-from .weight import Weight
 
 Array = npt.NDArray[Any]
 

@@ -166,10 +166,10 @@ def test_batched_and_single_observers_equal_the_equations(injection, order):
 def test_free_runs_start_from_the_first_recorded_samples():
     rng = np.random.default_rng(8)
     channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
-    values = {str(i): rng.normal(size=(length, 4)) for i, length in enumerate((30, 20))}
+    values = [rng.normal(size=(length, 4)) for length in (30, 20)]
     population = from_arrays({"1": {"default": values}}, channels, 0.01)
     batch = EpisodeBatch.read(population, population.episodes)
-    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values["1"][:4, :2])
+    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values[1][:4, :2])
     np.testing.assert_array_equal(batch.first_states(), batch.states[0])
     short = EpisodeBatch.read(population, population.episodes, 3)
     with pytest.raises(DataError, match=r"episode 0 of unit 1 .*: needs 4 samples for delays of up to 3, found 3"):

@@ -227,8 +227,8 @@ def export_c(
     """Write an observer as C99 source with a self-test."""
     from .study.commands.export import export_run
 
-    path = export_run(run_folder, out, name, observer, precision=precision, track=track)
-    _say([f"C source in {path}; start with {path / 'README.md'}"])
+    path, exactness = export_run(run_folder, out, name, observer, precision=precision, track=track)
+    _say([*filter(None, [exactness]), f"C source in {path}; start with {path / 'README.md'}"])
 
 
 @export.command("fmu")
@@ -244,7 +244,8 @@ def export_fmu(
     """Write an observer as a functional mock-up unit for co-simulation."""
     from .study.commands.export import export_run
 
-    _say([f"FMU in {export_run(run_folder, out, name, observer, fmi=fmi, precision=precision, track=track)}"])
+    path, _ = export_run(run_folder, out, name, observer, fmi=fmi, precision=precision, track=track)
+    _say([f"FMU in {path}"])
 
 
 @app.command()

@@ -150,7 +150,7 @@ def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, 
     angle = columns[:-2, 1] + np.degrees(1e-3 * columns[0, 2]) - columns[0, 1]  # what the README says of the offset
     voltage = columns[2:, 3]  # and of the lag
     for precision, close in (("double", 1e-9), ("float", 1e-4)):
-        source = export_run(study.folder, tmp_path / precision, "motor", precision=precision)
+        source, _ = export_run(study.folder, tmp_path / precision, "motor", precision=precision)
         compiled = CompiledObserver.build(source)
         assert compiled.selftest() == 0
         estimates = compiled.run(angle[:, None], voltage[:, None])[0]
@@ -161,7 +161,7 @@ def test_generated_code_and_estimates_are_in_the_units_of_the_recordings(found, 
         assert "| angle | deg | added: mean of current - angle" in (source / "README.md").read_text()
         manifest = json.loads((source / "manifest.json").read_text())
         assert manifest["units_of_measure"] == {"current": "0.001 A", "angle": "deg", "voltage": "V"}
-    with zipfile.ZipFile(export_run(study.folder, tmp_path / "motor.fmu", "motor", fmi=3)) as archive:
+    with zipfile.ZipFile(export_run(study.folder, tmp_path / "motor.fmu", "motor", fmi=3)[0]) as archive:
         model = ET.fromstring(archive.read("modelDescription.xml"))
     units = {v.get("name"): v.get("unit") for v in model.find("ModelVariables") or ()}
     assert {name: unit for name, unit in units.items() if name != "time"} == {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import re
 import shlex
 import shutil
@@ -44,10 +45,9 @@ def test_the_tutorial_from_csv_to_a_board(kros, tmp_path, monkeypatch: pytest.Mo
             assert ran.returncode == 0, f"{text}: {ran.stdout}{ran.stderr}"
         done.append(" ".join([name, *arguments][:2]))
     assert done[:6] == ["kros init", "kros run", "kros list", "kros estimate", "kros check", "kros export"]
-    assert (
-        Path("estimates.csv").read_text().splitlines()[0]
-        == "unit,condition,episode,k,position_hat,velocity_hat,current_hat"
-    )
+    with Path("estimates.csv").open(newline="") as file:
+        names = next(csv.reader(file))
+    assert names == ["unit", "condition", "episode", "k", "position_hat", "velocity_hat", "current_hat"]
     for path in ("runs/study/report.html", "axis/axis.c", "axis/axis.h", "axis/README.md", "axis/example_main.c"):
         assert Path(path).is_file()
     called = set(re.findall(r"\baxis_\w+(?=\()", PAGE.read_text(encoding="utf-8")))

@@ -5,7 +5,7 @@ import pytest
 
 from kros.core.errors import ConfigError, DataError, DimensionError, IdentificationError
 from kros.core.lti import StateSpace
-from kros.data import Channel, EpisodeBatch, Role, from_arrays
+from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
 from kros.identify import combine, edmd, free_run
 from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation, require_independent
 from kros.lifting import Lifting
@@ -166,10 +166,11 @@ def test_batched_and_single_observers_equal_the_equations(injection, order):
 def test_free_runs_start_from_the_first_recorded_samples():
     rng = np.random.default_rng(8)
     channels = [Channel(n, Role.STATE, "", True) for n in STATES] + [Channel(n, Role.INPUT) for n in INPUTS]
-    values = [rng.normal(size=(length, 4)) for length in (30, 20)]
-    population = from_arrays({"1": {"default": values}}, channels, 0.01)
+    values = {str(i): rng.normal(size=(length, 4)) for i, length in enumerate((30, 20))}
+    episodes = {EpisodeKey("1", "default", name): signals for name, signals in values.items()}
+    population = from_arrays(episodes, channels, 0.01)
     batch = EpisodeBatch.read(population, population.episodes)
-    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values[1][:4, :2])
+    np.testing.assert_array_equal(batch.first_states(DELAYED.history)[1], values["1"][:4, :2])
     np.testing.assert_array_equal(batch.first_states(), batch.states[0])
     short = EpisodeBatch.read(population, population.episodes, 3)
     with pytest.raises(DataError, match=r"episode 0 of unit 1 .*: needs 4 samples for delays of up to 3, found 3"):

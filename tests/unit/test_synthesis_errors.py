@@ -47,7 +47,7 @@ def problem(**changes):
         ({"dt": -1.0}, "not negative"),
         ({"dt": np.nan}, "found nan"),
         ({"dt": None}, "found None"),
-        ({"A": [[1j]]}, "A should be a matrix of real numbers, found complex"),
+        ({"A": [[1j]]}, "A should be a matrix of real numbers, found list: complex numbers"),
         ({"A": "fast"}, "A should be a matrix of real numbers, found str"),
         ({"n_w1": 3}, "n_w1 = 3 should lie between 0 and 2"),
         ({"n_z1": -1}, "n_z1 = -1"),

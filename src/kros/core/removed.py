@@ -57,7 +57,7 @@ response data, with from_control for transfer functions and uncertainty_to_contr
     kros.interop: quantify_models
 Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
     kros.uncertainty: VariationAndNoise variation_and_noise
-The numerical error of generated code is no longer part of kros; use CompiledObserver, which runs it on recordings.
+The numerical error of generated code is no longer an object; kros export c prints it.
     kros.export: HeldOut
 Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
     kros.observer: track_parameter Tracked

@@ -64,11 +64,12 @@ class Realised:
         if turn is None:
             return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, start, _into(observer))
         turned = in_coordinates(observer, turn)
-        first, own = len(observer.recorded), turned.A.copy()
-        measured = list(observer.measured)
+        own, measured = turned.A.copy(), list(observer.measured)
         A = turn @ A @ np.linalg.inv(turn)  # leaves the measured columns apart from the others
-        block = np.abs(own[first:n, first:n])
-        own[first:n, first:n][block < RULE.negligible * block.max()] = 0.0
+        for part in _parts(observer):
+            block = own[part, part]
+            if np.count_nonzero(turn[part, part]) > len(block):  # of modes, others have no rounding
+                block[np.abs(block) < RULE.negligible * np.abs(block).max()] = 0.0
         model = np.hstack([own[:n], turned.B[:n]])
         model[:, measured] = A[:n, measured]
         turned = replace(turned, A=own)
@@ -105,22 +106,32 @@ def to_modes(observer: Observer) -> Array | None:
     """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted); None without a bank."""
     if observer.bank is None:
         return None
-    n, first, last = observer.lifting.n_states, len(observer.recorded), len(observer.recorded) + observer.bank.filters
-    turn = np.eye(observer.lifting.n_lifted)
-    for begin, end in ((first, last), (last, n - first)):
-        turn[begin:end, begin:end] = _modes(observer.A[begin:end, begin:end])
+    from scipy.linalg import matrix_balance
+
+    n, turn = observer.lifting.n_states, np.eye(observer.lifting.n_lifted)
+    _, (scale, _) = matrix_balance(observer.A[:n, :n], permute=False, separate=True)
+    for part in _parts(observer):
+        turn[part, part] = _modes(observer.A[part, part], scale[part])
     return turn
 
 
-def _modes(A: Array) -> Array:
-    """Return the coordinates of the modes of a matrix; the identity where their vectors are nearly alike."""
+def _parts(observer: Observer) -> tuple[slice, slice]:
+    """Return the filters of a bank, and those of inputs alone."""
+    assert observer.bank is not None
+    n, first, last = observer.lifting.n_states, len(observer.recorded), len(observer.recorded) + observer.bank.filters
+    return slice(first, last), slice(last, n - first)
+
+
+def _modes(A: Array, scale: Array) -> Array:
+    """Return the coordinates of the modes of a matrix, or states over their scale where vectors are nearly alike."""
+    A = A / scale[:, None] * scale
     values, vectors = np.linalg.eig(A)
     upper = [i for i, v in enumerate(values) if v.imag >= 0]
     parts = [[vectors[:, i].real, vectors[:, i].imag][: 1 + bool(values[i].imag)] for i in upper]
     basis = np.array([part for pair in parts for part in pair]).T
     if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > RULE.alike:
-        return np.eye(len(A))
-    return np.asarray(np.linalg.inv(basis))
+        return np.diag(1 / scale)
+    return np.asarray(np.linalg.inv(basis) / scale)
 
 
 def in_coordinates(observer: Observer, turn: Array) -> Observer:

@@ -2,19 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import replace
 from pathlib import Path
 
-from ...core.artifacts import load_artifact, write_json
-from ...core.errors import ConfigError
-from ...core.files import did_you_mean
-from ...data.survey import RecordingFacts
-from ...export import LoadOutput, export_c, export_fmu
-from ...observer import Observer
-from ..config import Stage
-from ..engine.run_folder import open_finished
-from ..stages.load import TrialSettings
+import numpy as np
 
+from ...core.artifacts import load_artifact, write_json
+from ...core.errors import ConfigError, KrosError
+from ...core.files import did_you_mean
+from ...data import EpisodeBatch
+from ...data.survey import RecordingFacts
+from ...evaluate.sensor import as_arriving
+from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
+from ...loops.compiler import find_compiler
+from ...observer import Observer, run_observer
+from ...observer.units import recorded_factors
+from ..config import Stage, StudyConfig
+from ..engine.run_folder import open_finished
+from ..engine.store import Store
+from ..stages.load import TrialSettings
+from ..stages.read import open_source
+from .field import load_calibration
+
+LARGEST = 20_000  # samples of the recording that generated code is compared on
+TOO_COARSE = 1.0  # percent of the largest estimate: generated code that differs by more is warned of
+
+log = logging.getLogger(__name__)
 DEPLOYED, LOAD = "deployed", "load"
 
 
@@ -27,8 +41,11 @@ def export_run(
     fmi: int | None = None,
     precision: str = "double",
     track: str | None = None,
-) -> Path:
-    """Write one of a run's observers as C source, or as an FMU of a version; `name` is the study's by default."""
+) -> tuple[Path, str]:
+    """Write one of a run's observers as C source, or as an FMU of a version, and say how exact the source is.
+
+    `name` is the study's by default.
+    """
     with open_finished(run, Stage.READ, Stage.CALIBRATE, Stage.SYNTHESIZE) as (config, store):
         names = (DEPLOYED, *load_artifact(store.path("observers"), "observers")[0]["names"])
         places = {name: store.path("observers", f"{name}.json") for name in names}
@@ -45,13 +62,49 @@ def export_run(
             about = Observer.load(places[DEPLOYED]).about
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
-            return export_fmu(chosen, out, fmi, name, precision, track)
+            return export_fmu(chosen, out, fmi, name, precision, track), ""
         settings, facts = TrialSettings(), RecordingFacts.load(store.path("population"))
         level = settings.level(chosen.sample_period_s, facts.limits)
         load = LoadOutput(level, current=settings.current) if observer in loads else None
         folder = export_c(chosen, out, name, precision, track, load)
         write_json(folder / "study.json", config.dump())
-        return folder
+        return folder, "" if track else exactness(folder, chosen, config, store)
+
+
+def exactness(folder: Path, observer: Observer, config: StudyConfig, store: Store) -> str:
+    """Return in words how far generated code is from Python on a held-out episode; refuse code that fails its test."""
+    if find_compiler() is None:
+        return "not compared with Python: there is no C compiler"
+    compiled = CompiledObserver.build(folder)
+    if sample := compiled.selftest():
+        raise ConfigError(f"Export: the self-test of {folder} fails at sample {sample}; do not use it, and report it.")
+    try:
+        batch = held_out_episode(config, store)
+    except KrosError as error:
+        return f"not compared with Python, since the run's recordings cannot be read: {error}"
+    arriving = as_arriving(batch, observer.sensor, observer.recorded[: batch.states.shape[-1]])
+    y = arriving.measurements(observer.measured)
+    parameters = observer.own(batch.parameters)
+    wanted = run_observer(observer, y, batch.inputs, parameters)[1:, 0, : len(observer.recorded)]
+    measured = [observer.lifting.states[i] for i in observer.measured]
+    of_y, of_u, of_x = (recorded_factors(observer, n) for n in (measured, observer.inputs, observer.recorded))
+    values = {name: float(np.ravel(value)[0]) for name, value in parameters.items()}
+    estimates, _ = compiled.run(y[:, 0] / of_y, batch.inputs[:, 0] / of_u, values)
+    apart = 100 * np.abs(estimates[:-1] * of_x - wanted).max(axis=0) / np.abs(wanted).max(axis=0)
+    differences = ", ".join(f"{name} {value:.1g} %" for name, value in zip(observer.recorded, apart, strict=True))
+    if not (apart <= TOO_COARSE).all():
+        log.warning("single precision is too coarse for this observer; export it in double precision")
+    return f"differs from Python on a held-out episode by at most {differences} of the largest estimate"
+
+
+def held_out_episode(config: StudyConfig, store: Store) -> EpisodeBatch:
+    """Return the first episode that no design knows, as far as code is compared on it."""
+    facts, calibration = RecordingFacts.load(store.path("population")), load_calibration(store)
+    keys = [key for key in facts.test if calibration is None or key.unit in calibration.units]
+    if not keys:
+        raise ConfigError("no episode is held out.")
+    phase = {} if calibration is None else {calibration.spec.parameter: calibration.units[keys[0].unit].phase_rad}
+    return EpisodeBatch.read(open_source(config), keys[:1], LARGEST, {keys[0].unit: phase})
 
 
 def identifier(text: str) -> str:

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from ..core.errors import DataError, DimensionError
 
 Array = npt.NDArray[np.float64]
+_FORGOTTEN = 1e-9  # samples: an age whose square counts as nothing beside any half
 _ARRAYS = ("start", "forget", "half", "recovery", "reach")
 
 
@@ -132,6 +133,9 @@ class Gaps:
 
     def fill(self, x: Array, y: Array, missing: npt.NDArray[np.bool_]) -> None:
         """Put measurements (batch, q) and substitutes of missing ones into states (batch, n); bridge gaps that end."""
+        if not missing.any() and not self.count.any():
+            x[:, self.measured] = y
+            return
         self.held = (x[:, self.fallback] + self.offset)[:, self.measured]
         reach = (1 - self.bank.level(self.age)[:, self.measured]) * self.bank.reach
         near = np.clip(x[:, self.measured] - self.held, -reach, reach)
@@ -152,6 +156,9 @@ class Gaps:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""
         bank, some = self.bank, np.asarray(missing.any(axis=1))
         offset = self.apart(x, np.where(missing, self.held, x[:, self.measured]))
+        if not some.any() and not (self.age > _FORGOTTEN).any():
+            self.offset[moving], self.age[moving], self.count[moving] = offset[moving], 0.0, 0.0
+            return
         count = np.where(missing, self.count + 1, 0.0)
         recovered = np.where(some[:, None], self.age, bank.recovery * self.age)
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))

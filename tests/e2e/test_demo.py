@@ -68,6 +68,7 @@ def test_every_unit_is_evaluated_in_every_condition_with_every_observer(metrics)
         else CHANNELS
         for name in made
     }
+    assert "held-out episode" in metrics["observers"]["mean_profile"]["reason"]  # drives of a demo repeat no motion
     assert len(rows) == len(metrics["evaluation"]) == sum(len(channels) for channels in estimated.values()) * 6 * 2
     assert {(name, channel) for name, _, _, channel in rows} == {
         (name, c) for name, channels in estimated.items() for c in channels

@@ -56,8 +56,10 @@ class Refusing(OpenLoop):
 
 
 def test_a_method_may_have_other_options(uncertain: UncertainModels) -> None:
-    design = kros.synthesize(uncertain, WorstCaseH2(max_order=1), methods=())
+    white = WorstCaseH2(corners=(None,), noises=((0.0, 0.0),), orders=(1,))
+    design = kros.synthesize(uncertain, white, methods=())
     assert design.name == "linear_edmd/worst_case_h2"
+    assert design.facts["input_weight_hz"] is None
     assert 0 < design.lower_bound <= design.facts["worst_case_h2"]  # type: ignore[operator]
     with pytest.raises(ConfigError, match="it is not for these kinds of models"):
         kros.synthesize(uncertain, Refusing(), methods=())

@@ -79,8 +79,6 @@ Report and figures of a run are no longer written by public functions; use kros 
     kros.report: render write_figures
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
-The mean of episodes with the same inputs is no longer part of kros; use learned.
-    observer: baselines=mean_profile
 """
 
 

@@ -35,6 +35,8 @@ class BaselineSettings:
 
     levels: tuple[float, ...] = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of the extended filter's process noise
     extended_samples: int = 2_000  # of an episode, on which these are compared
+    profile_samples: int = 5_000_000  # of the mean profile, at most, once every unit and condition has been read
+    same_motion: float = 0.01  # RMS difference of inputs of the same motion, share of the largest input
 
 
 DEFAULT = BaselineSettings()
@@ -55,6 +57,7 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
+    restarts: bool = True
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
@@ -71,7 +74,12 @@ class Baseline:
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
             estimator, some = self.by_unit[unit], samples.of(rows)
-            part = restarted(estimator, some, values)
+            if isinstance(estimator, ExtendedKalman):
+                part = estimator.run(some.y, some.u, values, some.starts)
+            elif self.restarts:
+                part = restarted(estimator, some, values)
+            else:
+                part = estimator.run(some.y, some.u, values)
             estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
             estimate[:, rows] = part
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
@@ -79,8 +87,6 @@ class Baseline:
 
 def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
     """Run a batch, missing measurements held, every member again from each sample at which it starts again."""
-    if isinstance(estimator, ExtendedKalman):
-        return estimator.run(samples.y, samples.u, parameters, samples.starts)
     n_samples, batch = samples.starts.shape
     estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:

@@ -25,6 +25,7 @@ from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
 from ..observer.sensor import Sensors, require_measured, sides
+from ..synthesis import ObserverProblem
 from ..uncertainty.quantify import UncertainModels
 from .about import about
 from .certificates import certify, in_recorded_units
@@ -125,11 +126,13 @@ def synthesize(
         every = synthesize_all(uncertain, options, compared, regression, sensors, work=work)
         return every.designs[every.deployed]
     kind, chosen = _named(uncertain, method, regression)
-    tasks, work = tasks_of(uncertain, kind, [chosen], sensors), work or Work()
+    beside = [m for m in methods_of(options.methods, regression) if m.assumes_disturbances and m.name != chosen.name]
+    tasks, work = tasks_of(uncertain, kind, [*beside, chosen], sensors), work or Work()
     designs, failed = _designed(tasks, work)
-    for name, reason in failed.items():
-        raise SynthesisError(f"{name} could not be designed: {reason}")
-    return certified(tasks, designs, uncertain.models, work)[tasks[0].name]
+    name = f"{kind}/{chosen.name}"
+    if name in failed:
+        raise SynthesisError(f"{name} could not be designed: {failed[name]}")
+    return certified(tasks, designs, uncertain.models, work)[name]
 
 
 def synthesize_all(
@@ -226,10 +229,18 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
 
 def _designed(tasks: Sequence[DesignTask], work: Work) -> tuple[dict[str, Design], dict[str, str]]:
     """Return designs, and reasons of those that failed; the last methods start first, since they take longest."""
-    results = [*work.map("synthesize", _design, tasks[::-1])][::-1]
-    named = list(zip((task.name for task in tasks), results, strict=True))
-    designs = {name: result for name, result in named if isinstance(result, Design)}
-    return designs, {name: result for name, result in named if isinstance(result, str)}
+    designs: dict[str, Design] = {}
+    failed: dict[str, str] = {}
+    places = {method.name: place for place, method in enumerate(METHODS)}
+    order = sorted(tasks, key=lambda task: -places.get(task.method.name, len(places)))
+    results = dict(zip((task.name for task in order), work.map("synthesize", _design, order), strict=True))
+    for task in tasks:
+        result = results[task.name]
+        if isinstance(result, Design):
+            designs[task.name] = result
+        else:
+            failed[task.name] = result
+    return designs, failed
 
 
 def _design(task: DesignTask) -> Design | str:
@@ -249,7 +260,7 @@ def certified(
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
-    linear = [partial(certificate, task, design) for task, design in pairs]
+    linear = [partial(certificate, task, design, _assumed(task, pairs)) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
     by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
     final = {}
@@ -259,6 +270,12 @@ def certified(
         observer = replace(design.observer, about=about(task, identified, design))
         final[task.name] = replace(design, observer=observer)
     return final
+
+
+def _assumed(task: DesignTask, pairs: Iterable[tuple[DesignTask, Design]]) -> ObserverProblem | None:
+    """Return the set that all observers of a kind of model are certified for, with disturbances that a method chose."""
+    chosen = (d.problem for other, d in pairs if other.models.name == task.models.name and d.problem is not None)
+    return next(chosen, task.problem)
 
 
 def choose_deployed(designs: Sequence[Design], settings: DeploymentSettings | None = None) -> str:

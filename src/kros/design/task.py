@@ -30,6 +30,7 @@ class Method(ABC):
     """One way to an observer; its options are fields."""
 
     name: ClassVar[str]
+    assumes_disturbances: ClassVar[bool] = False  # chooses those that all observers of its models are certified for
 
     def refusal(self, kind: str, kinds: Collection[str]) -> str:
         """Return why the method is not used for one of some kinds of models; empty where it is."""
@@ -54,6 +55,8 @@ class Design:
         What the metrics of a study say.
     certificate : ReliftCertificate or None
         Of the nonlinear observer that is deployed; its `certified` says whether it holds.
+    problem : ObserverProblem or None
+        The uncertain set with the disturbances that the method assumed, where these are its own.
 
     Examples
     --------
@@ -70,6 +73,7 @@ class Design:
     synthesis: Synthesis
     facts: Mapping[str, Any] = field(default_factory=dict)
     certificate: ReliftCertificate | None = None
+    problem: ObserverProblem | None = None
 
     def __repr__(self) -> str:
         percent, known = self.facts.get("hidden_error_percent"), "certified" if self.certified else "not certified"
@@ -144,9 +148,9 @@ class DesignTask:
             sensor=self.sensor,
         )
 
-    def designed(self, synthesis: Synthesis, **facts: Any) -> Design:
+    def designed(self, synthesis: Synthesis, problem: ObserverProblem | None = None, **facts: Any) -> Design:
         """Return the design of a synthesis that corrects the nominal model."""
-        return Design(self.name, self.observer(synthesis), synthesis, facts)
+        return Design(self.name, self.observer(synthesis), synthesis, facts, problem=problem)
 
     @property
     def sensor(self) -> Sensors:

@@ -35,16 +35,16 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
         return None, str(error)
 
 
-def certificate(task: DesignTask, design: Design) -> dict[str, Any]:
+def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
     """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
     facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
     if design.facts.get("rows_fitted_to_single_steps"):
         return facts | {"reason": FITTED}
-    if task.problem is None:
+    if problem is None:
         return facts | {"reason": task.refusal}
-    problem = replace(task.problem, injection=design.synthesis.injection)
+    problem = replace(problem, injection=design.synthesis.injection)
     try:
         errors, mean = error_maps(task, design, problem)
         loop = float(errors.spectral_radius())

@@ -26,6 +26,7 @@ METHODS = {
     "ekf": Method("extended Kalman", "extended Kalman filter", Tone.PURPLE, True),
     "filtered_difference": Method("filtered difference", "low-pass filtered derivative", Tone.GOLD, True),
     "learned": Method("learned", "ridge regression on past samples", Tone.GREEN, True),
+    "mean_profile": Method("mean profile", "mean of the same episode of other units", Tone.GREEN, True),
     "mixed": Method("mixed H2-H∞", "H2-optimal with an H∞ bound", Tone.ORANGE),
     "paper": Method("mixed, entrywise weights", "as published", Tone.ORANGE),
     "worst_case_h2": Method("worst-case H2", "smallest H2 norm over the set of plants", Tone.BLUE),

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
 from typing import Any, ClassVar
 
 import numpy as np
 
-from ... import synthesis  # solvers load when they are used
-from ...core.lti import StateSpace, gain
+from ... import synthesis, uncertainty  # solvers load when they are used
+from ...core.errors import SynthesisError
+from ...core.lti import StateSpace, block_diagonal, gain
 from ...identify.model_set import kind_of
-from ...synthesis import Injection, ObserverProblem
+from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
 from ...uncertainty.weights.entries import EntryWeights, fit_entries
 from ..task import Design, DesignTask, Method
@@ -68,14 +71,77 @@ def as_published(problem: ObserverProblem, weight: StateSpace) -> ObserverProble
 
 
 @dataclass(frozen=True)
+class Disturbances:
+    """What is assumed about the disturbances of a machine."""
+
+    corner: float | None = None  # of the inputs' low-pass spectrum, share of the sampling frequency; None: white inputs
+    process_noise: float = 0.0  # share of every state's range
+    measurement_noise: float = 0.0  # share of every measurement's range, at least
+
+    def of(self, problem: ObserverProblem) -> ObserverProblem:
+        """Return the problem with these disturbances."""
+        noise = np.maximum(problem.noise, self.measurement_noise * np.abs(problem.C) @ problem.output_scale)
+        problem = replace(problem, process_noise=self.process_noise * problem.output_scale, noise=noise)
+        if self.corner is None:
+            return problem
+        pole = np.exp([[-2 * np.pi * self.corner]])
+        lowpass = StateSpace(pole, 1 - pole, pole, 1 - pole, problem.nominal.dt)
+        return replace(problem, W_u=block_diagonal([lowpass] * problem.nominal.n_inputs))
+
+    def facts(self, dt: float) -> dict[str, Any]:
+        """Return them for the metrics."""
+        hz = None if self.corner is None else self.corner / dt
+        noises = {"process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
+        return {"input_weight_hz": hz, **noises}
+
+
+@dataclass(frozen=True)
 class WorstCaseH2(Method):
-    """The least worst-case H2 error over the set, for white inputs and the noise of the measurements."""
+    """Worst-case H2 with the disturbances whose observer does best on training episodes."""
 
     name: ClassVar[str] = "worst_case_h2"
-    max_order: int = 2  # of a shaping filter
-    tolerance_db: float = 3.0  # of the shaping filters: it costs optimality, never validity
+    assumes_disturbances: ClassVar[bool] = True
+    corners: tuple[float | None, ...] = (None, 3e-5, 1e-3, 3e-2)  # see `Disturbances`
+    noises: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))
+    tolerance_db: float = 3.0  # of the shaping filters
+    orders: tuple[int, ...] = (1, 2)  # of the shaping filters; disturbances are compared with the first one
 
     def design(self, task: DesignTask) -> Design:
-        """Design for the average spectrum of the set; no correction where that has the smaller worst case."""
-        options: dict[str, Any] = {"max_order": self.max_order, "tolerance_db": self.tolerance_db}
-        return task.designed(synthesis.worst_case_h2(task.require_problem(), **options))
+        """Choose disturbances, then the order, on training episodes."""
+        problem = task.require_problem()
+        fit = cached(uncertainty.fit_magnitude)
+        solve = partial(synthesis.worst_case_h2, tolerance_db=self.tolerance_db, fit=fit)
+        tried = [Disturbances(corner, *noise) for corner, noise in product(self.corners, self.noises)]
+        rough = [partial(solve, d.of(problem), bounded=False, max_order=self.orders[0]) for d in tried]
+        disturbances = tried[best_design(task, rough)[0]]
+        assumed = disturbances.of(problem)
+        _, best = best_design(task, [partial(solve, assumed, max_order=order) for order in self.orders])
+        return task.designed(best, assumed, **disturbances.facts(problem.nominal.dt))
+
+
+def best_design(task: DesignTask, designs: Sequence[Callable[[], Synthesis]]) -> tuple[int, Synthesis]:
+    """Return which design does best on training episodes, and its synthesis."""
+    solved: dict[int, Synthesis] = {}
+    reason = ""
+    for number, design in enumerate(designs):
+        try:
+            solved[number] = design()
+        except SynthesisError as error:
+            reason = str(error)
+    if not solved:
+        raise SynthesisError(reason)
+    best = list(solved)[task.best([task.observer(one) for one in solved.values()])[0]]
+    return best, solved[best]
+
+
+def cached(fit: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a fit that remembers its results: candidates that differ in noise alone share their shaping filters."""
+    known: dict[Any, Any] = {}
+
+    def fitted(freqs_hz: Any, magnitude: Any, dt: float, **options: Any) -> Any:
+        key = (freqs_hz.tobytes(), magnitude.tobytes(), dt, *sorted(options.items()))
+        if key not in known:
+            known[key] = fit(freqs_hz, magnitude, dt, **options)
+        return known[key]
+
+    return fitted

@@ -15,6 +15,7 @@ from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data.population import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned
+from ...design.mean_profile import make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.task import split_name
 from ...design.validation import TrainingSet
@@ -148,8 +149,9 @@ def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[
     for name in [n for n, m in models.items() if m.lifting.functions or m.lifting.input_functions][:1]:
         noise = measurement_noise(identified, models[name], sensor)
         makers[f"{name}/ekf"] = partial(make_extended, training, models[name], context.uncertain.nominal, noise)
+    profile = partial(make_mean_profile, whole, first.measured, episodes.population, episodes.keys)
     makers["filtered_difference"] = partial(make_difference, training, first.measured)
-    makers["learned"] = partial(make_learned, whole, first.measured)
+    makers |= {"mean_profile": profile, "learned": partial(make_learned, whole, first.measured)}
     return {n: make for n, make in makers.items() if n.split("/")[-1] in context.config.observer.baselines}
 
 

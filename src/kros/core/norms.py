@@ -25,12 +25,13 @@ import numpy.typing as npt
 from .errors import DimensionError, KrosError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
+from .precise import precise_gain, precise_h2_norm
 
 Array = npt.NDArray[Any]
 
 _MAX_ITERATIONS = 60
 _EPSILON = float(np.finfo(float).eps)
-_AGREE = 1e-4  # relative difference of what should be equal, beyond which double precision is not trusted
+_AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
 def as_state_space(system: Any) -> StateSpace:
@@ -92,13 +93,7 @@ def h2_norm(system: Any) -> float:
     Returns
     -------
     float
-        The larger of the values by both Gramians, which rounding makes differ; infinity for an unstable system, and for
-        a continuous one whose `D` is not zero.
-
-    Raises
-    ------
-    KrosError
-        When the two differ so much that rounding decides.
+        Infinity for an unstable system, and for a continuous one whose `D` is not zero.
 
     Examples
     --------
@@ -109,14 +104,22 @@ def h2_norm(system: Any) -> float:
     system = balanced(as_state_space(system))
     if system.dt == 0 and np.any(system.D):
         return float("inf")
+    if _near_the_limit(system):
+        return precise_h2_norm(system)
     if not system.is_stable():
         return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
     dual = float(np.trace(system.B.T @ gramian(system.A.T, system.C.T, system.dt) @ system.B))
     if not abs(squared - dual) <= _AGREE * max(squared, dual):
-        problem = f"its square by both Gramians is {squared} and {dual}, so double precision does not determine it"
-        raise KrosError(f"H2 norm: {problem}; scale states and time, or leave out modes that are much faster.")
-    return float(np.sqrt(max(squared, dual, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
+        return precise_h2_norm(system)
+    return float(np.sqrt(max(squared, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
+
+
+def _near_the_limit(system: StateSpace) -> bool:
+    """Whether rounding, ``eps ||A||``, decides if a pole of a balanced system is stable."""
+    poles = system.poles()
+    distance = np.abs(1 - np.abs(poles)) if system.dt > 0 else np.abs(poles.real)
+    return bool((distance <= 10 * _EPSILON * np.linalg.norm(system.A)).any())
 
 
 def balanced(system: StateSpace) -> StateSpace:
@@ -140,7 +143,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
         Or any object with `A, B, C, D, dt`.
     tol : float
         Relative width of the bracket; the value returned is attained, and the norm is at most ``(1 + tol)`` times
-        larger. Where rounding changes gains by more, a bound of the norm is returned.
+        larger.
 
     Returns
     -------
@@ -161,17 +164,18 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
         return float(np.linalg.norm(system.D, 2)) if system.D.size else 0.0
     continuous = balanced(to_continuous(system) if system.dt > 0 else system)
-    at, lower = _largest(system, first_frequencies(continuous.poles()))
+    known = first_frequencies(continuous.poles())
+    at, lower = _largest(system, known)
     at, lower = max((at, lower), (np.inf, float(np.linalg.norm(continuous.D, 2))), key=lambda pair: pair[1])
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    room = max(tol, error)
+    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
     for _ in range(_MAX_ITERATIONS):
-        peak, best = _largest(system, crossings(continuous, lower * (1 + room)))
+        peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
         before, (at, lower) = lower, max((peak, best), (at, lower), key=lambda pair: pair[1])
         if best <= before * (1 + room):
-            return lower if error <= tol else lower * (1 + error)
+            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
     problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
     raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
 
@@ -192,6 +196,21 @@ def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
     gains = _gains(system, nu)
     best = int(np.argmax(gains)) if gains.size else 0
     return (float(nu[best]), float(gains[best])) if gains.size else (0.0, 0.0)
+
+
+def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
+    nu = np.unique(nu)
+    gains = _gains(system, nu)
+    best = int(np.argmax(gains))
+    at, most, low, high = nu[best], gains[best], nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
+    while high - low > 1e-9 * high:
+        inside = np.linspace(low, high, 12)
+        gains = _gains(system, inside)
+        best = int(np.argmax(gains))
+        at, most = max((inside[best], gains[best]), (at, most), key=lambda pair: pair[1])
+        low, high = inside[max(best - 1, 0)], inside[min(best + 1, 11)]
+    return float(at), float(most)
 
 
 def _in_hz(system: StateSpace, nu: Any) -> Any:

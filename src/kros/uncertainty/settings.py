@@ -46,6 +46,10 @@ class FitRule:
     temperatures: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003)  # nepers, of smoothed maxima; the last is 0.03 dB
     steps: int = 12  # at most, at each temperature, and of the search of a cover at each of its orders
     squarings: tuple[int, ...] = (1, 3, 6)  # s of the orders 2^s + 1 of the smoothed maximum of covers
+    missed_db: float = 0.05  # cost between the points of the fit that brings further ones
+    farthest: float = 1.5  # nepers: largest change of a parameter in a step of the joint fit
+    damping: float = 1e-2  # of its first step at a temperature
+    trials: int = 8  # of a step, each with eight times the damping
     pull: float = 1e-3  # towards the start, nepers: small, and it makes optima unique
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
     rounds: int = 5  # fits, each with the frequencies and units missed by the one before

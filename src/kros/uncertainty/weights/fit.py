@@ -39,11 +39,14 @@ def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[W
     weight = fit.start()
     proof, ratio = fit.proven(weight)
     for _ in range(FIT.rounds):
-        if proof.bound <= FIT.deficit:
+        missed = fit.costly(weight)
+        if proof.bound > FIT.deficit:
+            missed = np.concatenate([missed, fit.checked_hz[_peaks(ratio)], np.atleast_1d(proof.freq_hz)])
+        if not missed.size:
             break
-        weight = fit.again(np.append(fit.checked_hz[_peaks(ratio)], proof.freq_hz))
+        weight = fit.again(missed)
         proof, ratio = fit.proven(weight)
-    else:
+    if proof.bound > FIT.deficit:
         weight = weight.scaled(proof.bound)
         proof, ratio = fit.proven(weight)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
@@ -92,6 +95,13 @@ class _Fit:
         self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)))
         self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db)
         return self._weight()
+
+    def costly(self, weight: Weight) -> Array:
+        """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
+        if not weight.left.D.any():
+            return np.zeros(0)
+        cost = weight.magnitudes(self.freqs_hz).cost_db() - self.optimal.cost_db() - self.fitted.excess_db
+        return np.asarray(self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))])
 
     def again(self, missed_hz: Array) -> Weight:
         """Fit again, with the largest residuals at further frequencies."""

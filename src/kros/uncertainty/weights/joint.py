@@ -10,15 +10,15 @@ one brings an inverse form close to an ill-posed set. The start x_0 are the best
 entry, which linear programs find (`magnitude`). Whole families of weights are within a fraction of a decibel of the
 optimum; the last term makes it unique, so that it follows the residuals continuously, and not their rounding.
 
-Every maximum is smoothed, `T log sum exp(. / T)`, with a falling temperature T, and minimised in a trust region with
-the spread of the gradients, `(sum w g g^T - (sum w g)(sum w g)^T) / T`, as Hessian. Singular values move along their
+Every maximum is smoothed, `T log sum exp(. / T)`, with a falling temperature T; steps are those of Gauss and Newton,
+damped, with the spread of the gradients, `(sum w g g^T - (sum w g)(sum w g)^T) / T`. Singular values move along their
 vectors, `d log sigma = -sum |u_i|^2 d log W_L,i - sum |v_j|^2 d log W_R,j`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import islice
 from typing import Any
 
@@ -93,21 +93,16 @@ def _simplest(known: list[Bound], tolerance_db: float) -> Sections:
 
 def refit(problem: JointProblem, start: Sections) -> JointFit:
     """Return the best sections of the same orders near a start, raised to be sound."""
-    from scipy.optimize import minimize
-
-    first = start.at(start.parameters, problem.ends).parameters
-    state = lru_cache(maxsize=2)(lambda x: _State(problem, start.at(np.frombuffer(x), problem.ends), first))
-    x = first
+    first = start.at(start.parameters, problem.ends)
+    state = _State(problem, first, first.parameters)
     for temperature in FIT.temperatures:
-        x = minimize(
-            lambda x, T=temperature: state(x.tobytes()).value(T),
-            x,
-            jac=True,
-            hess=lambda x, T=temperature: state(x.tobytes()).hessian(T),
-            method="trust-exact",
-            options={"maxiter": FIT.steps, "initial_trust_radius": 3.0},
-        ).x
-    return state(x.tobytes()).fitted()
+        damping = FIT.damping
+        for _ in range(FIT.steps):
+            better = state.step(temperature, damping)
+            if better is None:
+                break
+            state, damping = better
+    return state.fitted()
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,6 +174,18 @@ class _State:
             mean = rows @ weight
             total += terms.price / temperature * ((rows * weight) @ rows.T - np.outer(mean, mean))
         return total
+
+    def step(self, temperature: float, damping: float) -> tuple[_State, float] | None:
+        """Return the state after one damped step and the damping of the next; None where no step is better."""
+        (before, gradient), hessian = self.value(temperature), self.hessian(temperature)
+        for _ in range(FIT.trials):
+            move = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+            move *= min(1.0, FIT.farthest / max(float(np.abs(move).max()), _TINY))
+            trial = replace(self, sections=self.sections.at(self.sections.parameters + move, self.problem.ends))
+            if trial.value(temperature)[0] < before:
+                return trial, max(damping / 4, 1e-6)
+            damping *= 8
+        return None
 
     def fitted(self) -> JointFit:
         """Return the sections, raised to be sound."""

@@ -65,7 +65,11 @@ class MagnitudeRule:
     highest: float = 10.0  # tau of the highest knot: 80 % of Nyquist
     rounds: int = 6  # of programs: frequencies at which n or d vanish between points join them
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist
-    settled: float = 1 - 1e-8  # ratio of steps of Dinkelbach's iteration that ends it
+    settled: float = 1 - 1e-10  # ratio of steps of Dinkelbach's iteration that ends it
+    steps: int = 60  # of the iteration; about twenty are needed
+    largest: float = 1e8  # of an unknown of a program; solutions are at most some thousands
+    exceeded: float = 1e-10  # rounding of rows of size one
+    across: float = 1e-11  # rounding of their changes
     damping: float = 3e-3  # least, of a pair of zeros or poles
     widest: float = 40.0  # y of a pair: two real ones 17 decades apart
     digits: int = 30  # of the arithmetic of roots, which spread over twice as many decades as frequencies

@@ -100,7 +100,7 @@ def model_look(name: str) -> Look:
 
 def method_look(name: str) -> Look:
     """Return how an observer's curves look beside others of the same model: the hue of its method."""
-    styles = {"kalman_tuned": "--", "estimator": "-."}
+    styles = {"kalman_tuned": "--", "mean_profile": ":", "estimator": "-."}
     return Look(method_of(name).tone.light, styles.get(split_observer(name)[1], "-"))
 
 

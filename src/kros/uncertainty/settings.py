@@ -54,6 +54,7 @@ class FitRule:
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
     rounds: int = 5  # fits, each with the frequencies and units missed by the one before
     deficit: float = 1.02  # ratio up to which a weight is lifted; beyond it is fitted again
+    block: int = 200  # units at once: of more, those that decide are fitted, all are checked
 
 
 @dataclass(frozen=True)
@@ -65,11 +66,7 @@ class MagnitudeRule:
     highest: float = 10.0  # tau of the highest knot: 80 % of Nyquist
     rounds: int = 6  # of programs: frequencies at which n or d vanish between points join them
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist
-    settled: float = 1 - 1e-10  # ratio of steps of Dinkelbach's iteration that ends it
-    steps: int = 60  # of the iteration; about twenty are needed
-    largest: float = 1e8  # of an unknown of a program; solutions are at most some thousands
-    exceeded: float = 1e-10  # rounding of rows of size one
-    across: float = 1e-11  # rounding of their changes
+    settled: float = 1 - 1e-8  # ratio of steps of Dinkelbach's iteration that ends it
     damping: float = 3e-3  # least, of a pair of zeros or poles
     widest: float = 40.0  # y of a pair: two real ones 17 decades apart
     digits: int = 30  # of the arithmetic of roots, which spread over twice as many decades as frequencies
@@ -92,6 +89,21 @@ class ProofRule:
 
 
 @dataclass(frozen=True)
+class BandRule:
+    """Energies in bands and their cover, which holds in any case: only its size depends on these numbers."""
+
+    bands: int = 96
+    rounding: float = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
+    at_once: int = 2_000_000  # lags of signals in memory
+    block: int = 2048  # lags whose weights are in memory
+    iterations: int = 60  # at most
+    turns: int = 10  # between looks at whether all bands are done
+    enough: float = 1.002  # ratio to the least multiple that covers, which ends the iteration
+    regular: float = 1e-14  # of the largest eigenvalue: smaller ones are rounding
+    ridge: float = 1e-6  # of the largest energy, in every direction: the iteration needs its square above rounding
+
+
+@dataclass(frozen=True)
 class OutlierRule:
     """Outlier scores: distances, the search for outliers, and when a score decides nothing."""
 
@@ -107,20 +119,28 @@ class OutlierRule:
     largest_db: float = 26.0  # beyond the largest of the others, twenty times as far away, at which a unit has to show
     largest_percent: float = 900.0  # change of gain, ten times as large, at which a unit has to show
     percent: float = 1.0  # change of an entry from which the smallest change that shows is extrapolated
+    changed: int = 12  # units at most, whose entries are changed
     recorded: float = 0.5  # of the middle unit's samples: the variance of an estimate is at most twice the usual one
 
 
 @dataclass(frozen=True)
 class SetRule:
-    """From systems or responses to a set: what a form leaves over, and what is shown."""
+    """From systems or responses to a set: what a form leaves over, grids of continuous systems, and what is shown."""
 
     condition: float = 1e12  # beyond it an inverse form does not rebuild a plant
     exact: float = 1e-9  # relative misfit that is rounding
     warned: float = 0.01  # misfit from which on another form is worth a thought
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
+    points_beyond: int = 15  # from the end of the grid of continuous systems to ten times as far
+    points: int = 1000  # of the default grid of continuous systems
+    units: int = 200  # that are stored for a picture
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
+    nominals: int = 64  # at most, of the mean over pairs of units
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 
-FIT, MAGNITUDE, PROOF, OUTLIER, SET = FitRule(), MagnitudeRule(), ProofRule(), OutlierRule(), SetRule()
+FIT, MAGNITUDE, PROOF, BANDS, OUTLIER, SET = (
+    *(FitRule(), MagnitudeRule(), ProofRule()),
+    *(BandRule(), OutlierRule(), SetRule()),
+)

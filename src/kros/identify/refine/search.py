@@ -122,7 +122,7 @@ class RefineOptions:
     """
 
     # Data of the search
-    horizons: tuple[int, ...] = (80, 320, 1000)  # of the free runs, one after the other; the last one is minimised
+    horizons: tuple[int, ...] = (160, 320, 1000)  # of the free runs, one after the other; the last one is minimised
     segments: int = 24  # stretches of recordings of every unit, spread over its training episodes
     pooled_segments: int = 120  # of all units together, from which the pooled model is sought; it is finished on all
     compared: int = 64  # residuals of a state in a segment, at least: neighbouring errors of a long run say the same

@@ -133,7 +133,7 @@ class Comparison:
     def _changes(self) -> Array:
         """Levels, dB, of residuals between inliers and themselves with one entry changed, shape (p, m, frequency)."""
         G = self.responses[self.inliers]
-        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.nominals, len(G))).round().astype(int))]
+        G = G[np.unique(np.linspace(0, len(G) - 1, min(OUTLIER.changed, len(G))).round().astype(int))]
         levels = np.empty((*G.shape[2:], G.shape[1]))
         for i, j in np.ndindex(*G.shape[2:]):
             changed = G.copy()

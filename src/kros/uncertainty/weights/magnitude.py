@@ -30,8 +30,7 @@ from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from ..settings import MAGNITUDE
-from .programs import Grid
-from .rational import RationalMagnitude
+from .rational import RationalMagnitude, basis
 from .sections import Sections
 
 Array = npt.NDArray[Any]
@@ -158,7 +157,7 @@ def _best(tau: Array, targets: Array, order: int, gamma: float) -> RationalMagni
     """Return the best n / d of one order above the targets, positive on the whole axis, of a ratio below gamma."""
     knots, cuts = np.exp(_bends(tau, np.log(targets), order)), np.zeros(0)
     for _ in range(MAGNITUDE.rounds):
-        best = Grid.of(tau, targets, knots, cuts).best(targets**-0.5, gamma)  # n and d share the slope
+        best = _Grid.of(tau, targets, knots, cuts).best(gamma)
         try:
             zeros = best.not_positive() if best is not None else []
         except KrosError as error:  # multiple roots
@@ -180,6 +179,69 @@ def _bends(tau: Array, log: Array, count: int) -> Array:
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
     share = bend / max(bend[-1], np.finfo(float).tiny) + (middle - middle[0]) / (middle[-1] - middle[0])
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Squared magnitudes f to stay above, with the basis evaluated there."""
+
+    targets: Array  # (n_points,)
+    knots: Array  # (order,)
+    phi: Array  # (n_points, order + 1)
+    edge: Array  # (n_edges, order + 1): rows that keep n and d from falling at DC, Nyquist and cuts
+    nearest: Array  # (n_edges,): grid points next to these
+
+    @classmethod
+    def of(cls, tau: Array, targets: Array, knots: Array, cuts: Array) -> _Grid:
+        """Evaluate the basis on a grid."""
+        phi = basis(tau, knots)
+        nearest = np.concatenate([[0], np.searchsorted(tau, cuts).clip(0, len(tau) - 1), [len(tau) - 1]])
+        edge = MAGNITUDE.edge * phi[nearest] - basis(np.concatenate([[0.0], cuts, [np.inf]]), knots)
+        return cls(targets, knots, phi, edge, nearest)
+
+    def best(self, gamma: float) -> RationalMagnitude | None:
+        """Return the bound of the smallest ratio; None where none is below gamma."""
+        best, scale, settled = None, self.targets**-0.5, False  # n and d share the slope
+        while not settled:
+            solution = self._solved(scale, gamma)
+            if solution is None:
+                break
+            n, d = self.phi @ solution[0], self.phi @ solution[1]
+            if not ((d > 0) & (n > 0)).all():
+                break
+            ratio = n / (self.targets * d)
+            spread = float(ratio.max() / ratio.min())
+            if spread >= gamma * MAGNITUDE.settled:
+                break
+            best, settled = (
+                RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots),
+                spread < MAGNITUDE.exact,
+            )
+            gamma, scale = spread, d
+        return best
+
+    def _solved(self, scale: Array, gamma: float) -> tuple[Array, Array] | None:
+        """Minimise t over (a, b, t); return a and b."""
+        from scipy.optimize import linprog
+
+        d = self.phi / scale[:, None]
+        n = d / self.targets[:, None]
+        edge, size = self.edge / scale[self.nearest, None], self.phi.shape[1]
+        one, none = np.ones((len(n), 1)), np.zeros_like(edge)
+        rows = [np.hstack([n / gamma, -d, -one]), np.hstack([-n, d, 0 * one])]
+        rows.append(np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]))
+        rows.append(np.hstack([none, edge, none[:, :1]]))
+        with np.errstate(all="ignore"):
+            unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
+            table = np.vstack(rows) * unit
+            table /= np.abs(table).max(axis=1, keepdims=True)
+        if not np.isfinite(table).all():  # a basis function that is zero on the grid
+            return None
+        norm = np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]]) * unit
+        cost, zero = np.eye(2 * size + 1)[-1], np.zeros(len(table))
+        exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+        solved = linprog(cost, table, zero, norm[None], [1.0], (None, None), "highs-ds", options=exact)
+        return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
 
 
 def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:

@@ -4,7 +4,7 @@ r"""What a weight promises between grid points: the largest `sigma_max(W_L^-1 E_
 equals gamma exactly where a pencil is singular for an imaginary s. The gain is evaluated at and between its eigenvalues
 until no level higher by more than the margin is met by any unit. Eigenvalues are rounded: the pencil is tried first at
 a level below the peak, where the grid has all crossings, and when it misses one the proof is refused. **Grid**:
-responses alone and refused proofs have the peaks of a dense grid, which proves nothing between its
+responses alone, continuous systems and refused proofs have the peaks of a dense grid, which proves nothing between its
 points.
 
 Residuals, what forms leave out, and their ratios to weights are descriptor systems, `s F x = A x + B u, y = C x + D u`

@@ -89,3 +89,10 @@ def test_wrong_parameters_are_found() -> None:
     assert (
         wrongly_documented(ast.parse("class Add:\n" + docstring + "    a: int\n    b: int = 0\n    d: int = 0\n")) == []
     )
+
+
+def test_what_must_pass_calls_targets_that_exist() -> None:
+    makefile, script = (Path(__file__).parents[2].joinpath(name).read_text() for name in ("Makefile", ".ci/run"))
+    called = re.findall(r"^make (\w+)", script, re.M)
+    assert called
+    assert [name for name in called if not re.search(rf"^{name}:", makefile, re.M)] == []

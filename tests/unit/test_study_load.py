@@ -16,8 +16,7 @@ from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
 from kros.study.stages.load import load_metrics, run_load
 
-# The first two seconds of an episode are not judged.
-POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=4, seconds=6.0, seed=0, loop="soft").simulate().population
+POPULATION = HarmonicDrivePopulation(n_units=2, n_episodes=3, seconds=3.0, seed=0, loop="soft").simulate().population
 
 
 def context(folder: Path, **options: object) -> SimpleNamespace:

@@ -18,9 +18,9 @@ from ..runtime import Runtime
 from .bank import Bank
 from .certificate import outside_percent
 from .channels import FAMILIES, Channels, channels_of
-from .gaps import is_less, with_gaps
+from .gaps import with_gaps
 from .reduction import Filters, reduced
-from .regression import Design, Readout, Recordings
+from .regression import Design, Readout, Recordings, is_less
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]

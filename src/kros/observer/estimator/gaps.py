@@ -11,7 +11,7 @@ from ..filter_bank import FilterBank
 from ..observer import Observer
 from ..simulate import Course
 from ..step import Parameters
-from .regression import Recordings
+from .regression import Recordings, is_less
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
@@ -117,13 +117,6 @@ def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]
     alike = apart.mean(axis=1) <= margin * error
     least = np.where(alike, half[:, None], np.inf).min(axis=0)
     return np.asarray(np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0))
-
-
-def is_less(one: Array, other: Array, margin: float) -> bool:
-    """Whether one is less than the other by so many paired standard errors."""
-    difference = one - other
-    error = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else 0.0
-    return bool(difference.mean() + margin * error < 0)
 
 
 def blended_errors(

@@ -354,6 +354,13 @@ class Readout:
         return {name: total / weight for name, (total, weight) in sums.items()}
 
 
+def is_less(one: Array, other: Array, margin: float) -> bool:
+    """Whether one is less than the other by so many paired standard errors."""
+    difference = one - other
+    error = difference.std(ddof=1) / np.sqrt(len(difference)) if len(difference) > 1 else 0.0
+    return bool(difference.mean() + margin * error < 0)
+
+
 def condition_weights(moments: Moments, whitening: Whitening) -> Array:
     """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")

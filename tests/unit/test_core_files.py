@@ -146,17 +146,13 @@ def test_paths_that_name_no_file(tmp_path: Path, name: str) -> None:
     "content",
     [
         b"a = " + b"[" * 5000,
-        b"a = " + b"[" * 200 + b"]" * 200,
         b"a = " + b"{b = " * 5000,
-        b"[" + b".".join([b"a"] * 100_000) + b"]",
-        b"a" + b".a" * 300_000 + b" = 1",
-        b'"a"' + b' . "b"' * 100 + b" = 1",
         b"a = " + b"9" * 5000,
         b"\xff\xfe",
         b"a = 1\0",
         b"a = 1\na = 2",
     ],
-    ids=range(10),
+    ids=range(6),
 )
 def test_toml_that_cannot_be_used(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "x.toml").write_bytes(content)

@@ -25,7 +25,7 @@ from pydantic_core import to_jsonable_python
 
 from . import limits
 from .errors import DataError, KrosError
-from .files import pass_on_shortage, read_bytes, shortened, write_bytes
+from .files import read_bytes, shortened, write_bytes
 
 T = TypeVar("T")
 SCHEMA = 1
@@ -112,7 +112,6 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
             raise ValueError("a part of it was changed")
         return arrays
     except _DAMAGED as error:
-        pass_on_shortage(error, path)
         problem = f"not a valid archive of arrays ({error or type(error).__name__})"
         raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import stat
 import tempfile
@@ -18,7 +17,6 @@ from . import limits
 from .errors import ConfigError, DataError, KrosError
 
 TEMPORARY = ".kros."  # how names begin of what is beside its place until it is whole
-_NAME = r"""(?:[\w-]+|"[^"\n]*"|'[^'\n]*')"""
 
 
 def is_file(path: Path) -> bool:
@@ -111,33 +109,10 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     """Read a TOML file."""
     content = read_bytes(path, limits.MAX_TOML_BYTES, ConfigError)
     try:
-        return parse_toml(content.decode("utf-8-sig"))
+        return tomllib.loads(content.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
         reason = "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
         raise ConfigError(f"{what} {path}: not a TOML file that can be used ({reason}); correct it.") from error
-
-
-def parse_toml(text: str) -> dict[str, Any]:
-    """Parse TOML; tables deeper than `limits.MAX_TOML_DEPTH` are refused, since everything that walks them recurses."""
-    dots = rf"(?<![\w-]){_NAME}(?:[ \t]*\.[ \t]*{_NAME}){{{limits.MAX_TOML_DEPTH}}}"
-    if re.search(dots, text):  # before parsing, whose time grows with the square of their number
-        raise ValueError(f"a key of more than {limits.MAX_TOML_DEPTH} names")
-    tables = tomllib.loads(text)
-    level: list[Any] = [tables]
-    for _ in range(limits.MAX_TOML_DEPTH):
-        inside = (value for item in level for value in (item.values() if isinstance(item, dict) else item))
-        level = [value for value in inside if isinstance(value, (dict, list))]
-    if level:
-        raise ValueError(f"tables or lists are nested more than {limits.MAX_TOML_DEPTH} deep")
-    return tables
-
-
-def pass_on_shortage(error: BaseException, path: Path) -> None:
-    """Raise a shortage of memory as such, unless a damaged file states a size far beyond what it holds."""
-    if isinstance(error, MemoryError):
-        wanted = [int(digits) for digits in re.findall(r"\d{1,30}", str(error))]
-        if max(wanted, default=0) <= limits.RATIO_FROM_BYTES + limits.MAX_RATIO * path.stat().st_size:
-            raise MemoryError(f"{str(error) or 'no details'}, while {path} was read") from error
 
 
 def shortened(text: str, longest: int = 300) -> str:

@@ -7,11 +7,8 @@ assigns here:
 
 MAX_JSON_BYTES = 1 << 29  # an index of a million episodes takes some 30 MB
 MAX_TOML_BYTES = 1 << 22
-MAX_TOML_DEPTH = 64  # tables within tables
 MAX_ARRAYS_BYTES = 1 << 33  # of one .npz
 MAX_TEXT_BYTES = 1 << 32  # of one recording as text, unpacked
 MAX_LINE_BYTES = 1 << 20  # of the header and of the lines before it
-MAX_RATIO = 100  # unpacked over packed size: numbers as text reach 3 to 30
-RATIO_FROM_BYTES = 1 << 26  # below this much unpacked text the ratio does not matter
 MAX_SAMPLES = 10**8  # of one episode
 MAX_VALUE = 1e50  # of a sample, a time, a sampling period and its inverse: products of six are finite

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from importlib import import_module
 from typing import Any
 
 # A sentence, then indented what it is for: public names ``kros.package.name``, keys ``section.key`` of a study, values
@@ -55,8 +57,6 @@ Bounds of residuals over every nominal are no longer a function; use sigma_max o
 Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions and uncertainty_to_control for the result.
     kros.interop: quantify_models
-Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
-    kros.uncertainty: VariationAndNoise variation_and_noise
 The numerical error of generated code is no longer an object; kros export c prints it.
     kros.export: HeldOut
 Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
@@ -79,6 +79,11 @@ Report and figures of a run are no longer written by public functions; use kros 
     kros.report: render write_figures
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
+Several units in one file are no longer part of kros; write a file for each unit, or use kros.from_frame.
+    unit
+Models are no longer resampled, nor is estimation noise separated from variation between units; compare models of two
+halves of the episodes.
+    kros.identify: ModelSamples bootstrap_edmd episode_weights kros.uncertainty: VariationAndNoise variation_and_noise
 """
 
 
@@ -113,3 +118,15 @@ def refusing(package: str) -> Callable[[str], Any]:
         raise AttributeError(f"module {package!r} has no attribute {name!r}" + (f": {reason}" if reason else ""))
 
     return find
+
+
+def lazy_names(
+    package: str, home: Mapping[str, str], public: Sequence[str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return the ``__getattr__`` and ``__dir__`` of a package whose names are imported on first use (PEP 562)."""
+    unknown = refusing(package)
+
+    def find(name: str) -> Any:
+        return getattr(import_module(f".{home[name]}", package), name) if name in home else unknown(name)
+
+    return find, lambda: sorted({*vars(sys.modules[package]), *public})

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..core.lazy import lazy_names
+from ..core.removed import lazy_names
 
 if TYPE_CHECKING:
     from .control import UncertaintyForControl, from_control, to_control, uncertainty_to_control

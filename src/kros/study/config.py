@@ -11,7 +11,7 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from ..core.errors import ConfigError
-from ..core.files import parse_toml, read_toml, shortened
+from ..core.files import read_toml, shortened
 from ..core.settings import Settings
 from ..design.settings import ObserverSettings, SynthesisSettings
 from ..identify.settings import CalibrationSettings, IdentifySettings, LiftingSettings
@@ -193,7 +193,7 @@ def _apply(raw: dict[str, Any], override: str) -> None:
     if not separator or not key.strip():
         raise ConfigError(f"--set {override!r}: should look like KEY=VALUE, for example identify.alpha=90.")
     try:
-        value = parse_toml(f"value = {text}")["value"]
+        value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         value = text
     except (ValueError, RecursionError) as error:

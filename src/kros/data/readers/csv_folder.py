@@ -21,7 +21,7 @@ from ..checks import check_names
 from ..population import DEFAULT_CONDITION, EpisodeKey, Population, Role, Unit
 from ..prepare import assemble
 from ..recording import Recording, Recordings, some, usable
-from .csv_mapping import Column, CsvMapping, UnitMapping, load_mapping
+from .csv_mapping import Column, CsvMapping, load_mapping
 from .tables import Dialect, file_fields, read_columns
 
 log = logging.getLogger(__name__)
@@ -85,18 +85,17 @@ def read_csv_folder(
         fields = file_fields(path, chosen.dialect)
         if optional and not places:
             chosen = chosen.without(_absent(chosen, fields, optional))
-        for unit in chosen.units:
-            place = _place(path, fields, chosen, unit)
-            for i, key in enumerate(_keys(match, chosen, unit)):
-                if key in places:
-                    twice = f"{key} is in {places[key].path} and in {path}"
-                    raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
-                check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
-                places[key] = replace(place, piece=(i, chosen.pieces))
-            group = match.groupdict().get("group") or ""
-            if groups.setdefault(key.unit, group) != group:
-                both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
-                raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
+        place, named = _place(path, fields, chosen), {name: text for name, text in match.groupdict().items() if text}
+        for i, key in enumerate(_keys(named, chosen.pieces)):
+            if key in places:
+                twice = f"{key} is in {places[key].path} and in {path}"
+                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
+            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
+            places[key] = replace(place, piece=(i, chosen.pieces))
+        group = named.get("group", "")
+        if groups.setdefault(key.unit, group) != group:
+            both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
+            raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
         files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
         sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
@@ -109,21 +108,19 @@ def read_csv_folder(
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
 
 
-def _keys(match: re.Match[str], mapping: CsvMapping, unit: UnitMapping) -> list[EpisodeKey]:
-    """Return the episodes of one unit in a file."""
-    groups = {name: text for name, text in match.groupdict().items() if text}
-    name = f"{groups.get('unit', DEFAULT_UNIT)}{unit.suffix}"
-    condition, episode = groups.get("condition", DEFAULT_CONDITION), groups.get("episode", DEFAULT_EPISODE)
-    endings = [f".{i + 1}" for i in range(mapping.pieces)] if mapping.pieces > 1 else [""]
-    return [EpisodeKey(name, condition, f"{episode}{ending}") for ending in endings]
+def _keys(named: Mapping[str, str], pieces: int) -> list[EpisodeKey]:
+    """Return the episodes in a file, by what its path says."""
+    unit, condition = named.get("unit", DEFAULT_UNIT), named.get("condition", DEFAULT_CONDITION)
+    episode = named.get("episode", DEFAULT_EPISODE)
+    endings = [f".{i + 1}" for i in range(pieces)] if pieces > 1 else [""]
+    return [EpisodeKey(unit, condition, f"{episode}{ending}") for ending in endings]
 
 
 def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -> set[str]:
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
-    columns = {(c.name, mapping.column(c, unit)) for c in spared for unit in mapping.units}
-    numbers = range(1, len(fields) + 1)
-    absent = {name for name, column in columns if column not in (numbers if isinstance(column, int) else fields)}
+    known = {*fields, *range(1, len(fields) + 1)}
+    absent = {c.name for c in spared if c.place not in known}
     return absent | {c.name for c in mapping.channel if c.truth_of in absent}
 
 
@@ -153,10 +150,10 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
-    """Return where the channels of a unit are in a file."""
+def _place(path: Path, fields: list[str], mapping: CsvMapping) -> FilePlace:
+    """Return where the channels are in a file."""
     wanted = [] if mapping.time is None else [mapping.time]
-    wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
+    wanted += [channel.place for channel in mapping.ordered]
     names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that are not needed
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False))
     if mapping.header and numbered:

@@ -33,16 +33,14 @@ class ChannelMapping(Settings):
     truth_of: str = Field("", alias="of", description="for the role `truth`: the state that it is the truth of")
 
     @property
+    def place(self) -> Column:
+        """Where it is read from."""
+        return self.name if self.column is None else self.column
+
+    @property
     def declared(self) -> Channel:
         """The channel of the population."""
         return Channel(self.name, self.role, self.unit, self.measured, self.truth_of)
-
-
-class UnitMapping(Settings):
-    """``[[unit]]``: one of several units in the same file."""
-
-    suffix: str = Field("", description="appended to the unit's id from the path")
-    columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
 class CsvMapping(Settings):
@@ -56,7 +54,6 @@ class CsvMapping(Settings):
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
-    unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
     time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
     exclude: str | None = Field(None, description="regular expression; paths in which it occurs are left out")
@@ -107,23 +104,13 @@ class CsvMapping(Settings):
             wanted = "two different characters of ASCII that stand in no number otherwise"
             actual = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
             raise ValueError(f"delimiter and decimal should be {wanted}, found {actual}")
-        names = [c.name for c in self.channel]
-        if not names:
+        if not self.channel:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")
-        for unit in self.units:
-            if unknown := sorted(set(unit.columns) - set(names)):
-                gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
-                raise ValueError(f"{gives}; the channels are {names}")
-        columns = (self.time, *(self.column(c, u) for u in self.units for c in self.channel))
+        columns = (self.time, *(c.place for c in self.channel))
         named = next((column for column in columns if isinstance(column, str)), None)
         if named is not None and not self.header:
             raise ValueError(f"header = false leaves columns without names, found {named!r}; give its number from 1")
         return self
-
-    @property
-    def units(self) -> tuple[UnitMapping, ...]:
-        """The units of one file; one without a suffix where none is declared."""
-        return self.unit or (UnitMapping(),)
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
@@ -144,28 +131,18 @@ class CsvMapping(Settings):
     @property
     def scaling(self) -> dict[str, Scaling]:
         """Columns of the channels, before any step."""
-        columns = {c.name: {self.column(c, unit) for unit in self.units} for c in self.channel}
-        return {name: Scaling(next(iter(of)) if len(of) == 1 else None) for name, of in columns.items()}
+        return {c.name: Scaling(c.place) for c in self.channel}
 
     @property
     def dialect(self) -> Dialect:
         """How its files are written."""
         return Dialect(self.delimiter, self.header, self.skip_rows, self.decimal, self.encoding, self.unit_rows)
 
-    def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
-        """Return where a channel of a unit is read from."""
-        return unit.columns.get(channel.name, channel.name if channel.column is None else channel.column)
-
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
-        columns = [{name: c for name, c in u.columns.items() if name not in names} for u in self.unit]
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
-        retained = {
-            "channel": tuple(c for c in self.channel if c.name not in names),
-            "unit": tuple(u.model_copy(update={"columns": c}) for u, c in zip(self.unit, columns, strict=True)),
-            "prepare": tuple(step for step in steps if step is not None),
-        }
-        return self.model_copy(update=retained)
+        channels = tuple(c for c in self.channel if c.name not in names)
+        return self.model_copy(update={"channel": channels, "prepare": tuple(step for step in steps if step)})
 
 
 def _is_mark(text: str) -> bool:

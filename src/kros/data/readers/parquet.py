@@ -31,7 +31,7 @@ from pydantic import TypeAdapter
 from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
-from ...core.files import pass_on_shortage, require_regular, shortened, whole_folder
+from ...core.files import require_regular, shortened, whole_folder
 from ..checks import check_structure, refuse_copies, usable_episodes
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
@@ -49,7 +49,7 @@ AGAIN = "convert the recordings again"
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
 # Signals as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s per 91 MB; zstd: 55 %, 0.08 s.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
-_ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError)
+_ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError)
 _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 
 
@@ -126,7 +126,6 @@ class _Group:
         except DataError:
             raise
         except _ARROW_ERRORS as error:
-            pass_on_shortage(error, self.path)
             raise DataError(f"Reading {self.key} from {self.path}: {shortened(str(error))}; {AGAIN}.") from error
 
     def _tables(self, columns: list[str], rows: int | None) -> Iterator[Any]:

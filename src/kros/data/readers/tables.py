@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError
-from ...core.files import pass_on_shortage, require_regular, shortened
+from ...core.files import require_regular, shortened
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -76,8 +76,7 @@ def read_columns(
         return np.array([*first, *map(to_numpy, columns)]).reshape(len(wanted), table.num_rows)
     except DataError:
         raise
-    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
-        pass_on_shortage(error, path)
+    except (pa.ArrowException, OSError, ValueError, LookupError) as error:
         raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file, or the mapping.") from error
 
 
@@ -145,8 +144,7 @@ class LimitedFile:
 
     def __init__(self, file: IO[bytes], path: Path) -> None:
         self._file, self._path = file, path
-        self._given, self._size = 0, path.stat().st_size
-        self.closed = False
+        self._given, self.closed = 0, False
 
     def read(self, size: int = -1) -> bytes:
         """Return the next bytes."""
@@ -172,12 +170,9 @@ class LimitedFile:
 
     def _counted(self, content: bytes) -> bytes:
         self._given += len(content)
-        limit = min(limits.MAX_TEXT_BYTES, max(limits.RATIO_FROM_BYTES, limits.MAX_RATIO * self._size))
-        if self._given > limit:
-            advice = "split or unpack it, or raise MAX_TEXT_BYTES or MAX_RATIO in kros.core.limits"
-            ratio = limit / max(self._size, 1)
-            problem = f"unpacks to more than {limit} bytes, {ratio:.3g} times its {self._size} bytes"
-            raise DataError(f"Reading {self._path}: {problem}; {advice}.")
+        if self._given > limits.MAX_TEXT_BYTES:
+            advice = "split it, or raise MAX_TEXT_BYTES in kros.core.limits"
+            raise DataError(f"Reading {self._path}: unpacks to more than {limits.MAX_TEXT_BYTES} bytes; {advice}.")
         return content
 
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import re
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from ...core.errors import ConfigError, DataError, IdentificationError
-from ...core.files import parse_toml
 from ...core.work import Progress, Work
 from ...data import Population, Role
 from ...data.checks import check_population
@@ -64,7 +64,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     except DataError as error:
         findings.append(f"kros run would refuse this: {error}")
     text = study_text(source, data, discovery, proposal, findings)
-    validate_config(parse_toml(text), folder, str(out))
+    validate_config(tomllib.loads(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
     return _lines(population, discovery, proposal, findings, out)

@@ -1,31 +1,26 @@
 """What the report says about the uncertainty beside its weights; later stages use nothing of it.
 
-EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
-residuals of all units          --> beside the weights                                     uncertainty/<model>/units
-the most conspicuous unit       --> against the cover of all the others                    outliers/<models>/others
+residuals of all units      --> beside the weights                        uncertainty/<model>/units
+the most conspicuous unit   --> against the cover of all the others       outliers/<models>/others
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from ...core.errors import KrosError
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual
-from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
-from .resampling import resampling
 
 log = logging.getLogger(__name__)
 
@@ -34,33 +29,18 @@ log = logging.getLogger(__name__)
 class DiagnosticSettings:
     """Extent of what is computed for the report alone."""
 
-    noise_points: int = 80  # frequencies at which variation and noise are compared
     points: int = 240  # frequencies of residuals
-    units: int = 60  # at most, whose models are resampled
 
 
 DEFAULT = DiagnosticSettings()
-
-
-class _Result(Protocol):
-    def save(self, folder: Path) -> None:
-        """Write into a folder."""
-
-
-Task = tuple[Path, Callable[[], _Result]]
+Task = tuple[Path, Callable[[], UnitResiduals]]
 
 
 def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
-    tasks: list[Task] = [
-        (folder / kind / "noise", noise)
-        for kind, one in sets.items()
-        if kind in models.edmd_kinds
-        for noise in _noise(context, kind, one)
-    ]
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
+    tasks: list[Task] = [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
     work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
@@ -68,32 +48,12 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
             result.save(place)
 
 
-def _attempt(name: str, task: Callable[[], _Result]) -> _Result | None:
+def _attempt(name: str, task: Callable[[], UnitResiduals]) -> UnitResiduals | None:
     try:
         return task()
     except KrosError as error:
         log.warning("%s: not in the report: %s", name, error)
         return None
-
-
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> Iterator[Callable[[], NoiseShare]]:
-    """Compare variation and noise over some units, the nominal one among them; not with single episodes."""
-    units = uncertain.unit_ids
-    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
-    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
-    models = context.identified.models(name)
-    try:
-        samples = resampling(context, name, chosen)
-    except KrosError as error:
-        log.info("%s: variation and noise are not separated: %s", name, error)
-        return
-    yield partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
-
-
-def _compared(samples: Callable[[], Any], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
-    scale = models.output_scale[:, None] / models.input_scale
-    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
-    return noise_share(samples(), scale, freqs, dt, form, nominal)
 
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:

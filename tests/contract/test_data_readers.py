@@ -15,14 +15,13 @@ from kros.data import (
     Role,
     from_arrays,
     from_frame,
-    from_pykoop,
     prepare,
     read,
     steps,
-    to_pykoop,
     write_parquet,
 )
 from kros.data.readers.motor_drive_raw import write_raw
+from kros.interop import from_pykoop, to_pykoop
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
 PERIOD = 1e-3

@@ -7,7 +7,8 @@ import pytest
 
 import kros
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame, from_pykoop, to_pykoop
+from kros.data import Channel, EpisodeKey, Role, from_arrays, from_frame
+from kros.interop import from_pykoop, to_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 
@@ -155,7 +156,7 @@ def test_pykoop_refuses() -> None:
             from_pykoop(X, n_inputs, 0.1)
     with pytest.raises(DataError, match="check n_inputs"):
         from_pykoop({"a": koopman_array(), "b": koopman_array()[:, :3]}, 1, 0.1)
-    with pytest.raises(DataError, match="mapping is empty"):
+    with pytest.raises(DataError, match="of one width"):
         from_pykoop({}, 1, 0.1)
 
 

@@ -15,10 +15,11 @@ from pyarrow import parquet
 
 from kros.core import limits
 from kros.core.errors import DataError
-from kros.data import Channel, EpisodeKey, Role, from_arrays, from_pykoop, prepare, read, steps, write_parquet
+from kros.data import Channel, EpisodeKey, Role, from_arrays, prepare, read, steps, write_parquet
 from kros.data.alerts import period_alerts
 from kros.data.checks import scan_digests
 from kros.data.readers.parquet import read_parquet
+from kros.interop import from_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 MAPPING: dict[str, Any] = {

@@ -32,7 +32,7 @@ White-noise Kalman observers and placed poles are no longer part of kros; use ka
 Parts of the uncertainty are no longer public; use quantify, which takes models, systems and responses.
     kros.uncertainty: quantify_systems quantify_responses magnitude_tightness choose_nominals fit_weight optimal_cover
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
-    kros.interop: AdoptedModel from_pykoop models_from_pykoop one_step_pairs
+    kros.interop: AdoptedModel models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
     kros.data: read_csv_folder read_motor_drive_raw read_parquet check_population TrueChannel
     kros.data.steps: ByDirection Cut Tare
@@ -84,6 +84,8 @@ Several units in one file are no longer part of kros; write a file for each unit
 Models are no longer resampled, nor is estimation noise separated from variation between units; compare models of two
 halves of the episodes.
     kros.identify: ModelSamples bootstrap_edmd episode_weights kros.uncertainty: VariationAndNoise variation_and_noise
+The array format of pykoop is no longer in kros.data; use from_pykoop and to_pykoop of kros.interop.
+    kros.data: from_pykoop to_pykoop
 """
 
 

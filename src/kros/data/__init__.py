@@ -18,7 +18,7 @@ from . import steps
 from .batch import EpisodeBatch
 from .population import Channel, EpisodeKey, Population, Role, Unit, split_episodes
 from .prepare import prepare
-from .readers.arrays import from_arrays, from_frame, from_pykoop, to_pykoop
+from .readers.arrays import from_arrays, from_frame
 from .readers.opening import read
 from .readers.parquet import write_parquet
 
@@ -31,12 +31,10 @@ __all__ = [
     "Unit",
     "from_arrays",
     "from_frame",
-    "from_pykoop",
     "prepare",
     "read",
     "split_episodes",
     "steps",
-    "to_pykoop",
     "write_parquet",
 ]
 __getattr__ = refusing(__name__)

@@ -13,14 +13,12 @@ from __future__ import annotations
 import logging
 import os
 import sys
-from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import astuple, dataclass, field, replace
 from functools import lru_cache
 from hashlib import sha256
 from pathlib import Path
-from threading import Lock
 from typing import Any
 from urllib.parse import quote
 
@@ -28,10 +26,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter
 
-from ...core import limits
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened, whole_folder
+from ...core.files import require_regular, shortened, stamp_of, whole_folder
 from ..checks import check_structure, refuse_copies, usable_episodes
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
@@ -53,32 +50,6 @@ _ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, N
 _INDEXED = ("unit", "condition", "file", "episodes", "samples")
 
 
-class ArrayCache:
-    """Read-only arrays by key, the latest ones, at most so many bytes in all."""
-
-    def __init__(self, limit: int) -> None:
-        self.limit, self.size, self.lock = limit, 0, Lock()
-        self.arrays: OrderedDict[Hashable, Array] = OrderedDict()
-
-    def take(self, key: Hashable, read: Callable[[], Array]) -> Array:
-        """Return the array of a key, read where it is not there."""
-        with self.lock:
-            if key in self.arrays:
-                self.arrays.move_to_end(key)
-                return self.arrays[key]
-        array = read()
-        array.flags.writeable = False
-        with self.lock:
-            self.size += array.nbytes - (self.arrays[key].nbytes if key in self.arrays else 0)
-            self.arrays[key] = array
-            while self.size > self.limit:
-                self.size -= self.arrays.popitem(last=False)[1].nbytes
-        return array
-
-
-_CACHE = ArrayCache(limit=2**28)  # the demo's recordings fit, those of a factory do not have to
-
-
 @dataclass(frozen=True, eq=False)
 class ParquetRecordings(Recordings):
     """Reads one row group at a time; a place is a file, its row group and the number of samples."""
@@ -92,74 +63,53 @@ class ParquetRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: Place) -> Recording:
         """Return one episode."""
-        file = _Group(self.file(place), place, key)
-        return Recording(key, _CACHE.take((file, self.columns), lambda: next(file.read(self.columns))))
+        (values,) = self.blocks(key)
+        return Recording(key, values)
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Array]:
-        """Return the samples of an episode in blocks, read one after the other."""
-        return _Group(self.file(self.places[key]), self.places[key], key).read(self.columns, rows)
-
-
-@dataclass(frozen=True)
-class _Group:
-    """A row group of a file, which is read anew where the file was written anew."""
-
-    path: Path
-    place: Place
-    key: EpisodeKey
-    version: tuple[int, ...] = ()
-
-    def __post_init__(self) -> None:
-        require_regular(self.path, sys.maxsize)
-        status = self.path.stat()
-        object.__setattr__(self, "version", (status.st_ino, status.st_size, status.st_mtime_ns))
-
-    def read(self, columns: tuple[str, ...], rows: int | None = None) -> Iterator[Array]:
-        """Return the samples, shape (n_samples, n_columns), whole or in blocks of `rows`."""
+    def blocks(self, key: EpisodeKey, rows: int | None = None) -> Iterator[Array]:
+        """Yield the samples of an episode, shape (n, n_columns), whole or in blocks of at most `rows`."""
+        place = self.places[key]
+        path = self.file(place)
+        require_regular(path, sys.maxsize)
         try:
-            for table in self._tables([*KEYS, *columns], rows):
+            for table in _tables(path, place, [*KEYS, *self.columns], rows):
                 table.select(KEYS).validate(full=True)
-                for name in KEYS:
-                    wanted, actual = getattr(self.key, name), table.column(name).unique().to_pylist()
-                    self._require(actual == [wanted], f"the index says {name} {wanted!r}, the samples say {actual!r}")
-                yield np.column_stack([to_numpy(table.column(channel)) for channel in columns])
+                if [table.column(name).unique().to_pylist() for name in KEYS] != [[name] for name in astuple(key)]:
+                    raise DataError(f"Reading {path}: the index says {key}, the samples do not; {AGAIN}.")
+                yield np.column_stack([to_numpy(table.column(channel)) for channel in self.columns])
         except DataError:
             raise
         except _ARROW_ERRORS as error:
-            raise DataError(f"Reading {self.key} from {self.path}: {shortened(str(error))}; {AGAIN}.") from error
+            raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
 
-    def _tables(self, columns: list[str], rows: int | None) -> Iterator[Any]:
-        """Read columns after the checks of length and types, pages against their checksums."""
-        import pyarrow as pa
-        from pyarrow import parquet
 
-        _, group, samples = self.place
-        options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
-        options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
-        with parquet.ParquetFile(self.path, metadata=_metadata(self.path, self.version), **options) as file:
-            actual = file.metadata.row_group(group).num_rows
-            self._require(actual == samples, f"{samples} samples are expected in row group {group}, found {actual}")
-            if samples > limits.MAX_SAMPLES:
-                advice = "cut it, or raise MAX_SAMPLES in kros.core.limits"
-                raise DataError(f"Reading {self.path}: an episode has {samples} samples; {advice}.")
-            for name in columns:
-                kind, label = str(file.schema_arrow.field(name).type), name in KEYS
-                wanted = "text" if label else "numbers of type double"
-                fits = "string" in kind if label else kind == "double"
-                self._require(fits, f"column {name!r} should hold {wanted}, found {kind}")
-            if rows is None:
-                yield file.read_row_group(group, columns=columns, use_threads=False)
-                return
-            for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
-                yield pa.Table.from_batches([part])
+def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> Iterator[Any]:
+    """Yield columns of a row group after checks of length and types, pages against their checksums."""
+    import pyarrow as pa
+    from pyarrow import parquet
 
-    def _require(self, condition: bool, problem: str) -> None:
-        if not condition:
-            raise DataError(f"Reading {self.path}: {shortened(problem)}; files were changed, {AGAIN}.")
+    _, group, samples = place
+    options: dict[str, Any] = {"pre_buffer": False, "page_checksum_verification": True}
+    options |= {"memory_map": True} if rows is None else {"buffer_size": BLOCK}
+    with parquet.ParquetFile(path, metadata=_metadata(path, stamp_of(path)), **options) as file:
+        actual, schema = file.metadata.row_group(group).num_rows, file.schema_arrow
+        if actual != samples:
+            problem = f"{samples} samples are expected in row group {group}, found {actual}"
+            raise DataError(f"Reading {path}: {problem}; files were changed, {AGAIN}.")
+        kinds = {name: str(schema.field(name).type) for name in columns}
+        wrong = [name for name, kind in kinds.items() if not (("string" in kind) if name in KEYS else kind == "double")]
+        if wrong:
+            problem = f"column {wrong[0]!r} should hold {'text' if wrong[0] in KEYS else 'numbers of type double'}"
+            raise DataError(f"Reading {path}: {problem}, found {kinds[wrong[0]]}; files were changed, {AGAIN}.")
+        if rows is None:
+            yield file.read_row_group(group, columns=columns, use_threads=False)
+            return
+        for part in file.iter_batches(rows, row_groups=[group], columns=columns, use_threads=False):
+            yield pa.Table.from_batches([part])
 
 
 @lru_cache(maxsize=64)
-def _metadata(path: Path, version: tuple[int, ...]) -> Any:
+def _metadata(path: Path, version: tuple[int, int]) -> Any:
     """Return the description of all row groups of a file, which are read one by one."""
     from pyarrow import parquet
 

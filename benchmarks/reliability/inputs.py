@@ -29,7 +29,7 @@ from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
 from kros.core.store import Artefact, read_manifest, write_manifest
 from kros.data import Channel, Role, from_arrays, from_frame, from_pykoop, read, write_parquet
-from kros.data.checks import check_population, scan_digests
+from kros.data.checks import check_population, usable_episodes
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
@@ -211,7 +211,8 @@ def recorded(population: Any) -> Any:
     """Everything that is in a population, for comparison."""
     check_population(population, allow_single=True)
     facts = plain([population.channels, population.sample_period_s, population.units, population.metadata])
-    return facts, [(str(key), digest) for key, digest in scan_digests(population)]
+    groups = [usable_episodes(population, keys) for _, _, keys in population.groups()]
+    return facts, [(str(key), digest) for group in groups for key, _, digest in group]
 
 
 def matrices(value: Any) -> Any:

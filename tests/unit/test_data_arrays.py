@@ -112,7 +112,7 @@ def frame(**changes: Any) -> Any:
 
 def test_frame_refuses() -> None:
     pd = pytest.importorskip("pandas")
-    with pytest.raises(DataError, match="column 'v' is missing"):
+    with pytest.raises(DataError, match="column 'v' occurs 0 times"):
         from_frame(frame().drop(columns="v"), CHANNELS, time="t")
     with pytest.raises(DataError, match="one of time and sample_period_s"):
         from_frame(frame(), CHANNELS)

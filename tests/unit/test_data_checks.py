@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.support.scans import scan_digests
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays
-from kros.data.checks import check_episode, check_population, scan_digests
+from kros.data.checks import check_episode, check_population
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")

@@ -11,12 +11,9 @@ class KrosError(Exception):
 
     Examples
     --------
-    >>> import kros
-    >>> try:
-    ...     kros.read("no/such/folder")
-    ... except kros.core.KrosError as error:  # whatever kros refuses
-    ...     print(type(error).__name__)
-    DataError
+    >>> from kros.core import DataError, KrosError
+    >>> issubclass(DataError, KrosError)
+    True
     """
 
 
@@ -26,11 +23,9 @@ class DataError(KrosError, ValueError):
     Examples
     --------
     >>> import kros
-    >>> try:
-    ...     kros.read("no/such/folder")
-    ... except kros.core.DataError as error:
-    ...     print(error)
-    Reading no/such/folder: there is no such folder; check data.source (relative to the study file).
+    >>> kros.read("no/such/folder")
+    Traceback (most recent call last):
+    kros.core.errors.DataError: Reading no/such/folder: there is no such folder; check data.source.
     """
 
 
@@ -39,12 +34,10 @@ class DimensionError(KrosError, ValueError):
 
     Examples
     --------
-    >>> from kros.core import DimensionError, gain
-    >>> try:
-    ...     gain([[1.0, 2.0]], 0.01) @ gain([[1.0]], 0.01)
-    ... except DimensionError as error:
-    ...     print(error)
-    Series connection: 2 inputs at 0.01 s against 1 outputs at 0.01 s; match sizes and sampling periods.
+    >>> from kros.core import gain
+    >>> gain([[1.0, 2.0]], 0.01) @ gain([[1.0]], 0.01)
+    Traceback (most recent call last):
+    kros.core.errors.DimensionError: Series connection: 2 inputs at 0.01 s against 1 outputs at 0.01 s; match them.
     """
 
 

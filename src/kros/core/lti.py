@@ -152,7 +152,7 @@ class StateSpace:
         """Series connection `self * other`: the input passes through `other` first."""
         if self.n_inputs != other.n_outputs or self.dt != other.dt:
             sizes = f"{self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at {other.dt} s"
-            raise DimensionError(f"Series connection: {sizes}; match sizes and sampling periods.")
+            raise DimensionError(f"Series connection: {sizes}; match them.")
         zero = np.zeros((other.n_states, self.n_states))
         return StateSpace(
             np.block([[self.A, self.B @ other.C], [zero, other.A]]),
@@ -192,9 +192,5 @@ def block_diagonal(systems: Sequence[StateSpace]) -> StateSpace:
         periods = [s.dt for s in systems]
         raise DimensionError(f"Block diagonal: needs one sampling period, found {periods} s; resample first.")
 
-    def stack(blocks: list[Array]) -> Array:
-        rows, cols = sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)
-        return block_diag(*blocks).reshape(rows, cols)
-
-    A, B, C, D = (stack([getattr(s, name) for s in systems]) for name in "ABCD")
+    A, B, C, D = (block_diag(*(getattr(s, name) for s in systems)) for name in "ABCD")
     return StateSpace(A, B, C, D, systems[0].dt)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -149,14 +148,11 @@ def check_names(kind: str, names: Iterable[Any]) -> None:
 
 def check_period(period_s: Any, what: str) -> float:
     """Return a sampling period that is a number of seconds above zero."""
-    try:
-        seconds = math.nan if isinstance(period_s, bool) or not isinstance(period_s, Real) else float(period_s)
-    except OverflowError:
-        seconds = math.inf
-    if not 1 / limits.MAX_VALUE < seconds < limits.MAX_VALUE:
+    is_number = isinstance(period_s, Real) and not isinstance(period_s, bool)
+    if not is_number or not 1 / limits.MAX_VALUE < period_s < limits.MAX_VALUE:
         wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
         raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
-    return seconds
+    return float(period_s)
 
 
 def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
@@ -172,11 +168,10 @@ def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey])
     if not states:
         roles = [(c.name, c.role.value) for c in channels]
         raise DataError(f"A population needs at least one channel with role 'state', found {roles}; declare one.")
-    owners = [c.of for c in channels if c.role is Role.TRUTH]
-    wrong = any(bool(c.of) != (c.role is Role.TRUTH) for c in channels)
-    if wrong or len(set(owners)) < len(owners) or not set(owners) <= set(states):
+    truths = {c.name: c.of for c in channels if c.of or c.role is Role.TRUTH}
+    owners, declared = set(truths.values()), {c.name for c in channels if c.role is Role.TRUTH}
+    if set(truths) != declared or len(owners) < len(truths) or not owners <= set(states):
         wanted = f"says with `of` which state it is the truth of, each of another one of {states}"
-        truths = [(c.name, c.of) for c in channels if c.of or c.role is Role.TRUTH]
         raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
     if not episodes:
         raise DataError("The population is empty: no episode was found; check the source and the reader.")
@@ -198,14 +193,6 @@ def check_population(population: Population, allow_single: bool = False) -> None
         actual = f"found {len(units)} ({', '.join(units) or 'none'}): uncertainty is the difference between units"
         advice = 'add recordings of more units, or stop after identification ("--until identify")'
         raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
-
-
-def scan_digests(population: Population, on_nan: str = "error") -> list[tuple[EpisodeKey, str]]:
-    """Read and check every episode; return the usable ones with their digests."""
-    groups = (usable_episodes(population, keys, on_nan) for _, _, keys in population.groups())
-    digests = [(key, digest) for group in groups for key, _, digest in group]
-    refuse_copies(digests)
-    return digests
 
 
 def usable_episodes(

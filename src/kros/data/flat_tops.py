@@ -1,19 +1,15 @@
 """Limits that show in recordings: a state that is cut off at one and the same extreme value, whatever the inputs are.
 
-A flat top is a run of samples at a signal's extreme value, within its noise. It may be a smooth peak, a commanded
-plateau, the top level of a coarse signal, or a limit. It counts as a limit where
-
-- the signal is constant there and changes sharply before or after (a smooth peak falls with the square of the time),
-- it is there several times, in more than one episode, at the same value, and nothing was recorded beyond,
-- every input took different values there: what an input holds at one value may be that input's doing.
-
-So a limit that only shows under one and the same input is not found; it can be declared.
+A flat top is a run of samples at a signal's extreme value, within its noise. It counts as a limit where the signal
+changes sharply before or after (a smooth peak falls with the square of the time), where it is there several times, in
+more than one episode, with nothing beyond, and where every input took different values.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -65,29 +61,25 @@ class FoundLimit:
 def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
     """Return the flat tops of a signal, shape (n_samples,), with inputs of shape (n_samples, m), at both ends."""
     signal, width = np.ascontiguousarray(signal), _width(signal)
-    lower, upper = (_flat_tops(unit, episode, side, inputs, width) for side in (-signal, signal))
-    return lower, upper
+    return _flat_tops(unit, episode, -signal, inputs, width), _flat_tops(unit, episode, signal, inputs, width)
 
 
 def found_limit(ends: Sequence[Ends], ranges: Array) -> FoundLimit | None:
     """Return the limits that all episodes of a population speak for; None where they speak for none."""
-    below, above = zip(*ends, strict=True)
-    lower, upper = _level(below, ranges), _level(above, ranges)
-    levels = [level for level in (lower, upper) if level is not None]
-    if not levels:
+    below, above = (_level(side, ranges) for side in zip(*ends, strict=True))
+    if below is None and above is None:
         return None
-    units = tuple(dict.fromkeys(unit for level in levels for unit in level.units))
-    low, high = None if lower is None else -lower.value, None if upper is None else upper.value
-    return FoundLimit(low, high, units, sum(level.samples for level in levels))
+    units = tuple(dict.fromkeys(unit for level in (below, above) if level for unit in level.units))
+    low, high = None if below is None else -below.value, None if above is None else above.value
+    return FoundLimit(low, high, units, sum(level.samples for level in (below, above) if level))
 
 
-@dataclass(frozen=True)
-class _Level:
+class _Level(NamedTuple):
     """A limit at one end."""
 
     value: float
-    units: tuple[str, ...] = ()
-    samples: int = 0
+    units: tuple[str, ...]
+    samples: int
 
 
 def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
@@ -111,19 +103,17 @@ def _level(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
         return None
     values, lengths, steep, *inputs = np.concatenate([runs for _, runs in near]).T
     often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in near}) >= _RULE.episodes
-    varied = all(np.ptp(u) > _RULE.varied * size for u, size in zip(inputs, ranges, strict=True))
-    if not (often and varied):
+    if not often or any(np.ptp(u) <= _RULE.varied * size for u, size in zip(inputs, ranges, strict=True)):
         return None
-    units = tuple(dict.fromkeys(f.unit for f, _ in near))
-    return _Level(float(np.average(values, weights=lengths * steep)), units, int(lengths.sum()))
+    value = float(np.average(values, weights=lengths * steep))
+    return _Level(value, tuple(dict.fromkeys(f.unit for f, _ in near)), int(lengths.sum()))
 
 
 def _width(signal: Array) -> float:
     """Width of the noise: five standard deviations by second differences, at least one step of quantisation."""
     steps = np.diff(signal)
     noise = 1.4826 * float(np.median(np.abs(np.diff(steps)))) / np.sqrt(6) if len(steps) > 1 else 0.0
-    smallest = smallest_step(signal)
-    return max(_RULE.noise * noise, 1.01 * smallest)
+    return max(_RULE.noise * noise, 1.01 * smallest_step(signal))
 
 
 def smallest_step(signal: Array) -> float:

@@ -214,7 +214,10 @@ def from_frame(
     if (time is None) == (sample_period_s is None):
         actual = f"found time = {time!r}, sample_period_s = {sample_period_s!r}"
         raise DataError(f"from_frame needs one of time and sample_period_s, {actual}.")
-    ordered = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame"))
+    ordered, known = columns_in_order(declare_channels(channels, states, inputs, measured, "from_frame")), list(frame)
+    for name in filter(None, (*(c.name for c in ordered), time, unit)):
+        if known.count(name) != 1:
+            raise DataError(f"from_frame: column {name!r} occurs {known.count(name)} times in {known}; rename it.")
     numbers = np.column_stack([_column(frame, c.name) for c in ordered])
     times = None if time is None else _column(frame, time)
     columns: list[tuple[str | None, str | None]] = [(unit, None), (condition, DEFAULT_CONDITION), (episode, "0")]
@@ -225,20 +228,11 @@ def from_frame(
     return assemble(ArrayRecordings(places), ordered, sample_period_s=sample_period_s)
 
 
-def _series(frame: Any, name: str) -> Any:
-    """Return a column that occurs once."""
-    count = list(frame.columns).count(name)
-    if count != 1:
-        problem = f"occurs {count} times in" if count else "is missing, found"
-        raise DataError(f"from_frame: column {name!r} {problem} {list(frame.columns)}; rename a column or the names.")
-    return frame[name]
-
-
 def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:
     """Return the names of a column, row by row."""
     if default is not None and column not in frame.columns:
         return [default] * len(frame)
-    values = _series(frame, str(column)).to_numpy(dtype=object)
+    values = frame[column].to_numpy(dtype=object)
     bad = next((v for v in values if isinstance(v, bool) or not isinstance(v, (str, int, np.integer))), None)
     if bad is not None:
         wanted = f"column {column!r} should hold text or whole numbers, found {bad!r}"
@@ -248,7 +242,7 @@ def _ids(frame: Any, column: str | None, default: str | None) -> list[str]:
 
 def _column(frame: Any, name: str) -> Array:
     """Return a column of numbers."""
-    column = _series(frame, name)
+    column = frame[name]
     try:
         missing = {"dtype": float, "na_value": np.nan} if column.dtype.kind in "biuf" else {}
         return as_numbers(column.to_numpy(**missing))

@@ -95,7 +95,7 @@ def _fitting(reader: str | None, source: Path, with_mapping: bool) -> str:
     """Return the reader to use, after checking that there is a folder."""
     reading = f"Reading {source}"
     if not source.exists():
-        raise DataError(f"{reading}: there is no such folder; check data.source (relative to the study file).")
+        raise DataError(f"{reading}: there is no such folder; check data.source.")
     if not source.is_dir():
         raise DataError(f"{reading}: this is a file, and recordings are a folder; give the folder that holds it.")
     if not any(source.iterdir()):

@@ -1,0 +1,12 @@
+"""All recordings of a population read and checked."""
+
+from kros.data import EpisodeKey, Population
+from kros.data.checks import refuse_copies, usable_episodes
+
+
+def scan_digests(population: Population, on_nan: str = "error") -> list[tuple[EpisodeKey, str]]:
+    """The usable episodes with their digests."""
+    groups = [usable_episodes(population, keys, on_nan) for _, _, keys in population.groups()]
+    digests = [(key, digest) for group in groups for key, _, digest in group]
+    refuse_copies(digests)
+    return digests

@@ -20,7 +20,7 @@ from ...core.errors import ConfigError, DataError
 from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
-from ..readers.csv_folder import csv_files, read_csv_folder
+from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
 from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
 from ..recording import CHECK, some, usable
 from .dialect import TableHead, look_at
@@ -79,14 +79,10 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
         raise ConfigError(f"--files {expression!r}: is not a regular expression ({error}); correct it.") from error
     files = {relative: path for path, relative in csv_files(source)}
     selected = {relative: path for relative, path in files.items() if selects(relative)}
-    if not files:
-        kinds = ".csv, .tsv, .txt, .dat, .parquet, or these with .gz"
-        raise DataError(
-            f"Looking at {source}: there are no files of recordings ({kinds}); save them as CSV or Parquet."
-        )
     if not selected:
-        problem = f"no file matches --files {expression!r}"
-        raise DataError(f"Looking at {source}: {problem}; correct the expression, or leave it out.")
+        there = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
+        advice = there if files else f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV or Parquet"
+        raise DataError(f"Looking at {source}: {advice}.")
     return selected
 
 
@@ -140,9 +136,7 @@ def _columns(
         _read(paths[0], head, numeric)  # says why not, where it cannot be read
         problem = "the files looked at have fewer than three rows of numbers"
         raise DataError(f"Looking at {source}: {problem}; check the folder.")
-    time: int | None = None
-    keys: dict[str, Any] = {"sample_period_s": period_s}
-    notes: dict[str, str] = {}
+    time, keys, notes = None, dict[str, Any](sample_period_s=period_s), dict[str, str]()
     if not period_s:
         time, keys, notes = _time(source, head, described, numeric, samples)
         described[time] = replace(described[time], part=ColumnPart.TIME)
@@ -178,11 +172,9 @@ def _time(
     if texts:
         return texts[-1], {"time": columns[texts[-1]].reference, "timestamp": head.timestamp(texts[-1])}, {}
     called = next((c.header for c in columns if c.kind == "time"), None)
-    problem = f"{called!r} stands still or runs back in places, as rounded times do"
-    problem = "no column increases like time" if called is None else problem
+    problem = f"{called!r} stands still or runs back in places, as rounded times do" if called else "no column is time"
     found = ", ".join(repr(c.header) for c in columns)
-    advice = "give the sampling period, --period SECONDS"
-    raise DataError(f"Looking at {source}: {problem}, found the columns {found}; {advice}.")
+    raise DataError(f"Looking at {source}: {problem}, found the columns {found}; give --period SECONDS.")
 
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
@@ -198,15 +190,10 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 def _channel(column: TableColumn) -> dict[str, Any]:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     reference = column.reference if column.reference != column.name else None
-    table = {
-        "name": column.name,
-        "column": reference,
-        "role": "input" if column.part is ColumnPart.INPUT else "state",
-        "measured": column.part is ColumnPart.MEASURED or None,
-        "unit": column.unit or None,
-        "scale": column.scale if column.scale != 1 else None,
-    }
-    return {key: value for key, value in table.items() if value is not None}
+    role, unit, scale = "input" if column.part is ColumnPart.INPUT else "state", column.unit, column.scale
+    table = {"name": column.name, "column": reference, "role": role}
+    table |= {"measured": column.part is ColumnPart.MEASURED or None, "unit": unit or None}
+    return {key: v for key, v in (table | {"scale": None if scale == 1 else scale}).items() if v is not None}
 
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:

@@ -28,7 +28,6 @@ from ..stages.read import FEWEST, open_source
 from .study_text import LiftingProposal, study_text
 
 log = logging.getLogger(__name__)
-MOST_FINDINGS = 12
 _UNLOADED_WORDS = "unloaded noload leerlauf ohnelast unbelastet leer idle empty vide avide sanscharge"
 NO_LOAD = _UNLOADED_WORDS.split()
 
@@ -143,9 +142,7 @@ def _lines(
         lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
     functions = "; ".join(proposal.lifting.get("functions", ()))
     lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
-    lines += [f"looks wrong: {text}" for text in findings[:MOST_FINDINGS]]
-    more = len(findings) - MOST_FINDINGS
-    lines += [f"looks wrong: {more} further points, which are written at the start of the study"] if more > 0 else []
+    lines += [f"looks wrong: {text}" for text in findings]
     until = " --until identify" if len(units) < FEWEST else ""
     return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ...data.discovery.discover import Discovery
-from ...data.discovery.roles import ColumnPart, TableColumn
+from ...data.discovery.roles import TableColumn
 from ...data.readers.csv_mapping import CsvMapping
 
 
@@ -57,7 +57,7 @@ def _keys(table: Mapping[str, Any]) -> list[str]:
 
 
 def _mapping(discovery: Discovery) -> Iterator[str]:
-    """Yield the lines of ``[data.csv]``, columns that were left out as comments."""
+    """Yield the lines of ``[data.csv]``."""
     yield from ("", "[data.csv]")
     for key, value in discovery.mapping.items():
         if key != "channel":
@@ -67,14 +67,6 @@ def _mapping(discovery: Discovery) -> Iterator[str]:
     by_name = {c.name: c for c in discovery.columns}
     for channel in discovery.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
-    spare = [c for c in discovery.columns if c.part is ColumnPart.LEFT_OUT and c.why != "no numbers"]
-    if spare:
-        roles = "a channel of the role state is estimated, one of the role input is known at run time"
-        yield from ("", f"# Columns that were left out; {roles}.")
-    for column in spare:
-        table = {"name": column.name, "column": column.reference, "role": "state"}
-        table |= {"unit": column.unit} if column.unit else {}
-        yield from ("", *(f"# {line}" for line in ("[[data.csv.channel]]", *_channel(table, column))))
 
 
 def _channel(table: Mapping[str, Any], column: TableColumn) -> Iterator[str]:

@@ -115,7 +115,7 @@ def test_recordings_that_are_no_files(tmp_path: Path, layout: str, kind: str) ->
     if (layout, kind) == ("csv", "folder"):
         assert scan(tmp_path).unit_ids == ("b",)  # a folder is looked into, not read
         return
-    with pytest.raises(DataError, match=r"regular file|no such file|no file matches"):
+    with pytest.raises(DataError, match=r"regular file|there is no file|no file matches"):
         read(tmp_path, layout, mapping=MAPPING if layout == "csv" else None)
 
 

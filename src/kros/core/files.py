@@ -12,6 +12,7 @@ from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
@@ -38,7 +39,7 @@ def require_regular(path: Path, limit: int, error: type[KrosError] = DataError) 
     try:
         status = path.stat()
     except FileNotFoundError as missing:
-        raise error(f"Reading {path}: there is no such file; check the path.") from missing
+        raise error(f"Reading {path.name}: there is no file {path}; check the path.") from missing
     except (OSError, ValueError) as failure:
         raise error(f"Reading {path}: {failure}; check the path and the permissions.") from failure
     if not stat.S_ISREG(status.st_mode):
@@ -62,14 +63,12 @@ def read_bytes(path: Path, limit: int, error: type[KrosError] = DataError) -> by
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file so that a reader sees the old content or the new, never half of it."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=TEMPORARY)
+    draft = path.with_name(f"{TEMPORARY}{uuid4().hex}")
     try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-        os.chmod(name, 0o644)
-        os.replace(name, path)
+        draft.write_bytes(content)
+        draft.replace(path)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        draft.unlink(missing_ok=True)
         raise
 
 

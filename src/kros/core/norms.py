@@ -153,7 +153,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     """
     system = as_state_space(system)
     if tol <= 0:
-        raise KrosError(f"H-infinity norm: tol should be positive, found {tol}; 1e-6 is the default.")
+        raise KrosError(f"H-infinity norm: tol should be positive, found {tol}.")
     if not system.is_stable():
         return float("inf")
     if system.n_states == 0 or system.n_inputs == 0 or system.n_outputs == 0:
@@ -218,7 +218,7 @@ def _rounding(system: StateSpace, nu: float) -> float:
 def first_frequencies(poles: Array) -> Array:
     """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a grid around them."""
     sizes = np.abs(poles)
-    low, high = max(sizes.min(), 1e-300), max(sizes.max(), 1e-300)
+    low, high = np.maximum([sizes.min(), sizes.max()], np.finfo(float).tiny)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))
     grid = np.geomspace(low / 10, 10 * high, 100)

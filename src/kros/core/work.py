@@ -1,8 +1,7 @@
 """Independent pieces of work, in order: where they run, which results are there, and who listens to their progress.
 
-Results of maps are in a store, by the digest of all that they follow from: what is new is computed, the rest is read.
-The process that computes a result writes it, on a cluster too. Numbers come back bit by bit, so results do not depend
-on how they were obtained; what cannot be read back whole is computed again.
+Results of maps are in a store, by the digest of all that they follow from. The process that computes a result writes
+it, on a cluster too. Numbers come back bit by bit; what cannot be read back whole is computed again.
 """
 
 from __future__ import annotations

@@ -181,7 +181,7 @@ def test_another_rate(folder: Path) -> None:
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
         ({"skip_rows": -1}, "skip_rows: input should be greater than or equal to 0, found -1"),
-        ({"prepare": [{"step": "trim", "begin": 1}]}, "unknown key 'begin'"),
+        ({"prepare": [{"step": "trim", "begin": 1}]}, "key 'begin' is unknown"),
     ],
 )
 def test_mapping_refuses(folder: Path, changes: dict[str, Any], message: str) -> None:

@@ -72,6 +72,7 @@ def test_files_as_documented(tmp_path: Path) -> None:
         "file": "a@cold.parquet",
         "episodes": ["0", "1", "2"],
         "samples": [20, 21, 22],
+        "digests": [],
     }
 
 

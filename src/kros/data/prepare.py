@@ -46,9 +46,8 @@ class PreparedSource:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recorded(key)
         if not any(step.makes_even for step in self.steps):
-            file = (
-                self.recordings.file(self.recordings.places[key]) if isinstance(self.recordings, Recordings) else None
-            )
+            read = self.recordings
+            file = read.file(read.places[key]) if isinstance(read, Recordings) else None
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
         signals = Signals(self.channels, self.period_s)
         for step in self.steps:
@@ -164,10 +163,9 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
         problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
         key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
         text = f"{key}: {problem['msg'].lower()}, found {actual}"
-        if problem["type"] == "unexpected_keyword_argument":
-            text = f"unknown key {key!r}{did_you_mean(key, known) or ';'} known keys are {', '.join(known)}"
-        if problem["type"] == "missing":
-            text = f"key {key!r} is missing, found {list(table)}; add it"
+        if problem["type"] in ("unexpected_keyword_argument", "missing"):
+            what = "is missing" if problem["type"] == "missing" else "is unknown"
+            text = f"key {key!r} {what}{did_you_mean(key, known) or ';'} the keys are {', '.join(known)}"
         raise ConfigError(f"{where} (step {name!r}): {text}.") from error
 
 

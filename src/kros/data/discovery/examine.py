@@ -51,8 +51,7 @@ def examine(population: Population, work: Work | None = None) -> list[EpisodeLoo
     """Read every episode once, as it was recorded, and say what is wrong with it alone or beside the others."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
-    median = median_period(looks)
-    looks = [_without_gap(look, median) for look in looks]
+    looks = [_without_gap(look, median_period(looks)) for look in looks]
     copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
     return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
 

@@ -64,12 +64,6 @@ class DaskExecutor(Executor):
             raise self._error(_GIVEN_UP) from error
         except CancelledError as error:
             raise self._error(_LOST) from error
-        except (ImportError, RuntimeError) as error:
-            missing = error if isinstance(error, ImportError) else error.__cause__
-            if isinstance(error, KrosError) or not isinstance(missing, ModuleNotFoundError):
-                raise
-            problem = f"there or on a worker a package is not installed ({missing})"
-            raise self._error(f"{problem}; install kros[dask].") from error
 
     def _error(self, text: str) -> KrosError:
         return KrosError(f"Dask scheduler {self._address}: {text}")
@@ -118,11 +112,8 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
     except (OSError, ValueError) as error:
         problem = f"no Dask scheduler of this version answers there ({error})"
         raise ConfigError(f"--scheduler {address}: {problem}; correct the address.") from error
-    threads = client.nthreads()
-    if not threads:
+    if not client.nthreads():
         log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
-    if any(n > 1 for n in threads.values()):
-        log.warning("Dask scheduler %s: workers run one task at a time; start them with --nthreads 1.", address)
     messages = logging.getLogger("distributed.client")
     level = messages.level
     messages.setLevel(logging.CRITICAL)  # a lost connection is an error here

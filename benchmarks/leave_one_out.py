@@ -36,8 +36,7 @@ from kros.report.names import BASELINES, minus, number, split_observer
 from kros.study import load_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage, SynthesisSettings
-from kros.study.engine.executors import available_cores
-from kros.study.engine.progress import Lines
+from kros.study.engine.executors import Lines, available_cores
 
 PAPER = "koopman_edmd/mixed"  # the observer that powers at the gearbox frequency are compared with
 HOME, HIDDEN, LEARNED, ENTRYWISE = "noload", ("velocity", "current"), "learned", "koopman_edmd/paper"

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from kros.core.settings import Settings
-from kros.data.readers.csv_mapping import ChannelMapping, CsvMapping
+from kros.data.readers.csv_folder import ChannelMapping, CsvMapping
 from kros.data.steps import STEPS
 from kros.study.config import StudyConfig
 

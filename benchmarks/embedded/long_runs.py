@@ -31,8 +31,8 @@ from kros.observer.screen import screened
 from kros.observer.simulate import Course
 from kros.observer.tracking import PhaseLockedLoop
 from kros.study.config import Stage
-from kros.study.engine.run_folder import open_finished
-from kros.study.stages.read import open_source
+from kros.study.engine.store import open_finished
+from kros.study.stages.learning import open_source
 
 TURN = 2 * np.pi
 LIMIT, UNCERTIFIED = 4, 8

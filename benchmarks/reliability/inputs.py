@@ -24,12 +24,20 @@ from typing import Any
 import numpy as np
 from campaign import Tally, main
 
-from kros.core.artifacts import CHECKSUM, load_artifact, plain, read_json, save_artifact
+from kros.core.artifacts import (
+    CHECKSUM,
+    Artefact,
+    load_artifact,
+    plain,
+    read_json,
+    read_manifest,
+    save_artifact,
+    write_manifest,
+)
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
-from kros.core.store import Artefact, read_manifest, write_manifest
 from kros.data import Channel, Role, from_arrays, from_frame, from_pykoop, read, write_parquet
-from kros.data.checks import check_population, usable_episodes
+from kros.data.recording import check_population, usable_episodes
 from kros.identify import ModelSet
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime

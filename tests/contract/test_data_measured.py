@@ -8,7 +8,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data import EpisodeKey, prepare, read, split_episodes, steps
-from kros.data.checks import check_population
+from kros.data.recording import check_population
 
 PENDULUM_SIGNALS = [
     ("position", "state", "pos_meas", "rad"),

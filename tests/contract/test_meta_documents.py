@@ -59,7 +59,7 @@ def check_configuration(text: str) -> None:
     """Read a CSV mapping, or a study, as kros reads it."""
     table = tomllib.loads(text)
     if "files" in table:
-        from kros.data.readers.csv_mapping import load_mapping
+        from kros.data.readers.csv_folder import load_mapping
 
         _ = load_mapping(table).steps
     else:

@@ -21,8 +21,8 @@ from kros.loops import find_compiler
 from kros.observer import Observer
 from kros.observer.units import recorded_channel
 from kros.plants import PLANTS
-from kros.study.commands.estimate import estimate_recordings
 from kros.study.commands.export import export_run
+from kros.study.commands.field import estimate_recordings
 
 MAPPING: dict[str, Any] = {
     "files": r"(?P<unit>\w+)_(?P<episode>\d+)[.]csv",

@@ -205,7 +205,7 @@ def die(_: int) -> None:
 
 
 def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp_path, monkeypatch):
-    monkeypatch.setattr("kros.study.engine.cluster._BATCHES", 4)
+    monkeypatch.setattr("kros.study.engine.executors._BATCHES", 4)
     address = cluster.start(2)
     with open_executor(scheduler=address) as executor:
         assert list(executor.map(square, range(30))) == [x * x for x in range(30)]
@@ -224,7 +224,7 @@ def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp
 
 
 def test_workers_have_the_same_kros(cluster, monkeypatch):
-    monkeypatch.setattr("kros.study.engine.cluster.code_key", lambda: "another")
+    monkeypatch.setattr("kros.study.engine.executors.code_key", lambda: "another")
     with (
         open_executor(scheduler=cluster.start(1)) as executor,
         pytest.raises(KrosError, match="install the same version on every worker"),

@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.core.store import describe, read_manifest, write_manifest
+from kros.core.artifacts import describe, read_manifest, write_manifest
 from kros.data import Channel, Population, Role, from_arrays, write_parquet
 from kros.plants import PLANTS
 

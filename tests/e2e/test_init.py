@@ -14,7 +14,7 @@ from pyarrow import parquet
 from kros.data import EpisodeKey, Population
 from kros.plants import DcMotorPopulation, PendulumPopulation
 from kros.study import load_config
-from kros.study.stages.read import open_source
+from kros.study.stages.learning import open_source
 
 Array = np.ndarray
 DEGREE = np.pi / 180

@@ -16,12 +16,13 @@ from typing import Any
 import pytest
 from run_results import files, results
 
+from kros.core.artifacts import recorded_files
 from kros.core.errors import IdentificationError
-from kros.core.locks import NAME as LOCK
-from kros.core.locks import locked
-from kros.core.store import recorded_files
-from kros.study import learning, load_config
+from kros.core.files import NAME as LOCK
+from kros.core.files import locked
+from kros.study import load_config
 from kros.study import run as run_study
+from kros.study.stages import learning
 
 pytestmark = pytest.mark.usefixtures("few_figures")
 FAST = (

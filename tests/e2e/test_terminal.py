@@ -12,10 +12,10 @@ import warnings
 import pytest
 
 import kros as package
+from kros.cli import OnceHandler
 from kros.core.errors import ConfigError
-from kros.edge import OnceHandler
 from kros.study.config import validate_config
-from kros.study.engine.progress import Lines
+from kros.study.engine.executors import Lines
 
 
 def test_version_and_module():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import IdentificationError
-from kros.data.checks import check_episode, is_constant
 from kros.data.prepare import scale_population
+from kros.data.recording import check_episode, is_constant
 from kros.identify import Factor, PhaseSpec, combine, edmd, smallest_stabilising_alpha
 from kros.identify.calibration import find_segments
 from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation

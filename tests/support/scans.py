@@ -1,7 +1,7 @@
 """All recordings of a population read and checked."""
 
 from kros.data import EpisodeKey, Population
-from kros.data.checks import refuse_copies, usable_episodes
+from kros.data.recording import refuse_copies, usable_episodes
 
 
 def scan_digests(population: Population, on_nan: str = "error") -> list[tuple[EpisodeKey, str]]:

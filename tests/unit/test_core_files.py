@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kros.core import limits
-from kros.core.artifacts import load_artifact, pack_arrays, read_arrays, read_json, save_artifact
+from kros.core.artifacts import load_artifact, pack_arrays, place, read_arrays, read_json, save_artifact
 from kros.core.errors import ConfigError, DataError
 from kros.core.files import read_bytes, read_toml, write_bytes
-from kros.core.store import place
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from tests.support.scans import scan_digests
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays
-from kros.data.checks import check_episode, check_population
+from kros.data.recording import check_episode, check_population
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))
 KEY = EpisodeKey("001011", "load", "7")

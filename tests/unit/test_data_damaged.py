@@ -17,8 +17,8 @@ from tests.support.scans import scan_digests
 from kros.core import limits
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Role, from_arrays, prepare, read, steps, write_parquet
-from kros.data.alerts import period_alerts
 from kros.data.readers.parquet import read_parquet
+from kros.data.survey import period_alerts
 from kros.interop import from_pykoop
 
 CHANNELS = (Channel("x", Role.STATE, measured=True), Channel("v", Role.STATE), Channel("u", Role.INPUT))

@@ -10,9 +10,8 @@ from kros.data import Channel, Role, from_arrays
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.monitor import Monitor, octaves
-from kros.study.commands.check import monitored
+from kros.study.commands.check import junit_text, monitored, verdict_lines, with_verdict, worst
 from kros.study.commands.field import FieldRecordings
-from kros.study.commands.verdict import junit_text, verdict_lines, with_verdict, worst
 from kros.uncertainty.outliers.score import FEWEST_UNITS as FEWEST
 
 CHANNELS = (Channel("position", Role.STATE, "rad", True), Channel("force", Role.INPUT, "N"))

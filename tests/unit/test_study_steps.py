@@ -5,11 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from kros.core.store import Artefact
+from kros.core.artifacts import Artefact
 from kros.core.work import Work
 from kros.study.config import Stage, StudyConfig, validate_config
-from kros.study.engine.context import Context
-from kros.study.engine.steps import StageStep, run_steps
+from kros.study.engine.context import Context, StageStep, run_steps
 from kros.study.engine.store import Store
 from kros.study.pipeline import STEPS
 

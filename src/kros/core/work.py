@@ -16,11 +16,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from .artifacts import pack_arrays, unpack_arrays
+from .artifacts import digest_of, pack_arrays, unpack_arrays
 from .errors import DataError
 from .files import read_bytes, write_bytes
 from .limits import MAX_ARRAYS_BYTES
-from .store import digest_of
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

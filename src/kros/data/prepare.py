@@ -11,10 +11,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import TypeAdapter, ValidationError
 
+from ..core.artifacts import digest_of
 from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean, shortened, stamp_of
-from ..core.store import digest_of
-from .checks import check_episode, check_period, check_structure, checked_blocks
 from .population import (
     Channel,
     EpisodeKey,
@@ -27,7 +26,16 @@ from .population import (
     part_columns,
     restrict,
 )
-from .recording import Recording, Recordings, check_even, estimate_period
+from .recording import (
+    Recording,
+    Recordings,
+    check_episode,
+    check_even,
+    check_period,
+    check_structure,
+    checked_blocks,
+    estimate_period,
+)
 from .steps import STEPS, Scale, Signals, Step
 
 

@@ -1,12 +1,17 @@
-"""One episode as recorded: samples and, where there is one, a time column. Checks of time live here.
+"""One episode as recorded, and checks of its time and content: what makes an episode or a population unusable.
 
 reader ── Recording ── steps ── Recording ── checks ── samples
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import logging
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from hashlib import sha256
+from numbers import Real
 from pathlib import Path
 from typing import Any, Self
 
@@ -15,7 +20,8 @@ import numpy.typing as npt
 
 from ..core import limits
 from ..core.errors import DataError
-from .population import EpisodeKey
+from ..core.files import shortened
+from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 Float = npt.NDArray[np.float64]
 
@@ -147,3 +153,221 @@ def check_even(recording: Recording, period_s: float, reference: EpisodeKey, whe
             f"Two sampling periods: {period_s:g} s in {reference} and {period:g} s in {recording.key}{where}; a "
             f"population has one, {step}, period_s = {max(period, period_s):g}, or leave one out."
         )
+
+
+logger = logging.getLogger(__name__)
+Array = npt.NDArray[np.float64]
+
+
+class NonFiniteError(DataError):
+    """An episode holds NaN or infinity."""
+
+
+def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
+    """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
+    for _ in checked_blocks([values], key, channels, gaps=gaps):
+        pass
+
+
+def checked_blocks(
+    blocks: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
+) -> Iterator[Array]:
+    """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
+    count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
+    for values in blocks:
+        if values.ndim != 2 or values.shape[1] != len(channels):
+            declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
+            raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+        if not gaps and count + len(values) >= CHECK.samples and not usable(values).all():
+            check_finite(values, key, channels, first=count)
+        first = first if count else values[:1].ravel()
+        resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
+        count += len(values)
+        yield values
+    if count < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {count}"
+        raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
+    still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
+    moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
+    if moving:
+        stays = f"state {channels[still[0]].name!r} stays at {first[still[0]]:g} in all {count} samples"
+        reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
+        raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
+
+
+def is_constant(column: Array, first: float | None = None) -> bool:
+    """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
+    first = column[0] if first is None else first
+    room = CHECK.constant * abs(first)
+    lower, upper = first - room, first + room
+    return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
+
+
+def check_finite(
+    values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0, columns: Iterable[int] | None = None
+) -> None:
+    """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
+    for column in range(len(channels)) if columns is None else columns:
+        signal = values[:, column]
+        kinds = {
+            "NaN": np.isnan(signal),
+            f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
+            "infinity": np.isinf(signal),
+        }
+        bad = np.flatnonzero(np.any(list(kinds.values()), axis=0))
+        if bad.size:
+            what = " and ".join(kind for kind, places in kinds.items() if places.any())
+            where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
+            advice = 'fix the source or set data.on_nan = "drop_episode"'
+            name = channels[column].name
+            raise NonFiniteError(f"{title(key)}: channel {name!r} has {bad.size} {what} at {where}; {advice}.")
+
+
+class GroupWatch:
+    """What only the episodes of one unit and condition show together: channels that never move, and wild samples.
+
+    A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
+    values, and what it moves by in half of the other episodes.
+    """
+
+    def __init__(self, channels: Sequence[Channel]) -> None:
+        self._channels = channels
+        self._resting: list[dict[int, float]] = []
+        self._ranges: dict[EpisodeKey, Array] = {}
+        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # column, samples and values, quantiles
+
+    def add(self, key: EpisodeKey, values: Array) -> None:
+        """Look at one more episode, all of whose samples are usable."""
+        signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
+        self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
+        self._ranges[key] = np.ptp(values, axis=0)
+        outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
+        rows = [outside, len(values) // 2, len(values) - 1 - outside]
+        quantiles = np.partition(values, rows, axis=0)[rows]
+        for i in np.flatnonzero(self._ranges[key] > CHECK.wild * (quantiles[2] - quantiles[0])):
+            far = np.flatnonzero(np.abs(values[:, i] - quantiles[1, i]) > CHECK.wild * np.ptp(quantiles[:, i]))
+            self._suspects.append((key, int(i), np.stack([far, values[far, i]]), quantiles[:, i]))
+
+    def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
+        """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0, and the place."""
+        for suspect, i, (samples, values), (low, middle, high) in self._suspects:
+            others = sorted(ranges[i] for key, ranges in self._ranges.items() if key != suspect)
+            size = max(high - low, abs(low), abs(high), others[(len(others) - 1) // 2] if others else 0.0)
+            wild = np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))
+            if wild.size:
+                actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
+                most = f"98 % of its samples are from {low:g} to {high:g}"
+                yield suspect, f"channel {self._channels[i].name!r} is {actual}, and {most} ({wild.size} such samples)"
+
+    def check(self) -> None:
+        """Raise DataError for wild samples, and for an input or a state that never changed."""
+        for key, problem in self.wild():
+            raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
+        first = self._resting[0] if self._resting else {}
+        for i in sorted(set(first).intersection(*self._resting)):
+            key, channel = next(iter(self._ranges)), self._channels[i]
+            if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
+                continue  # it differs from episode to episode
+            what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"
+            place = f"in each of {len(self._resting)} episodes, in the first at {first[i]:g}"
+            raise DataError(f"{what} {place}; check the sensor and the column, or remove the channel or the unit.")
+
+
+def check_names(kind: str, names: Iterable[Any]) -> None:
+    """Refuse names that are empty, no text, or hold characters that no file and no table can show."""
+    for name in names:
+        if not isinstance(name, str) or not name.strip():
+            raise DataError(f"The name of every {kind} should be text that is not empty, found {name!r}; name it.")
+        if any(unicodedata.category(c) in ("Cc", "Cs") for c in name):
+            raise DataError(f"The name of a {kind} should hold printable characters only, found {name!r}; rename it.")
+
+
+def check_period(period_s: Any, what: str) -> float:
+    """Return a sampling period that is a number of seconds above zero."""
+    is_number = isinstance(period_s, Real) and not isinstance(period_s, bool)
+    if not is_number or not 1 / limits.MAX_VALUE < period_s < limits.MAX_VALUE:
+        wanted, actual = "should be a number of seconds above zero", shortened(repr(period_s))
+        raise DataError(f"{what}: the sampling period {wanted}, found {actual}; give it in seconds.")
+    return float(period_s)
+
+
+def check_structure(channels: Sequence[Channel], episodes: Sequence[EpisodeKey]) -> None:
+    """Check names: none empty, at least one state, no channel and no episode twice."""
+    check_names("channel", [c.name for c in channels])
+    for kind in ("unit", "condition", "episode"):
+        check_names(kind, dict.fromkeys(getattr(key, kind) for key in episodes))
+    names = [c.name for c in channels]
+    twice = [name for name, count in Counter(names).items() if count > 1]
+    if twice:
+        raise DataError(f"Channel names should differ, found {twice} more than once in {names}; rename them.")
+    states = [c.name for c in channels if c.role is Role.STATE]
+    if not states:
+        roles = [(c.name, c.role.value) for c in channels]
+        raise DataError(f"A population needs at least one channel with role 'state', found {roles}; declare one.")
+    truths = {c.name: c.of for c in channels if c.of or c.role is Role.TRUTH}
+    owners, declared = set(truths.values()), {c.name for c in channels if c.role is Role.TRUTH}
+    if set(truths) != declared or len(owners) < len(truths) or not owners <= set(states):
+        wanted = f"says with `of` which state it is the truth of, each of another one of {states}"
+        raise DataError(f"A channel with role 'truth' {wanted}, found {truths}; correct them.")
+    if not episodes:
+        raise DataError("The population is empty: no episode was found; check the source and the reader.")
+    copies = [(key, count) for key, count in Counter(episodes).items() if count > 1]
+    if copies:
+        actual = f"{copies[0][0]} occurs {copies[0][1]} times ({len(copies)} such episodes)"
+        raise DataError(f"Duplicate episodes: {actual}; rename or remove the copies.")
+
+
+def check_population(population: Population, allow_single: bool = False) -> None:
+    """Check what needs no reading: not empty, no duplicates, a state, a measured state, more than one unit."""
+    check_structure(population.columns, population.episodes)
+    if not population.measured:
+        problem = f"No state of {list(population.states)} is measured, so an observer has nothing to correct with"
+        raise DataError(f"{problem}; declare measured = true for at least one.")
+    recorded = {key.unit for key in population.episodes}
+    units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
+    if len(units) < 2 and not allow_single:
+        actual = f"found {len(units)} ({', '.join(units) or 'none'}): uncertainty is the difference between units"
+        advice = 'add recordings of more units, or stop after identification ("--until identify")'
+        raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
+
+
+def usable_episodes(
+    population: Population, keys: Iterable[EpisodeKey], on_nan: str = "error"
+) -> Iterator[tuple[EpisodeKey, Array, str]]:
+    """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
+    watch = GroupWatch(population.columns)
+    for key in keys:
+        try:
+            values = population.source(key)
+            check_episode(values, key, population.columns)
+        except NonFiniteError as error:
+            if on_nan != "drop_episode":
+                raise
+            logger.warning("Dropped, as data.on_nan asks: %s", error)
+            continue
+        watch.add(key, values)
+        yield key, values, digest_of(values)
+    watch.check()
+
+
+def digest_of(values: Array) -> str:
+    """Return the digest of all samples of an episode, shape (n_samples, n_channels)."""
+    values = np.ascontiguousarray(values) + 0.0  # one zero
+    digest = sha256(repr(values.shape).encode())
+    digest.update(values.data)
+    return digest.hexdigest()
+
+
+def copies_among(digests: Iterable[tuple[EpisodeKey, str]]) -> Iterator[tuple[EpisodeKey, EpisodeKey]]:
+    """Yield the episodes that are copies of earlier ones, with these."""
+    first: dict[str, EpisodeKey] = {}
+    for key, digest in digests:
+        if first.setdefault(digest, key) != key:
+            yield key, first[digest]
+
+
+def refuse_copies(digests: Iterable[tuple[EpisodeKey, str]]) -> None:
+    """Refuse copies, which put test episodes into training and one machine's data into another."""
+    for key, other in copies_among(digests):
+        reason = "a copy leaks test episodes into training and makes units look alike"
+        raise DataError(f"{title(key)} is a copy of {other}, sample by sample; {reason}, so remove one of them.")

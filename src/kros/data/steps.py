@@ -34,9 +34,8 @@ from ..core import limits
 from ..core.errors import ConfigError, DataError
 from ..core.files import did_you_mean
 from ..core.removed import refusing
-from .checks import check_finite
 from .population import Channel, Role, Scalings, scaling_of
-from .recording import CHECK, Recording, check_increasing, estimate_period, title
+from .recording import CHECK, Recording, check_finite, check_increasing, estimate_period, title
 
 __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Trim"]
 __getattr__ = refusing(__name__)

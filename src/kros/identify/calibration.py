@@ -26,9 +26,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import digest_of, load_artifact, loader, save_artifact
 from ..core.errors import IdentificationError
-from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts

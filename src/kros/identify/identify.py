@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.artifacts import digest_of
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import radius_text
 from ..core.settings import require_kind
-from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
 from ..data.survey import RecordingFacts, check_usable, survey

@@ -15,8 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, read_arrays, read_json
-from ..core.store import MANIFEST, recorded_files
+from ..core.artifacts import MANIFEST, load_artifact, read_arrays, read_json, recorded_files
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Population, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis

@@ -15,15 +15,13 @@ from ..data import Population
 from ..data.readers.opening import detect_reader
 from ..observer import Observer
 from .config import Stage, StudyConfig, load_config, validate_config
-from .engine.context import Context
+from .engine.context import Context, StageStep, run_steps
 from .engine.executors import open_executor
-from .engine.run_folder import load_run as load_run  # where readers of runs look for it
-from .engine.run_folder import open_run, require_own
-from .engine.steps import StageStep, run_steps
-from .engine.store import METRICS, Store
-from .learning import LEARNING
+from .engine.store import METRICS, Store, open_run, require_own
+from .engine.store import load_run as load_run  # where readers of runs look for it
 from .metrics import collect_metrics
-from .stages import evaluate, left_out, read, report
+from .stages import evaluate, learning, left_out, report
+from .stages.learning import LEARNING
 
 STEPS = (
     *LEARNING,
@@ -127,7 +125,7 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
     if isinstance(source, Population):
         if set(tables.get("data", ())) & {"source", "reader"}:
             raise ConfigError("Run: data.source and data.reader name recordings, and a population is given; drop them.")
-        raw: dict[str, Any] = {"name": out.name, "data": {"source": read.ARRAYS, "reader": read.ARRAYS}}
+        raw: dict[str, Any] = {"name": out.name, "data": {"source": learning.ARRAYS, "reader": learning.ARRAYS}}
         base = out
     elif isinstance(source, StudyConfig):
         raw = source.dump()
@@ -147,10 +145,12 @@ def study_of(source: Population | StudyConfig | Path | str, out: Path, sections:
 
 def require_usable(config: StudyConfig, until: Stage, population: Population | None = None) -> None:
     """Refuse what can be refused from the names of recordings alone."""
-    population = read.open_source(config, population)
-    read.check_source(config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY))
+    population = learning.open_source(config, population)
+    learning.check_source(
+        config, population, single_allowed=list(Stage).index(until) <= list(Stage).index(Stage.IDENTIFY)
+    )
     if left_out.wanted(config):
-        left_out.check_folds(config, read.taking_part(config, population))
+        left_out.check_folds(config, learning.taking_part(config, population))
 
 
 def run_in(

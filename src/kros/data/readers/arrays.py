@@ -11,10 +11,9 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.files import shortened
-from ..checks import check_period
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings, title
+from ..recording import Recording, Recordings, check_period, title
 
 Array = npt.NDArray[np.float64]
 

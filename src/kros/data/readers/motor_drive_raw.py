@@ -25,8 +25,7 @@ from ...core.errors import DataError
 from ...core.files import whole_folder
 from ..population import OUTLIERS, Channel, Population, Role
 from ..steps import Offset, Scale, Shift, Step, Trim
-from .csv_folder import csv_files, read_csv_folder
-from .csv_mapping import ChannelMapping, CsvMapping
+from .csv_folder import ChannelMapping, CsvMapping, csv_files, read_csv_folder
 from .tables import from_numpy
 
 

@@ -11,8 +11,7 @@ from ..population import Population
 from ..prepare import parse_steps
 from ..prepare import prepare as prepared
 from ..steps import Step
-from .csv_folder import csv_files, read_csv_folder
-from .csv_mapping import CsvMapping
+from .csv_folder import CsvMapping, csv_files, read_csv_folder
 from .motor_drive_raw import is_raw_layout, read_motor_drive_raw
 from .parquet import INDEX, read_parquet
 

@@ -29,10 +29,9 @@ from pydantic import TypeAdapter
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
 from ...core.files import require_regular, shortened, stamp_of, whole_folder
-from ..checks import check_structure, refuse_copies, usable_episodes
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
-from ..recording import Recording, Recordings
+from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy
 
 logger = logging.getLogger(__name__)

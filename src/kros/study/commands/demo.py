@@ -7,17 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ...core.artifacts import write_json
+from ...core.artifacts import digest_of, write_json
 from ...core.errors import ConfigError
-from ...core.store import digest_of
 from ...core.work import Progress
 from ...data import write_parquet
 from ...data.readers.motor_drive_raw import write_raw
 from ...identify.presets import HARMONIC_DRIVE
 from ..config import Stage, validate_config
 from ..engine.executors import open_executor
-from ..engine.run_folder import open_run
-from ..engine.store import code_key
+from ..engine.store import code_key, open_run
 from ..pipeline import RunResult, require_usable, run_in
 
 _STAGE, _RECORDINGS = "simulate", "simulated"

@@ -19,10 +19,9 @@ from ...loops.compiler import find_compiler
 from ...observer import Observer, run_observer
 from ...observer.units import recorded_factors
 from ..config import Stage, StudyConfig
-from ..engine.run_folder import open_finished
-from ..engine.store import Store
+from ..engine.store import Store, open_finished
+from ..stages.learning import open_source
 from ..stages.load import TrialSettings
-from ..stages.read import open_source
 from .field import load_calibration
 
 LARGEST = 20_000  # samples of the recording that generated code is compared on

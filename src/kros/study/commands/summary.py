@@ -1,7 +1,10 @@
-"""A few lines about a run for people at a terminal."""
+"""A few lines for people at a terminal: about a run, and about what is installed."""
 
 from __future__ import annotations
 
+import platform
+import shutil
+from importlib import metadata
 from pathlib import Path
 
 from ...core.artifacts import load_artifact
@@ -9,9 +12,34 @@ from ...report.error_tables import ErrorCell
 from ...report.facts import Facts
 from ...report.verdict import judge
 from ..config import Stage
-from ..engine.run_folder import open_finished
-from ..engine.store import METRICS
+from ..engine.store import METRICS, open_finished
 from ..pipeline import RunResult
+
+_REQUIRED = ("numpy", "scipy", "sympy", "pyarrow", "pydantic", "typer", "jinja2", "matplotlib")
+_OPTIONAL = {
+    "distributed": "maps over units on a cluster (kros run --scheduler)",
+    "pandas": "reading long data frames",
+    "scikit-learn": "the estimator protocol",
+    "control": "exchange with python-control",
+    "fmpy": "checking exported FMUs",
+}
+
+
+def diagnose() -> list[str]:
+    """Return lines for people."""
+    system = f"Python {platform.python_version()} on {platform.platform(terse=True)}"
+    lines = [f"kros {_version('kros', 'not installed as a package')}   {system}"]
+    lines += [f"  {name:<16} {_version(name, 'MISSING: install kros again')}" for name in _REQUIRED]
+    lines += ["optional", *(f"  {name:<16} {_version(name, 'not installed')}   {of}" for name, of in _OPTIONAL.items())]
+    compiler = shutil.which("cc") or shutil.which("gcc") or "none"
+    return [*lines, f"C compiler        {compiler}   for checking exported C code"]
+
+
+def _version(name: str, otherwise: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return otherwise
 
 
 def summary_lines(result: RunResult) -> list[str]:

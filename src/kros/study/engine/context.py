@@ -1,22 +1,30 @@
-"""What every stage gets: the study, its run folder, an executor and a progress listener."""
+"""What every stage gets, and the stages in order: each is run, or found done by the digest of what it follows from."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import logging
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
+from hashlib import sha256
+from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import load_artifact
-from ...core.work import Work
-from ...data.population import Population
+import numpy as np
+
+from ...core.artifacts import digest_of, load_artifact, write_json
+from ...core.work import Results, Work
+from ...data.population import EpisodeKey, Population
+from ...data.recording import NonFiniteError
 from ...data.survey import RecordingFacts
 from ...identify import PhaseCalibration, PhaseSpec
 from ...identify.identified import IdentifiedModels, recordings_of
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...lifting import Lifting
 from ...uncertainty.quantify import UncertainModels
-from ..config import StudyConfig
-from .store import Store
+from ..config import Stage, StudyConfig
+from .store import METRICS, STUDY, Store, code_key
 
 
 @dataclass(frozen=True)
@@ -72,3 +80,93 @@ class Context:
     def evaluation(self) -> dict[str, Any]:
         """What the evaluate stage left: errors of observers and baselines."""
         return load_artifact(self.store.path("evaluation"), "evaluation")[0]
+
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class StageStep:
+    """One stage: what it does, the sections or ``section.key`` it follows from, and which studies have it."""
+
+    stage: Stage
+    run: Callable[[Context], None]
+    sections: tuple[str, ...]
+    wanted: Callable[[StudyConfig], bool] = lambda config: True
+
+
+def run_steps(context: Context, steps: Sequence[StageStep], until: Stage) -> None:
+    """Run steps up to a stage; what later ones left goes where it does not follow from the study any more."""
+    digests = stage_digests(context, steps)
+    for step in steps[: [step.stage for step in steps].index(until) + 1]:
+        if step.stage in digests:
+            _run_step(context, step, digests)
+    _outdate(context, digests)
+
+
+def _run_step(context: Context, step: StageStep, digests: Mapping[Stage, str]) -> None:
+    """Run a step, or find it done."""
+    store, digest, progress = context.store, digests[step.stage], context.work.progress
+    if (artefact := store.stored(digest)) is not None:
+        record = store.record(step.stage)
+        if record is None or record.digest != digest:
+            _outdate(context, digests)
+        store.add(step.stage, artefact)
+        progress.finish(step.stage, artefact.seconds, skipped=True)
+        return
+    began = time.perf_counter()
+    progress.start(step.stage, None)
+    with store.drafting() as draft:
+        results = Results(store.artefacts, code_key())
+        step.run(replace(context, store=draft, work=replace(context.work, results=results)))
+        seconds = time.perf_counter() - began
+        _outdate(context, digests)
+        store.path(METRICS).unlink(missing_ok=True)
+        draft.commit(step.stage, digest, seconds, results.used)
+    progress.finish(step.stage, seconds, skipped=False)
+    log.info("%s: %.2f s", step.stage, seconds)
+
+
+def _outdate(context: Context, digests: Mapping[Stage, str]) -> None:
+    """Remove what does not follow from the study any more; the run folder is that of the study as it is now."""
+    store, manifest = context.store, context.store.manifest
+    outdated = [stage for stage in Stage if stage in manifest and manifest[stage].digest != digests.get(stage)]
+    if outdated:
+        store.path(METRICS).unlink(missing_ok=True)
+        store.drop(*outdated)
+    write_json(store.path(STUDY), context.config.dump())
+
+
+def stage_digests(context: Context, steps: Sequence[StageStep]) -> dict[Stage, str]:
+    """Return digests of what stages follow from: kros, the stages before, recordings, their part of the study."""
+    tables, digest, digests = context.config.dump(), code_key(), dict[Stage, str]()
+    for step in steps:
+        if step.wanted(context.config):
+            inputs = inputs_digest(context) if step.stage is Stage.READ else ""
+            digest = digest_of(digest, str(step.stage), inputs, [_part(tables, name) for name in step.sections])
+            digests[step.stage] = digest
+    return digests
+
+
+def _part(tables: Mapping[str, Mapping[str, object]], name: str) -> object:
+    """Return a section of a study, or a ``section.key``."""
+    section, _, key = name.partition(".")
+    return tables[section][key] if key else tables[section]
+
+
+def inputs_digest(context: Context) -> str:
+    """Return a digest of all recordings: files by path, size and time, arrays by their content."""
+    given, source = context.given, context.config.data.source
+    if given is not None:
+        declared = (given.columns, given.sample_period_s, given.units, sorted(given.metadata.items()))
+        return digest_of(declared, [(str(key), _digest(given, key)) for key in given.episodes])
+    files = sorted(p for p in source.rglob("*") if p.is_file()) if source.is_dir() else [Path(source)]
+    return digest_of([(str(f), f.stat().st_size, f.stat().st_mtime_ns) for f in files])
+
+
+def _digest(given: Population, key: EpisodeKey) -> str:
+    """Return a digest of an episode; of one that is not finite, the message: it is dropped, or an error."""
+    try:
+        return sha256(np.ascontiguousarray(given.source(key)).tobytes()).hexdigest()
+    except NonFiniteError as error:
+        return str(error)

@@ -1,22 +1,162 @@
 """Where maps over units run: here, in processes on this machine, or on a Dask cluster. The same code, the same bytes.
 
-Worker processes hold one end of a pipe whose other end is this process's alone: they end when it is closed, however
-this process ended.
+The order of the sums in a matrix product depends on the number of threads, so every worker uses one. Worker processes
+hold one end of a pipe whose other end is this process's alone: they end when it is closed.
 """
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Callable, Iterable, Iterator
+import socket
+import sys
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
+from threading import Lock
 from typing import Any, TypeVar
 
-from ...core.errors import ConfigError, KrosError
-from ...core.work import Executor
-from .cluster import open_dask, single_threaded
+from ...core.errors import ConfigError, KrosError, MissingDependencyError
+from ...core.work import Executor, Progress
+from .store import code_key
+
+
+class Lines(Progress):
+    """One line a finished stage, and one every few seconds while a stage advances."""
+
+    def __init__(self, every_s: float = 10.0) -> None:
+        self._every_s, self._written = every_s, time.monotonic()
+        self._stage, self._done, self._began = "", 0, 0.0
+        self._total: int | None = None
+
+    def start(self, stage: str, total: int | None) -> None:
+        """Remember what runs."""
+        self._stage, self._total, self._done, self._began = stage, total, 0, time.monotonic()
+
+    def advance(self) -> None:
+        """Count."""
+        self._done += 1
+        if time.monotonic() - self._written >= self._every_s:
+            of = f" of {self._total}" if self._total else ""
+            self._write(f"  {self._stage} ... {self._done}{of}, {time.monotonic() - self._began:.0f} s")
+
+    def finish(self, stage: str, seconds: float, skipped: bool) -> None:
+        """Write one line."""
+        self._write(f"{stage:<12} {'unchanged' if skipped else f'{seconds:6.1f} s'}")
+
+    def _write(self, line: str) -> None:
+        self._written = time.monotonic()
+        with suppress(OSError, ValueError):  # the reader may be gone
+            sys.stderr.write(f"{line}\n")
+            sys.stderr.flush()
+
 
 T = TypeVar("T")
+log = logging.getLogger(__name__)
+_BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
+_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
+_ALONE = Lock()
+_LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
+_GIVEN_UP = (
+    "one piece of work ended several workers, and was given up: memory ran out, or they were stopped. "
+    "Give workers more memory, see their logs, and run the same command again: it goes on where this one ended."
+)
+
+
+class DaskExecutor(Executor):
+    """Runs tasks on a Dask cluster, in batches where they are many."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self._client, self._address = client, address
+
+    def map(self, function: Callable[[Any], T], tasks: Iterable[Any]) -> Iterator[T]:
+        """Yield results in the order of the tasks, which run again elsewhere where a worker ends."""
+        from distributed.client import ClosedClientError
+
+        tasks = list(tasks)
+        size = min(_LARGEST, -(-len(tasks) // _BATCHES)) or 1
+        batches = [tasks[start : start + size] for start in range(0, len(tasks), size)]
+        try:
+            futures = self._client.map(partial(run_batch, code_key(), function), batches, pure=False)
+        except ClosedClientError as error:
+            raise self._error(_LOST) from error
+        return self._results(deque(futures))
+
+    def _results(self, futures: deque[Any]) -> Iterator[Any]:
+        """Yield results of batches; workers forget what was yielded."""
+        from distributed import KilledWorker
+
+        try:
+            while futures:
+                yield from futures.popleft().result()
+        except KilledWorker as error:
+            raise self._error(_GIVEN_UP) from error
+        except CancelledError as error:
+            raise self._error(_LOST) from error
+
+    def _error(self, text: str) -> KrosError:
+        return KrosError(f"Dask scheduler {self._address}: {text}")
+
+
+def run_batch(key: str, function: Callable[[Any], T], tasks: Sequence[Any]) -> list[T]:
+    """In a worker: run a batch of tasks, while no other one runs in this process."""
+    from threadpoolctl import threadpool_limits
+
+    worker = f"Dask worker on {socket.gethostname()}"
+    if code_key() != key:
+        raise KrosError(f"{worker}: its kros is not that of the study; install the same version on every worker.")
+    with _ALONE, single_threaded(), threadpool_limits(1):
+        try:
+            return [function(task) for task in tasks]
+        except FileNotFoundError as error:
+            needed = "recordings and run folder must be in a shared folder, the same path on every worker"
+            raise KrosError(f"{worker}: finds no {error.filename}; {needed}.") from error
+
+
+@contextmanager
+def single_threaded() -> Iterator[None]:
+    """Let processes that start now, and libraries for linear algebra that are loaded now, use one thread."""
+    saved = {name: os.environ.get(name) for name in _THREADS}
+    os.environ.update(dict.fromkeys(_THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in saved.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
+
+
+@contextmanager
+def open_dask(address: str) -> Iterator[DaskExecutor]:
+    """Connect to a Dask scheduler."""
+    try:
+        import threadpoolctl  # noqa: F401  # workers have what is installed here
+        from distributed import Client
+        from distributed.comm.addressing import get_address_host_port
+    except ImportError as error:
+        raise MissingDependencyError(f"--scheduler {address} needs Dask: pip install 'kros[dask]'.") from error
+    try:
+        get_address_host_port(address)  # a client made with something else goes on trying
+        client = Client(address, set_as_default=False)
+    except (OSError, ValueError) as error:
+        problem = f"no Dask scheduler of this version answers there ({error})"
+        raise ConfigError(f"--scheduler {address}: {problem}; correct the address.") from error
+    if not client.nthreads():
+        log.warning("Dask scheduler %s: has no workers yet; the study waits for them.", address)
+    messages = logging.getLogger("distributed.client")
+    level = messages.level
+    messages.setLevel(logging.CRITICAL)  # a lost connection is an error here
+    try:
+        with client:
+            yield DaskExecutor(client, address)
+    finally:
+        messages.setLevel(level)
+
+
 _CHUNKS = 128  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 

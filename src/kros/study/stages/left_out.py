@@ -31,11 +31,9 @@ from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer
 from ..config import Stage, StudyConfig
-from ..engine.context import Context
-from ..engine.steps import StageStep, run_steps
-from ..learning import LEARNING
+from ..engine.context import Context, StageStep, run_steps
 from .evaluate import band_hz, estimation, facts_of, outcomes
-from .read import FEWEST
+from .learning import FEWEST, LEARNING
 
 log = logging.getLogger(__name__)
 FOLDER, KIND = Stage.LEFT_OUT.value, "left_out"

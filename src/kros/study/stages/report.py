@@ -6,12 +6,12 @@ import time
 from functools import partial
 from pathlib import Path
 
-from ...core.store import digest_of
+from ...core.artifacts import digest_of
 from ...core.work import Progress
 from ..config import Stage
 from ..engine.context import Context
 from ..engine.executors import open_executor
-from ..engine.run_folder import open_finished
+from ..engine.store import open_finished
 
 REPORT = "report.html"
 _SHOWN = [stage for stage in Stage if stage is not Stage.REPORT]

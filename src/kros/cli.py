@@ -178,7 +178,7 @@ Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
 Overrides = Annotated[list[str] | None, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
 Seed = Annotated[int, typer.Option(min=0)]
-Prefix = Annotated[str | None, _option("Prefix of all names, a C identifier; default: the study's name.", "--name")]
+Prefix = Annotated[str | None, _option("Prefix of all names, a C identifier; default: that of the study.", "--name")]
 Precision = Annotated[str, _option("double or float")]
 ObserverName = Annotated[str, _option("Observer of the run; default: the one that is deployed.", "--observer")]
 Track = Annotated[str | None, _option("Parameter that a phase-locked loop follows.", metavar="NAME")]

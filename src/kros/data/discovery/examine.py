@@ -1,4 +1,4 @@
-"""How files are written (encoding, delimiter, decimal point, header, units), and what looks wrong in their recordings."""
+"""How files are written (encoding, delimiter, header, units of measure), and what looks wrong in recordings."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recordings beside a finished run, with parameters of every unit, and `kros estimate` on them, in the recordings' units."""
+"""Recordings beside a finished run, with parameters of every unit, and `kros estimate`, in the recordings' units."""
 
 from __future__ import annotations
 

@@ -38,6 +38,8 @@ from .recording import (
 )
 from .steps import STEPS, Scale, Signals, Step
 
+HEAD = 100_000  # samples whose median step is the period
+
 
 @dataclass(frozen=True, eq=False)
 class PreparedSource:
@@ -53,24 +55,41 @@ class PreparedSource:
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
         recording = self.recorded(key)
+        self._check_time(recording)
+        values, channels = self._prepared(recording)
+        check_episode(values, key, channels, gaps=self.gaps)
+        return values
+
+    def _check_time(self, recording: Recording) -> None:
+        """Refuse uneven time, unless a step makes it even."""
         if not any(step.makes_even for step in self.steps):
             read = self.recordings
-            file = read.file(read.places[key]) if isinstance(read, Recordings) else None
+            file = read.file(read.places[recording.key]) if isinstance(read, Recordings) else None
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
+
+    def _prepared(self, recording: Recording) -> tuple[npt.NDArray[np.float64], tuple[Channel, ...]]:
+        """Return what steps make of an episode, or of a part of it, and the channels."""
         signals = Signals(self.channels, self.period_s)
         for step in self.steps:
             recording = step.apply(recording, signals.channels, signals.period_s)
             signals = step.describe(signals)
-        check_episode(recording.values, key, signals.channels, gaps=self.gaps)
-        return recording.values
+        return recording.values, signals.channels
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
-        blocks = getattr(self.recordings, "blocks", None)
-        if blocks is not None and not self.steps:
-            return checked_blocks(blocks(key, rows), key, self.channels, gaps=self.gaps)
+        if isinstance(self.recordings, Recordings) and all(step.samplewise for step in self.steps):
+            return checked_blocks(self._in_turn(self.recordings.blocks(key, rows)), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
+
+    def _in_turn(self, blocks: Iterable[Recording]) -> Iterator[npt.NDArray[np.float64]]:
+        """Yield blocks of an episode after their steps; time is checked from the sample before on."""
+        end = np.empty(0)
+        for block in blocks:
+            if block.time_s is not None:
+                self._check_time(replace(block, time_s=np.append(end, block.time_s)))
+                end = block.time_s[-1:]
+            yield self._prepared(block)[0]
 
     def recorded(self, key: EpisodeKey) -> Recording:
         """Return one episode as recorded."""
@@ -101,7 +120,8 @@ def assemble(
     episodes = tuple(key for _, key in sorted(order, key=lambda pair: pair[0]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
-    period = estimate_period(recordings(episodes[0])) if sample_period_s is None else sample_period_s
+    head = next(recordings.blocks(episodes[0], HEAD)) if sample_period_s is None else None
+    period = sample_period_s if head is None else estimate_period(head)
     period = check_period(period, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
     about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}

@@ -9,7 +9,6 @@ import re
 import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -18,13 +17,13 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core.errors import DataError
-from ...core.files import did_you_mean, read_toml, require_regular, stamp_of
+from ...core.files import did_you_mean, read_toml, require_regular
 from ...core.settings import Settings
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import Scale, Step
-from .tables import Dialect, file_fields, read_columns
+from .tables import PARQUET, Dialect, file_fields, read_blocks, read_columns
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -201,20 +200,31 @@ class CsvRecordings(Recordings):
         """Return one episode as recorded."""
         i, n = place.piece
         require_regular(Path(place.path), sys.maxsize)
-        columns = _whole_file(self, replace(place, piece=(0, n)), stamp_of(Path(place.path)))
+        columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect, self.timestamp)
         columns = columns[:, i * columns.shape[1] // n : (i + 1) * columns.shape[1] // n]
+        return self._recording(key, columns.T, columns[:1, :1])
+
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
+        """Yield one episode in blocks, unless it is a piece of a file, in Parquet, or with timestamps."""
+        place, first = self.places[key], np.zeros((0, 0))
+        if place.piece[1] > 1 or self.timestamp is not None or place.path.endswith(PARQUET):
+            yield self(key)
+            return
+        before: Recording | None = None
+        for values in read_blocks(Path(place.path), place.names, place.wanted, self.dialect, rows):
+            first = first if first.size else values[:1, :1]
+            yield from [] if before is None else [before]
+            before = self._recording(key, values, first)
+        yield from [] if before is None else [before.ended()]
+
+    def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
+        """Return samples with their time, the first column if there is one, since the `first` of an episode."""
         if self.time_scale is None:
-            return Recording(key, np.ascontiguousarray(columns.T))
+            return Recording(key, np.ascontiguousarray(values))
         scale = 1.0 if self.timestamp is not None else self.time_scale
-        time = np.where(usable(columns[0]), columns[0], np.nan)
-        since = time - time[:1]  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
-        return Recording(key, np.ascontiguousarray(columns[1:].T), since * scale)
-
-
-@lru_cache(maxsize=1)  # pieces of a file are read one behind the other
-def _whole_file(recordings: CsvRecordings, place: FilePlace, version: tuple[int, int]) -> Array:
-    """Return the wanted columns of a file, shape (len(wanted), n_rows)."""
-    return read_columns(Path(place.path), place.names, place.wanted, recordings.dialect, recordings.timestamp)
+        time, start = (np.where(usable(t), t, np.nan) for t in (values[:, 0], first[:, 0]))
+        since = time - start  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
+        return Recording(key, np.ascontiguousarray(values[:, 1:]), since * scale)
 
 
 def read_csv_folder(

@@ -61,11 +61,11 @@ class ParquetRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: Place) -> Recording:
         """Return one episode."""
-        (values,) = self.blocks(key)
-        return Recording(key, values)
+        (recording,) = self.blocks(key)
+        return recording
 
-    def blocks(self, key: EpisodeKey, rows: int | None = None) -> Iterator[Array]:
-        """Yield the samples of an episode, shape (n, n_columns), whole or in blocks of at most `rows`."""
+    def blocks(self, key: EpisodeKey, rows: int | None = None) -> Iterator[Recording]:
+        """Yield an episode whole, or in blocks of at most `rows` samples."""
         place = self.places[key]
         path = self.file(place)
         require_regular(path, sys.maxsize)
@@ -74,7 +74,7 @@ class ParquetRecordings(Recordings):
                 table.select(KEYS).validate(full=True)
                 if [table.column(name).unique().to_pylist() for name in KEYS] != [[name] for name in astuple(key)]:
                     raise DataError(f"Reading {path}: the index says {key}, the samples do not; {AGAIN}.")
-                yield np.column_stack([to_numpy(table.column(channel)) for channel in self.columns])
+                yield Recording(key, np.column_stack([to_numpy(table.column(channel)) for channel in self.columns]))
         except DataError:
             raise
         except _ARROW_ERRORS as error:

@@ -11,6 +11,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 
@@ -69,21 +70,48 @@ def read_columns(
     """
     import pyarrow as pa
 
-    try:
-        table = (_parquet_table if path.suffix == PARQUET else _text_table)(path, names, wanted, dialect, timestamp)
+    with _explained(path, names):
+        if path.suffix == PARQUET:
+            table = _parquet_table(path, names, wanted, timestamp)
+        else:
+            table = pa.Table.from_batches(list(_text_batches(path, names, wanted, dialect, timestamp)))
         columns = [table.column(name) for name in wanted]
         first = [] if timestamp is None else [seconds_of(columns.pop(0), timestamp)]
         return np.array([*first, *map(to_numpy, columns)]).reshape(len(wanted), table.num_rows)
+
+
+def read_blocks(
+    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, rows: int
+) -> Iterator[Array]:
+    """Yield some columns of a text file in blocks of at least `rows`, the last one apart, shape (n, len(wanted))."""
+    import pyarrow as pa
+
+    batches: list[Any] = []
+    with _explained(path, names):
+        for batch in chain(_text_batches(path, names, wanted, dialect, None), [None]):
+            if batches and (batch is None or sum(b.num_rows for b in batches) >= rows):
+                table, batches = pa.Table.from_batches(batches), []
+                yield np.column_stack([to_numpy(table.column(name)) for name in wanted])
+            batches.append(batch)
+
+
+@contextmanager
+def _explained(path: Path, names: Sequence[str]) -> Iterator[None]:
+    """Turn what Arrow says about a file into one error."""
+    import pyarrow as pa
+
+    try:
+        yield
     except DataError:
         raise
     except (pa.ArrowException, OSError, ValueError, LookupError) as error:
         raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file, or the mapping.") from error
 
 
-def _text_table(
+def _text_batches(
     path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, timestamp: str | None
-) -> Any:
-    """Read columns of a text file as numbers, but for the first one with `timestamp`."""
+) -> Iterator[Any]:
+    """Yield batches of columns of a text file as numbers, but for the first one with `timestamp`."""
     import pyarrow as pa
     from pyarrow import csv as arrow
 
@@ -102,16 +130,14 @@ def _text_table(
         lines = dialect.skip_rows + dialect.header + (dialect.unit_rows if dialect.header else 0)
         _skip(file, lines, path)  # here, so that both readings count lines alike
         try:
-            return arrow.read_csv(pa.PythonFile(file, mode="r"), *options)
+            yield from arrow.open_csv(pa.PythonFile(file, mode="r"), *options)
         except pa.ArrowInvalid as error:
-            if "Empty CSV" in str(error):
-                return pa.schema(kinds).empty_table()
-            raise
+            if "Empty CSV" not in str(error):
+                raise
+            yield from pa.schema(kinds).empty_table().to_batches() or [pa.RecordBatch.from_pylist([], pa.schema(kinds))]
 
 
-def _parquet_table(
-    path: Path, names: Sequence[str], wanted: Sequence[str], dialect: Dialect, timestamp: str | None
-) -> Any:
+def _parquet_table(path: Path, names: Sequence[str], wanted: Sequence[str], timestamp: str | None) -> Any:
     """Read columns of a Parquet file as numbers, but for the first one with `timestamp`."""
     import pyarrow as pa
     from pyarrow import parquet

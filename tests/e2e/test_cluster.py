@@ -176,10 +176,6 @@ def missing(folder: Path) -> str:
     return (folder / "nowhere").read_text()
 
 
-def unknown(_: int) -> None:
-    raise ModuleNotFoundError("No module named 'kros'")
-
-
 def alone(_: int, folder: Path) -> bool:
     """Whether no other task runs in this process beside this one."""
     mark = folder / str(os.getpid())
@@ -216,8 +212,6 @@ def test_tasks_run_alone_with_one_thread_and_their_errors_come_back(cluster, tmp
             list(executor.map(refuse, [7]))
         with pytest.raises(KrosError, match="nowhere; recordings and run folder must be in a shared folder"):
             list(executor.map(missing, [tmp_path]))
-        with pytest.raises(KrosError, match="there or on a worker a package is not installed"):
-            list(executor.map(unknown, [0]))
     if len(os.sched_getaffinity(0)) > 1:  # else one thread is all there is
         with distributed.Client(address, set_as_default=False) as client:
             assert client.submit(threads, 0).result() != {1}

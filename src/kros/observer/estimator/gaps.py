@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ..filter_bank import FilterBank
+from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
 from ..step import Parameters
@@ -127,7 +127,7 @@ def blended_errors(
     x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
     for k, lost in enumerate(missing[:-1]):
         count = np.where(lost, count + 1, 0.0)
-        age = np.maximum(np.where(lost, age, recovery * age), count)
+        age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
         level = (age**2 / (age**2 + half**2))[..., None]
         fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])

@@ -36,9 +36,10 @@ from kros.core.artifacts import (
 )
 from kros.core.errors import KrosError
 from kros.core.lti import StateSpace
-from kros.data import Channel, Role, from_arrays, from_frame, from_pykoop, read, write_parquet
+from kros.data import Channel, Role, from_arrays, from_frame, read, write_parquet
 from kros.data.recording import check_population, usable_episodes
 from kros.identify import ModelSet
+from kros.interop import from_pykoop
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime
 from kros.study.config import load_config, stored_config

@@ -179,6 +179,11 @@ class Design:
         found = self.recordings.groups(self.settings.folds, self.settings.parts)
         return dict(zip(self.recordings.keys, found, strict=True))
 
+    @cached_property
+    def fine_sample(self) -> tuple[Array, Array]:
+        """Thinned rows of the bank with every delay, and their weights."""
+        return replace(self, bank=self.bank.fine).sample()
+
     def sample(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
         """Return thinned rows of the bank, and weights that sum to one."""
         parts = list(self.rows(self.recordings.some(150), self.settings.sample, offset))
@@ -236,8 +241,8 @@ class Moments:
     def of(cls, design: Design, whitening: Whitening) -> Moments:
         """Sum the rows of every group."""
         sums: dict[Group, list[Array]] = {}
-        groups = design.groups
-        for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
+        groups, recordings = design.groups, design.recordings.some(design.settings.episodes)
+        for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
             group = groups[key]
             F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
             t = targets * np.sqrt(weights)[:, None]

@@ -56,7 +56,7 @@ def test_truths_are_written_prepared_and_scaled_with_their_states(tmp_path: Path
         np.testing.assert_array_equal(again.source(key), judged.source(key))
         np.testing.assert_allclose(scaled.source(key) * [1, 4, 1, 4], again.source(key))
         np.testing.assert_array_equal(again.read_with_truths(key)[1][:, 0], 2 * recorded().source(key)[3:, 3])
-    assert "truths" not in read_json(tmp_path / "plain" / "population.json")
+    assert read_json(tmp_path / "plain" / "population.json")["truths"] == []
     assert survey(again)[1] == survey(judged)[1]
 
 

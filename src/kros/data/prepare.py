@@ -36,7 +36,7 @@ from .recording import (
     checked_blocks,
     estimate_period,
 )
-from .steps import STEPS, Scale, Signals, Step
+from .steps import STEPS, Signals, Step
 
 HEAD = 100_000  # samples whose median step is the period
 
@@ -197,10 +197,28 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
         raise ConfigError(f"{where} (step {name!r}): {text}.") from error
 
 
+@dataclass(frozen=True, eq=False)
+class Scaled:
+    """A source whose columns are divided by sizes, shape (n_columns,)."""
+
+    source: EpisodeSource
+    sizes: npt.NDArray[np.float64]
+
+    def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
+        """Return the samples of an episode, shape (n_samples, n_columns)."""
+        return np.asarray(self.source(key) / self.sizes)
+
+    def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
+        """Return the same for fewer episodes."""
+        return Scaled(restrict(self.source, keys), self.sizes)
+
+
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
     """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
-    owners = {c.name: c.of or c.name for c in population.columns}
-    return prepare(population, [Scale((c,), 1 / float(sizes[of]), "") for c, of in owners.items() if of in sizes])
+    owners = [c.of or c.name for c in population.columns]
+    source = Scaled(population.source, np.array([float(sizes.get(name, 1.0)) for name in owners]))
+    columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
+    return replace(population, source=source, **part_columns(columns))
 
 
 def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:

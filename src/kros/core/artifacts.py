@@ -30,7 +30,7 @@ from pydantic_core import to_jsonable_python
 
 from . import limits
 from .errors import ConfigError, DataError, KrosError
-from .files import is_file, read_bytes, shortened, stamp_of, write_bytes
+from .files import is_file, pass_on_shortage, read_bytes, shortened, stamp_of, write_bytes
 from .settings import Settings
 
 T = TypeVar("T")
@@ -117,6 +117,7 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
             raise ValueError("a part of it is no array")
         return arrays
     except _DAMAGED as error:
+        pass_on_shortage(error, path)
         problem = f"not a valid archive of arrays ({error or type(error).__name__})"
         raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
 

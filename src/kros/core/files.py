@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import logging
 import os
+import re
 import shutil
 import socket
 import stat
@@ -115,6 +116,13 @@ def read_toml(path: Path, what: str) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:  # of decoding, of TOML, of numbers with thousands of digits
         reason = "nested too deeply" if isinstance(error, RecursionError) else shortened(str(error))
         raise ConfigError(f"{what} {path}: not a TOML file that can be used ({reason}); correct it.") from error
+
+
+def pass_on_shortage(error: BaseException, path: Path) -> None:
+    """Raise a shortage of memory as such, unless a damaged file states a size that no file has."""
+    stated = max(map(int, re.findall(r"\d{1,30}", str(error))), default=0)
+    if isinstance(error, MemoryError) and stated <= limits.MAX_ARRAYS_BYTES:
+        raise MemoryError(f"{str(error) or 'no details'}, while {path} was read") from error
 
 
 def shortened(text: str, longest: int = 300) -> str:

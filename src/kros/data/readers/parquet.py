@@ -28,7 +28,7 @@ from pydantic import TypeAdapter
 
 from ...core.artifacts import load_artifact, save_artifact
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened, stamp_of, whole_folder
+from ...core.files import pass_on_shortage, require_regular, shortened, stamp_of, whole_folder
 from ..population import Channel, EpisodeKey, Population, Scaling, Unit, columns_in_order
 from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
@@ -45,7 +45,7 @@ AGAIN = "convert the recordings again"
 LONGEST_NAME = 200  # file systems allow 255 bytes, and a temporary name is longer
 # Signals as bytes of equal weight side by side, then LZ4: 57 % of the size for 0.03 s per 91 MB; zstd: 55 %, 0.08 s.
 COMPRESSION, SIGNALS, COUNTER = "lz4", "BYTE_STREAM_SPLIT", "DELTA_BINARY_PACKED"
-_ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError)
+_ARROW_ERRORS = (OSError, ValueError, LookupError, TypeError, ArithmeticError, NotImplementedError, MemoryError)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +78,7 @@ class ParquetRecordings(Recordings):
         except DataError:
             raise
         except _ARROW_ERRORS as error:
+            pass_on_shortage(error, path)
             raise DataError(f"Reading {key} from {path}: {shortened(str(error))}; {AGAIN}.") from error
 
 

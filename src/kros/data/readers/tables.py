@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from ...core import limits
 from ...core.errors import DataError
-from ...core.files import require_regular, shortened
+from ...core.files import pass_on_shortage, require_regular, shortened
 
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
@@ -104,7 +104,8 @@ def _explained(path: Path, names: Sequence[str]) -> Iterator[None]:
         yield
     except DataError:
         raise
-    except (pa.ArrowException, OSError, ValueError, LookupError) as error:
+    except (pa.ArrowException, OSError, ValueError, LookupError, MemoryError) as error:
+        pass_on_shortage(error, path)
         raise DataError(f"Reading {path}: {_explain(str(error), names)}; correct the file, or the mapping.") from error
 
 

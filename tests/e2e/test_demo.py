@@ -180,6 +180,14 @@ def test_new_units_are_scored(kros, demo, recorded, tmp_path):
         (tmp_path / "elsewhere").rename(recorded)
 
 
+@pytest.mark.parametrize("name", ["koopman_edmd", "linear_edmd"])
+def test_noise_is_kept_and_summarised(demo, metrics, name):
+    share = metrics["uncertainty"][name]["noise_share"]
+    assert all(0 <= share[key] <= 1 for key in ("median", "at_peak"))
+    assert share["peak_hz"] > 0
+    assert (demo / "uncertainty" / name / "noise" / "noise_share.json").exists()
+
+
 def test_every_disturbance_is_told_for_the_observers_of_the_kind_that_is_handed_over(metrics):
     rows = metrics["robustness"]
     kind = metrics["study"]["deployed"].rpartition("/")[0]

@@ -77,6 +77,16 @@ def test_mapping_from_a_toml_file(folder: Path, tmp_path: Path) -> None:
     assert read_csv_folder(folder, str(path)).channels == read_csv_folder(folder, MAPPING).channels
 
 
+def test_several_units_in_one_file(tmp_path: Path) -> None:
+    values = np.column_stack([samples(0), samples(1)[:, 1:]])
+    write(tmp_path / "rig_1.csv.gz", values, "t,pos1,volt1,pos2,volt2")
+    units = [{"suffix": f"/joint{j}", "columns": {"x": f"pos{j}", "u": f"volt{j}"}} for j in (1, 2)]
+    channel = [{k: v for k, v in c.items() if k not in ("column", "scale")} for c in CHANNEL]
+    population = read_csv_folder(tmp_path, mapping(files=r"(?P<unit>\w+)_(?P<episode>\d)", channel=channel, unit=units))
+    assert population.unit_ids == ("rig/joint1", "rig/joint2")
+    np.testing.assert_allclose(population.read(EpisodeKey("rig/joint2", "default", "1")), values[:, 3:], rtol=1e-15)
+
+
 def test_decimal_comma_skipped_lines_and_quoted_names(tmp_path: Path) -> None:
     text = '\ufeffBench 4\n;;\n"t";"pos; raw";"volt"\n0,00;1,5;-2e0\n0,01;2,5;3\n0,02;4,5;3\n'
     (tmp_path / "a_1.csv").write_text(text, encoding="utf-8")
@@ -182,6 +192,10 @@ def test_another_rate(folder: Path) -> None:
         ({"delimiter": "::"}, "two different characters .* found delimiter = '::'"),
         ({"decimal": ","}, "two different characters"),
         ({"skip_rows": -1}, "skip_rows: input should be greater than or equal to 0, found -1"),
+        (
+            {"unit": [{"suffix": "1", "columns": {"z": "pos"}}]},
+            r"gives a column for 'z'; the channels are \['u', 'x'\]",
+        ),
         ({"prepare": [{"step": "trim", "begin": 1}]}, "key 'begin' is unknown"),
     ],
 )

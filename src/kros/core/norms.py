@@ -25,6 +25,7 @@ import numpy.typing as npt
 from .errors import DimensionError, KrosError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
+from .precise import precise_gain, precise_h2_norm
 
 Array = npt.NDArray[Any]
 
@@ -45,13 +46,19 @@ def as_state_space(system: Any) -> StateSpace:
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Gramian of a stable pair, ``P = A P A' + B B'``; ``A P + P A' + B B' = 0`` for ``dt = 0``."""
+    """Gramian of a stable pair, ``P = A P A' + B B'`` by doubling; ``A P + P A' + B B' = 0`` for ``dt = 0``."""
+    power, P = A, B @ B.T
     if dt == 0:
         from scipy.linalg import solve_continuous_lyapunov
 
-        return np.asarray(solve_continuous_lyapunov(A, -B @ B.T))
-    R = gramian_root(A, B, dt)
-    return R @ R.T
+        return np.asarray(solve_continuous_lyapunov(A, -P))
+    for _ in range(_MAX_ITERATIONS):
+        step = power @ P @ power.T
+        P = P + step
+        if np.all(np.diag(step) <= _EPSILON * np.diag(P)):  # state by state, in whatever units of measure
+            break
+        power = power @ power
+    return (P + P.T) / 2
 
 
 def gramian_root(A: Array, B: Array, dt: float) -> Array:
@@ -86,12 +93,7 @@ def h2_norm(system: Any) -> float:
     Returns
     -------
     float
-        Infinity for a system that is unstable or within rounding of it, and for a continuous one with `D`.
-
-    Raises
-    ------
-    KrosError
-        Double precision does not suffice: the norms by both Gramians differ.
+        Infinity for an unstable system, and for a continuous one whose `D` is not zero.
 
     Examples
     --------
@@ -100,13 +102,16 @@ def h2_norm(system: Any) -> float:
     1.0
     """
     system = balanced(as_state_space(system))
-    if (system.dt == 0 and np.any(system.D)) or _near_the_limit(system) or not system.is_stable():
+    if system.dt == 0 and np.any(system.D):
+        return float("inf")
+    if _near_the_limit(system):
+        return precise_h2_norm(system)
+    if not system.is_stable():
         return float("inf")
     squared = float(np.trace(system.C @ gramian(system.A, system.B, system.dt) @ system.C.T))
     dual = float(np.trace(system.B.T @ gramian(system.A.T, system.C.T, system.dt) @ system.B))
     if not abs(squared - dual) <= _AGREE * max(squared, dual):
-        problem = f"its square is {squared:g} by one Gramian and {dual:g} by the other"
-        raise KrosError(f"H2 norm: double precision does not suffice, {problem}; scale or reduce the system.")
+        return precise_h2_norm(system)
     return float(np.sqrt(max(squared, 0.0) + (np.sum(system.D**2) if system.dt > 0 else 0.0)))
 
 
@@ -143,7 +148,7 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     Returns
     -------
     float
-        Infinity for an unstable system. Where rounding may change the gain by more than `tol`, its bound is added.
+        Infinity for an unstable system.
 
     Examples
     --------
@@ -165,12 +170,12 @@ def hinf_norm(system: Any, tol: float = 1e-6) -> float:
     if lower == 0.0:
         return 0.0
     error = _rounding(system, at) / lower
-    room = max(tol, error)
+    search, room, known = (_largest, tol, known[:0]) if error <= tol else (_peak, error, known)  # as are eigenvalues
     for _ in range(_MAX_ITERATIONS):
-        _, best = _largest(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
-        if best <= lower * (1 + room):
-            return max(lower, best) * (1 if error <= tol else 1 + error)
-        lower = best
+        peak, best = search(system, np.concatenate([known, crossings(continuous, lower * (1 + room))]))
+        before, (at, lower) = lower, max((peak, best), (at, lower), key=lambda pair: pair[1])
+        if best <= before * (1 + room):
+            return lower if error <= tol else precise_gain(system, _in_hz(system, at))
     problem = f"no convergence after {_MAX_ITERATIONS} level sets, the last at {lower}"
     raise KrosError(f"H-infinity norm: {problem}; scale states and time, or ask for a larger tol than {tol}.")
 
@@ -191,6 +196,21 @@ def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
     gains = _gains(system, nu)
     best = int(np.argmax(gains)) if gains.size else 0
     return (float(nu[best]), float(gains[best])) if gains.size else (0.0, 0.0)
+
+
+def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
+    """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
+    nu = np.unique(nu)
+    gains = _gains(system, nu)
+    best = int(np.argmax(gains))
+    at, most, low, high = nu[best], gains[best], nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
+    while high - low > 1e-9 * high:
+        inside = np.linspace(low, high, 12)
+        gains = _gains(system, inside)
+        best = int(np.argmax(gains))
+        at, most = max((inside[best], gains[best]), (at, most), key=lambda pair: pair[1])
+        low, high = inside[max(best - 1, 0)], inside[min(best + 1, 11)]
+    return float(at), float(most)
 
 
 def _in_hz(system: StateSpace, nu: Any) -> Any:

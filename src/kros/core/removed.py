@@ -57,6 +57,8 @@ Bounds of residuals over every nominal are no longer a function; use sigma_max o
 Models of python-control are no longer quantified by a function of their own; use kros.quantify, which takes systems and
 response data, with from_control for transfer functions and uncertainty_to_control for the result.
     kros.interop: quantify_models
+Variation and noise are no longer an object; use the noise_share of a run, under uncertainty in metrics.json.
+    kros.uncertainty: VariationAndNoise variation_and_noise
 The numerical error of generated code is no longer an object; kros export c prints it.
     kros.export: HeldOut
 Runs of a batch that follow a parameter are no longer public; use track of a running observer, or kros estimate --track.
@@ -79,11 +81,6 @@ Report and figures of a run are no longer written by public functions; use kros 
     kros.report: render write_figures
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
-Several units in one file are no longer part of kros; write a file for each unit, or use kros.from_frame.
-    unit
-Models are no longer resampled, nor is estimation noise separated from variation between units; compare models of two
-halves of the episodes.
-    kros.identify: ModelSamples bootstrap_edmd episode_weights kros.uncertainty: VariationAndNoise variation_and_noise
 The array format of pykoop is no longer in kros.data; use from_pykoop and to_pykoop of kros.interop.
     kros.data: from_pykoop to_pykoop
 """

@@ -122,9 +122,9 @@ def _uncertainty(context: Context) -> dict[str, Any]:
 
 
 def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
-    """Return the metrics of one uncertain model."""
+    """Return the metrics of one uncertain model, and the share of noise in it."""
     model = UncertainModel.load(store.path("uncertainty", name))
-    return {
+    entry: dict[str, Any] = {
         "nominal": model.nominal_id,
         "form": model.form,
         "peak_db": model.peak_db,
@@ -135,6 +135,10 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
             "overbound_db_max": model.overbound_db_max,
         },
     }
+    if store.holds("uncertainty", name, "noise"):
+        facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
+        entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
+    return entry
 
 
 def _observers(context: Context) -> dict[str, Any]:

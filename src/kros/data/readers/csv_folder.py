@@ -41,14 +41,16 @@ class ChannelMapping(Settings):
     truth_of: str = Field("", alias="of", description="for the role `truth`: the state that it is the truth of")
 
     @property
-    def place(self) -> Column:
-        """Where it is read from."""
-        return self.name if self.column is None else self.column
-
-    @property
     def declared(self) -> Channel:
         """The channel of the population."""
         return Channel(self.name, self.role, self.unit, self.measured, self.truth_of)
+
+
+class UnitMapping(Settings):
+    """``[[unit]]``: one of several units in the same file."""
+
+    suffix: str = Field("", description="appended to the unit's id from the path")
+    columns: dict[str, Column] = Field({}, description="column by channel, where it is not that of `[[channel]]`")
 
 
 class CsvMapping(Settings):
@@ -62,6 +64,7 @@ class CsvMapping(Settings):
     )
     channel: tuple[ChannelMapping, ...] = Field(description="the channels, in any order")
     time: Column | None = Field(None, description="column of time")
+    unit: tuple[UnitMapping, ...] = Field((), description="where one file holds several units")
     time_scale: float = Field(1.0, gt=0, description="factor from the column of time to seconds")
     sample_period_s: float | None = Field(None, gt=0, description="in place of a column of time")
     exclude: str | None = Field(None, description="regular expression; paths in which it occurs are left out")
@@ -112,13 +115,23 @@ class CsvMapping(Settings):
             wanted = "two different characters of ASCII that stand in no number otherwise"
             actual = f"delimiter = {self.delimiter!r}, decimal = {self.decimal!r}"
             raise ValueError(f"delimiter and decimal should be {wanted}, found {actual}")
-        if not self.channel:
+        names = [c.name for c in self.channel]
+        if not names:
             raise ValueError("there is no [[channel]]; declare each channel with name, column and role")
-        columns = (self.time, *(c.place for c in self.channel))
+        for unit in self.units:
+            if unknown := sorted(set(unit.columns) - set(names)):
+                gives = f"[[unit]] {unit.suffix!r} gives a column for {unknown[0]!r}"
+                raise ValueError(f"{gives}; the channels are {names}")
+        columns = (self.time, *(self.column(c, u) for u in self.units for c in self.channel))
         named = next((column for column in columns if isinstance(column, str)), None)
         if named is not None and not self.header:
             raise ValueError(f"header = false leaves columns without names, found {named!r}; give its number from 1")
         return self
+
+    @property
+    def units(self) -> tuple[UnitMapping, ...]:
+        """The units of one file; one without a suffix where none is declared."""
+        return self.unit or (UnitMapping(),)
 
     @property
     def ordered(self) -> tuple[ChannelMapping, ...]:
@@ -139,18 +152,28 @@ class CsvMapping(Settings):
     @property
     def scaling(self) -> dict[str, Scaling]:
         """Columns of the channels, before any step."""
-        return {c.name: Scaling(c.place) for c in self.channel}
+        columns = {c.name: {self.column(c, unit) for unit in self.units} for c in self.channel}
+        return {name: Scaling(next(iter(of)) if len(of) == 1 else None) for name, of in columns.items()}
 
     @property
     def dialect(self) -> Dialect:
         """How its files are written."""
         return Dialect(self.delimiter, self.header, self.skip_rows, self.decimal, self.encoding, self.unit_rows)
 
+    def column(self, channel: ChannelMapping, unit: UnitMapping) -> Column:
+        """Return where a channel of a unit is read from."""
+        return unit.columns.get(channel.name, channel.name if channel.column is None else channel.column)
+
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
+        columns = [{name: c for name, c in u.columns.items() if name not in names} for u in self.unit]
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
-        channels = tuple(c for c in self.channel if c.name not in names)
-        return self.model_copy(update={"channel": channels, "prepare": tuple(step for step in steps if step)})
+        remaining = {
+            "channel": tuple(c for c in self.channel if c.name not in names),
+            "unit": tuple(u.model_copy(update={"columns": c}) for u, c in zip(self.unit, columns, strict=True)),
+            "prepare": tuple(step for step in steps if step is not None),
+        }
+        return self.model_copy(update=remaining)
 
 
 def _is_mark(text: str) -> bool:
@@ -238,17 +261,18 @@ def read_csv_folder(
         fields = file_fields(path, chosen.dialect)
         if optional and not places:
             chosen = chosen.without(_absent(chosen, fields, optional))
-        place, named = _place(path, fields, chosen), {name: text for name, text in match.groupdict().items() if text}
-        for i, key in enumerate(_keys(named, chosen.pieces)):
-            if key in places:
-                twice = f"{key} is in {places[key].path} and in {path}"
-                raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
-            check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
-            places[key] = replace(place, piece=(i, chosen.pieces))
-        group = named.get("group", "")
-        if groups.setdefault(key.unit, group) != group:
-            both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
-            raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
+        named = {name: text for name, text in match.groupdict().items() if text}
+        for unit in chosen.units:
+            place, group = _place(path, fields, chosen, unit), named.get("group", "")
+            for i, key in enumerate(_keys(named, chosen.pieces, unit.suffix)):
+                if key in places:
+                    twice = f"{key} is in {places[key].path} and in {path}"
+                    raise DataError(f"Duplicate episodes: {twice}; name more groups in files, remove or renumber one.")
+                check_names(f"part of the path {os.fsencode(path)!r}", (key.unit, key.condition, key.episode))
+                places[key] = replace(place, piece=(i, chosen.pieces))
+            if groups.setdefault(key.unit, group) != group:
+                both = f"in both groups {groups[key.unit]!r} and {group!r} ({path})"
+                raise DataError(f"Unit {key.unit} is {both}; a unit has one group.")
     if not places:
         files, endings = [relative for _, relative in csv_files(source)], ", ".join(ENDINGS[:4])
         sample = f" of {len(files)} files such as {files[0]!r}" if files else ""
@@ -261,9 +285,9 @@ def read_csv_folder(
     return assemble(recordings, *facts, steps=chosen.steps, scaling=chosen.scaling)
 
 
-def _keys(named: Mapping[str, str], pieces: int) -> list[EpisodeKey]:
-    """Return the episodes in a file, by what its path says."""
-    unit, condition = named.get("unit", DEFAULT_UNIT), named.get("condition", DEFAULT_CONDITION)
+def _keys(named: Mapping[str, str], pieces: int, suffix: str) -> list[EpisodeKey]:
+    """Return the episodes of one unit in a file, by what its path says."""
+    unit, condition = named.get("unit", DEFAULT_UNIT) + suffix, named.get("condition", DEFAULT_CONDITION)
     episode = named.get("episode", DEFAULT_EPISODE)
     endings = [f".{i + 1}" for i in range(pieces)] if pieces > 1 else [""]
     return [EpisodeKey(unit, condition, f"{episode}{ending}") for ending in endings]
@@ -273,7 +297,7 @@ def _absent(mapping: CsvMapping, fields: list[str], optional: Collection[str]) -
     """Return the channels that are not there and need not be: those that are optional, and truths."""
     spared = [c for c in mapping.channel if c.name in optional or c.role is Role.TRUTH]
     known = {*fields, *range(1, len(fields) + 1)}
-    absent = {c.name for c in spared if c.place not in known}
+    absent = {c.name for c in spared for unit in mapping.units if mapping.column(c, unit) not in known}
     return absent | {c.name for c in mapping.channel if c.truth_of in absent}
 
 
@@ -303,10 +327,10 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         log.warning(text, len(others), source, mapping.files, some(others))
 
 
-def _place(path: Path, fields: list[str], mapping: CsvMapping) -> FilePlace:
-    """Return where the channels are in a file."""
+def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping) -> FilePlace:
+    """Return where the channels of a unit are in a file."""
     wanted = [] if mapping.time is None else [mapping.time]
-    wanted += [channel.place for channel in mapping.ordered]
+    wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
     names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that are not needed
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False))
     if mapping.header and numbered:

@@ -123,6 +123,7 @@ def uncertainty(facts: Facts) -> Section | None:
         "exceeds one. The approximation error is what the form cannot represent; it is covered by an additive term."
     )
     weights = [entry["weight"] for entry in entries.values()]
+    noise = [entry.get("noise_share") for entry in entries.values()]
     orders = [" and ".join(", ".join(map(str, side)) for side in entry["orders"]) for entry in weights]
     columns = [
         Column("model", [model_label(name) for name in entries]),
@@ -130,6 +131,7 @@ def uncertainty(facts: Facts) -> Section | None:
         Column("largest normalised residual", [number(w["cover_max"], 6) for w in weights]),
         Column("bounds every unit", [None if w["cover_max"] is None else w["cover_max"] <= 1 for w in weights]),
         Column("above the optimal bound (dB)", [entry["overbound_db_max"] for entry in weights]),
+        Column("estimation noise in the spread (%)", [None if n is None else 100 * n["at_peak"] for n in noise]),
         Column("approximation error", [entry["misfit_max"] for entry in entries.values()]),
     ]
     return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")

@@ -1,5 +1,6 @@
 """The stages from recordings to observers, which are repeated where units are left out.
 
+EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
 residuals of all units      --> beside the weights                     uncertainty/<model>/units
 the most conspicuous unit   --> against the cover of all the others    outliers/<models>/others
 """
@@ -13,6 +14,8 @@ from functools import partial
 from pathlib import Path
 from shutil import copyfile
 from typing import Any
+
+import numpy as np
 
 from ...core.artifacts import save_artifact
 from ...core.errors import ConfigError, DataError, KrosError
@@ -30,12 +33,14 @@ from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
 from ...uncertainty import Form, UncertainModel, residual
+from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.nominal import choose_nominal
 from ...uncertainty.quantify import UncertainModels, quantify
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep
+from .resampling import resampling
 
 PARQUET, ARRAYS = "parquet", "arrays"
 FEWEST = 2  # units that a population is learned from
@@ -109,18 +114,26 @@ log = logging.getLogger(__name__)
 class DiagnosticSettings:
     """Extent of what is computed for the report alone."""
 
+    noise_points: int = 80  # frequencies at which variation and noise are compared
     points: int = 240  # frequencies of residuals
+    units: int = 60  # at most, whose models are resampled
 
 
 DEFAULT = DiagnosticSettings()
-Task = tuple[Path, Callable[[], UnitResiduals]]
+Result = UnitResiduals | NoiseShare
+Task = tuple[Path, Callable[[], Result]]
 
 
 def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks: list[Task] = [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
+    tasks: list[Task] = [
+        (folder / kind / "noise", partial(_noise, context, kind, sets[kind]))
+        for kind in models.edmd_kinds
+        if kind in sets
+    ]
+    tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
     work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
@@ -128,12 +141,23 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
             result.save(place)
 
 
-def _attempt(name: str, task: Callable[[], UnitResiduals]) -> UnitResiduals | None:
+def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
     try:
         return task()
     except KrosError as error:
         log.warning("%s: not in the report: %s", name, error)
         return None
+
+
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> NoiseShare:
+    """Compare variation and noise over some units, the nominal one among them."""
+    units, models = uncertain.unit_ids, context.identified.models(name)
+    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
+    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
+    samples = resampling(context, name, chosen)()
+    scale = models.output_scale[:, None] / models.input_scale
+    freqs, nominal = models.frequencies(DEFAULT.noise_points), chosen.index(uncertain.nominal_id)
+    return noise_share(samples, scale, freqs, models.sample_period_s, uncertain.form, nominal)
 
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:

@@ -1,0 +1,70 @@
+"""Edges of resampling: weights, missing episodes, responses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kros.core import DataError
+from kros.identify import KoopmanMatrices, ModelSamples, bootstrap_edmd, edmd, episode_weights
+
+
+def factors(units: int, episodes: int, seed: int = 0) -> np.ndarray:
+    return np.linalg.qr(np.random.default_rng(seed).normal(size=(units, episodes, 30, 5)), mode="r")
+
+
+def samples(units: int = 2, draws: int = 40, spread: float = 0.02) -> ModelSamples:
+    rng = np.random.default_rng(1)
+    A, B = np.array([[0.8, 0.1], [-0.2, 0.7]]), np.array([[0.1, 0.0], [1.0, 0.5]])
+    whole = KoopmanMatrices(np.tile(A, (units, 1, 1)), np.tile(B, (units, 1, 1)))
+    drawn = KoopmanMatrices(
+        A + spread * rng.normal(size=(units, draws, 2, 2)), B + spread * rng.normal(size=(units, draws, 2, 2))
+    )
+    return ModelSamples(tuple(f"u{i}" for i in range(units)), whole, drawn)
+
+
+def test_weights_keep_the_number_of_episodes_and_the_variance_of_a_mean() -> None:
+    """Mean 1 and, for E episodes, covariance 1 on and -1 / (E - 1) off the diagonal: that of an unbiased variance."""
+    weights = episode_weights([4, 7], 40_000, seed=0)
+    assert weights.shape == (2, 40_000, 7)
+    assert not weights[0, :, 4:].any()
+    np.testing.assert_allclose(weights.sum(axis=2), [[4.0] * 40_000, [7.0] * 40_000])
+    for row, E in ((0, 4), (1, 7)):
+        expected = (E * np.eye(E) - 1) / (E - 1)
+        np.testing.assert_allclose(np.cov(weights[row, :, :E].T), expected, atol=0.04)
+
+
+@pytest.mark.parametrize(("episodes", "draws"), [([3, 1], 10), ([3, 3], 1), ([], 10)])
+def test_too_little_to_draw_from_is_refused(episodes: list[int], draws: int) -> None:
+    with pytest.raises(DataError, match="at least two episodes"):
+        episode_weights(episodes, draws, 0)
+
+
+def test_equal_weights_give_the_estimate_and_whole_weights_give_copies() -> None:
+    R = factors(2, 3)
+    weights = np.array([[[1.0, 1, 1], [2, 0, 1]]] * 2)
+    found = bootstrap_edmd(R, 2, 0.5, weights)
+    np.testing.assert_allclose(found.samples.A[:, 0], found.estimate.A, rtol=1e-10)
+    copies = edmd(np.linalg.qr(R[:, [0, 0, 2]].reshape(2, -1, 5), mode="r"), 2, 0.5)
+    np.testing.assert_allclose(found.samples.A[:, 1], copies.A, rtol=1e-9)
+    np.testing.assert_allclose(found.samples.B[:, 1], copies.B, rtol=1e-9)
+
+
+def test_a_unit_with_fewer_episodes_is_resampled_among_its_own() -> None:
+    R = factors(1, 3)
+    padded = np.concatenate([R, np.zeros((1, 2, 5, 5))], axis=1)
+    weights = episode_weights([3], 6, 0)
+    wide = np.concatenate([weights, np.zeros((1, 6, 2))], axis=2)
+    np.testing.assert_allclose(
+        bootstrap_edmd(padded, 2, 0.0, wide).samples.A, bootstrap_edmd(R, 2, 0.0, weights).samples.A, rtol=1e-9
+    )
+
+
+def test_responses_of_samples_are_those_of_their_models() -> None:
+    drawn = samples()
+    freqs, dt = np.array([0.0, 3.0, 50.0]), 0.01
+    for unit in range(2):
+        found = drawn.responses(unit, freqs, dt)
+        for k, z in enumerate(np.exp(2j * np.pi * freqs * dt)):
+            for draw, (A, B) in enumerate(zip(drawn.samples.A[unit], drawn.samples.B[unit], strict=True)):
+                np.testing.assert_allclose(found[draw, k], np.linalg.inv(z * np.eye(2) - A) @ B, rtol=1e-7)

@@ -47,7 +47,7 @@ def settle(figure: Figure) -> None:
 
 
 def engineering(axis: Axis) -> None:
-    """Number a linear axis with SI prefixes where its values are below 0.001 or above 1000, without a factor in the corner."""
+    """Number a linear axis with SI prefixes below 0.001 and from 1000 on, without a factor in the corner."""
     from matplotlib.ticker import FuncFormatter
 
     def text(value: float, _: Any) -> str:

@@ -9,9 +9,9 @@ import numpy as np
 from ...core.artifacts import read_arrays, read_json
 from ...evaluate import Kind
 from ...evaluate.errors import error_spectrum
-from ..canvas import Axes, Figure, frequency_axis, grid, legend, logarithmic
+from ..canvas import Axes, Figure, frequency_axis, grid, legend, logarithmic, power_of_ten
 from ..disturbances import AXES, Curve, curves
-from ..names import in_condition, method_label, method_look, model_label, model_look, number, split_observer, words
+from ..names import in_condition, method_label, method_look, model_label, model_look, split_observer, words
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING
 from .episodes import TRUTH, draw_lines, hide_times
@@ -68,7 +68,7 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
         panel.set_xscale("log")
         panel.set_xlim(0.07 * low, 1.4 * high)
         panel.xaxis.set_minor_locator(NullLocator())
-        panel.set_xticks([0.1 * low, *ticks], ["0", *(number(t, 1) for t in ticks)])
+        panel.set_xticks([0.1 * low, *ticks], ["0", *(power_of_ten(t) if "e" in f"{t:g}" else f"{t:g}" for t in ticks)])
 
 
 def load_torque(run: RunFolder) -> tuple[Figure, str]:

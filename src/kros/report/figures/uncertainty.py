@@ -142,7 +142,7 @@ def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: S
         note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
     frequency_axis(axes, freqs_hz, "", 4)
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
-    axes.set_ylim(low, high + 0.13 * (high - low) * len(columns))
+    axes.set_ylim(low, high + 0.2 * (high - low) * len(columns))
 
 
 def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:

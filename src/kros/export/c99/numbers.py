@@ -13,6 +13,7 @@ from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
+from ...observer.filter_bank import longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
@@ -287,6 +288,7 @@ class Source:
             "reach": self.numbers(own.reach),
             "half": self.numbers(own.half),
             "recovery": self.numbers(own.recovery),
+            "longest": self.numbers(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
             "one": self.precision.literal(1.0),

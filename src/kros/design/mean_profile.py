@@ -74,9 +74,9 @@ def make_mean_profile(
     means, closest, episodes = unit_means(training, list(motions.values()), estimated, settings)
     for key, of_units, apart in zip(motions, means, closest, strict=True):
         if len(of_units) < 2:
-            distance = f"{100 * apart:.3g} % of the largest (RMS), {100 * settings.same_motion:g} % counts as the same"
+            distance = f"{100 * apart:.3g} % of the largest (RMS), at most {100 * settings.same_motion:g} % is allowed"
             raise DataError(
-                f"Mean profile: held-out episode {key} is no motion that training episodes of two units repeat; the "
+                f"Mean profile: the inputs of held-out {key} do not occur in training episodes of two units; the "
                 f"nearest inputs differ by {distance}."
             )
 

@@ -94,7 +94,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
         for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
     ]
     measured = " and ".join(words(c.name) for c in run.states if c.measured)
-    text = f"{_PAPER if paper else ''}Estimated from {measured} and the inputs; errors are recorded minus estimated values."
+    text = f"{_PAPER if paper else ''}Estimated from {measured} and inputs; errors are recorded minus estimated values."
     return _figure(run, blocks, text)
 
 

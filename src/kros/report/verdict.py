@@ -246,7 +246,8 @@ def certificates(facts: Facts) -> list[str]:
     """Return what is certified about the deployed observer."""
     entry, texts = facts.entry, []
     if entry.get("worst_case_h2") is not None:
-        texts.append(f"For the set of plants: the H2 norm of the error is at most {number(entry['worst_case_h2'])}.")
+        norm = number(entry["worst_case_h2"])
+        texts.append(f"For the set of linear plants: the H2 norm of the error is at most {norm}.")
     bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:

@@ -75,14 +75,7 @@ def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str
     tried = doublings(facts).get(facts.deployed, {})
     reached = {kind: value for kind, value in tried.items() if kind in _NEEDS and ">" not in value}
     parts = [_NEEDS[kind].format(value).replace("of < ", "below ") for kind, value in reached.items()]
-    return (
-        [
-            *texts,
-            f"The error doubles with {joined(parts).replace(' and ', ' or ')}.",
-        ]
-        if parts
-        else texts
-    )
+    return [*texts, f"The error doubles with {joined(parts).replace(' and ', ' or ')}."] if parts else texts
 
 
 def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:

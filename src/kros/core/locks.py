@@ -67,9 +67,7 @@ def _open(path: Path, shared: bool) -> int:
         pass
     except OSError as error:
         if error.errno not in _BUSY:
-            log.warning(
-                "%s: files cannot be locked here (%s); do not run two studies in one folder at once", path, error
-            )
+            log.warning("%s: no file locks here (%s); do not run two studies in one folder at once", path, error)
             return handle
         holder = os.read(handle, 200).decode(errors="replace") or "another process"
         os.close(handle)

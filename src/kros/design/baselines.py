@@ -23,7 +23,6 @@ from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
 from ..observer.screen import Screen, Screened
 from ..observer.sensor import delay_of
-from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
@@ -104,39 +103,33 @@ def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, 
 def make_extended(
     training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
 ) -> Baseline:
-    """Tune the extended Kalman filter of a nominal model: process noise of two shapes, all run side by side."""
+    """Tune the extended Kalman filter of a nominal model: process noise of many sizes, all run side by side."""
     batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
-    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2)}
-    shapes[RESIDUAL] = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
-    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in settings.levels]
+    shape = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+    shape = shape * like_measurement_noise(shape[np.ix_(C, C)], R)
     filters = ExtendedKalman(
         lifting,
         models.A[row],
         models.B[row],
         models.measured,
         models.recorded_inputs,
-        np.stack([Q for *_, Q in tried]),
+        np.stack([10**level * shape for level in settings.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
     short = batch.head(settings.extended_samples)
-    percents = [
-        error_percent(estimate, short.states, short.lengths).mean(axis=0)
-        for estimate in filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
-    ]
+    estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
+    percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
-    ranks = [rank(p, np.full(n, 100.0), models.measured) for p in bounded]
-    first = min(range(len(tried)), key=lambda i: ranks[i])
+    first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
     if not np.isfinite(bounded[first]).all():
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
-    shape, level, Q = tried[first]
-    facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape}
-    tuned = {"": replace(filters, Q=Q)}
+    facts = {"status": "tuned", "process_noise_level": 10 ** settings.levels[first]}
+    tuned = {"": replace(filters, Q=filters.Q[first])}
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 

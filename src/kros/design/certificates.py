@@ -193,27 +193,34 @@ def guards_of(
     observers: Sequence[Observer], batches: Sequence[EpisodeBatch], settings: CertificateSettings
 ) -> list[Guard | None]:
     """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
+    extents = [_extents(observers, batch, first) for batch in batches for first in (0, len(batch.states) // 2)]
+    low, high, size, corrections = zip(*extents, strict=True)
+    least, most, largest = np.min(low, axis=0), np.max(high, axis=0), settings.largest * np.max(size, axis=0)
+    room = settings.room * np.maximum(most - least, np.finfo(float).tiny)
+    least = np.maximum(least - room, np.minimum(least, -largest))
+    most = np.minimum(most + room, np.maximum(most, largest))
+    of_corrections = [np.max(one, axis=0) for one in zip(*corrections, strict=True)]
+    return [_guard(*one, settings) for one in zip(observers, least, most, of_corrections, strict=True)]
+
+
+def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> tuple[Array, Array, Array, list[Array]]:
+    """Return bounds of estimates and recordings (observer, n), sizes of recordings (n,), and largest corrections."""
     n, q = observers[0].lifting.n_states, list(observers[0].measured)
-    low, high = np.full((len(observers), n), np.inf), np.full((len(observers), n), -np.inf)
-    size, largest = np.zeros(n), [np.zeros(o.controller.n_states) for o in observers]
-    for batch in batches:
-        y, recorded = batch.measurements(q), batch.states.shape[-1]
-        for first in (0, len(y) // 2):
-            x = run_observers(observers, y[first:], batch.inputs[first:], observers[0].own(batch.parameters))
-            inside = (np.arange(first, len(y))[:, None] < batch.lengths)[..., None]
-            states, least, most = batch.states[first:], np.full(n, np.inf), np.full(n, -np.inf)
-            least[:recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
-            most[:recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
-            size = np.maximum(size, np.maximum(np.abs(least), np.abs(most)))
-            low = np.minimum(low, np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least))
-            high = np.maximum(high, np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most))
-            for i, o in enumerate(observers):
-                nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
-                corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
-                largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
-    room, most = settings.room * np.maximum(high - low, np.finfo(float).tiny), settings.largest * size
-    low, high = np.maximum(low - room, np.minimum(low, -most)), np.minimum(high + room, np.maximum(high, most))
-    return [_guard(o, a, b, c, settings) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
+    y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
+    recorded = np.arange(n) < states.shape[-1]
+    inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
+    x = run_observers(observers, y, inputs, observers[0].own(batch.parameters))
+    least, most = np.full(n, np.inf), np.full(n, -np.inf)
+    least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
+    most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+    low = np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least)
+    high = np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most)
+    corrections = []
+    for o, estimate in zip(observers, x, strict=True):
+        nu = np.where(inside & np.isfinite(y), y - estimate[..., q], 0.0)
+        states_c = recursion(o.controller.A, nu, np.zeros((nu.shape[1], o.controller.n_states)), o.controller.B)
+        corrections.append(np.abs(states_c).max(axis=(0, 1), initial=0.0))
+    return low, high, np.maximum(np.abs(least), np.abs(most)), corrections
 
 
 def _guard(

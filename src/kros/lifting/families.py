@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import wraps
 from inspect import signature
 from itertools import combinations_with_replacement
@@ -156,21 +155,14 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
     >>> sorted(kmeans_centres([[0.0], [0.2], [9.0], [9.2]], n=2, seed=0).round(9).ravel().tolist())
     [0.1, 9.1]
     """
-    from scipy.cluster.vq import ClusterError, kmeans2
+    from scipy.cluster.vq import kmeans
 
     data = _finite("kmeans_centres: data", data)
-    distinct = len(np.unique(data, axis=0))
-    if distinct < n:
-        raise ConfigError(f"kmeans_centres: {n} clusters need as many different samples, found {distinct}.")
     spread = np.where(np.ptp(data, axis=0) > 0, data.std(axis=0), 1.0)
-    rng, scaled, best = np.random.default_rng(seed), data / spread, (np.inf, data[:0])
-    for _ in range(starts):
-        with suppress(ClusterError):  # this start has an empty cluster
-            means, label = kmeans2(scaled, n, iter=100, minit="++", missing="raise", rng=rng)
-            best = min(best, (float(np.sum((scaled - means[label]) ** 2)), means * spread), key=lambda end: end[0])
-    if not len(best[1]):
-        raise ConfigError(f"kmeans_centres: in {starts} starts one of {n} clusters was empty; ask for fewer.")
-    return np.asarray(best[1])
+    means, _ = kmeans(data / spread, n, iter=starts, rng=np.random.default_rng(seed))
+    if len(means) < n:
+        raise ConfigError(f"kmeans_centres: the data have {len(means)} clusters, not {n}; ask for fewer.")
+    return np.asarray(means * spread)
 
 
 KINDS: dict[str, Callable[..., Any]] = {

@@ -24,8 +24,7 @@ from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
-from .separation import FormulaSeparation
-from .window import Window
+from .window import FormulaSeparation, Window
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]
@@ -197,31 +196,25 @@ class Lifting:
             raise DimensionError(f"Lifting: {problem}; calibrate the unit first.")
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
-    def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted functions by every entry of the window, shape (..., p, n_window)."""
-        return self._slopes(self.window.names, x, parameters)
-
-    def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
-        """Return the derivative of the lifted functions by one of the parameters, shape (..., p)."""
-        return self._slopes((name,), x, parameters)[..., 0]
-
-    def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the input functions by every entry of the window, shape (..., r, n_window)."""
-        u = np.asarray(u, dtype=float)
-        self.window.require_inputs(u)
-        return self._slopes(self.window.names, window, parameters, u)
-
-    def _slopes(
-        self, names: tuple[str, ...], x: npt.ArrayLike, parameters: Parameters | None, u: Array | None = None
+    def slopes(
+        self,
+        x: npt.ArrayLike,
+        parameters: Parameters | None = None,
+        names: tuple[str, ...] | None = None,
+        u: npt.ArrayLike | None = None,
     ) -> Array:
-        """Return derivatives by some names of the lifted functions, or with inputs of the input functions."""
-        x, formulas = self._windows(x), self.formulas if u is None else self.input_formulas
+        """Return the derivative of the lifted functions, with inputs that of the input functions, on windows.
+
+        The shape is (..., p, n), by the entries of the window or by the names of some of them and of parameters.
+        """
+        names, inputs = names or self.window.names, None if u is None else np.asarray(u, dtype=float)
+        x, formulas = self._windows(x), self.formulas if inputs is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
-        if (names, u is None) not in self._derivatives:
+        if (names, inputs is None) not in self._derivatives:
             trees = [formula.derivative(name) for formula in formulas for name in names]
-            self._derivatives[names, u is None] = Program.of(trees)
-        values = self._values(parameters, x, x[..., self.n_states :], u)
-        self._derivatives[names, u is None].fill(slopes, values)
+            self._derivatives[names, inputs is None] = Program.of(trees)
+        values = self._values(parameters, x, x[..., self.n_states :], inputs)
+        self._derivatives[names, inputs is None].fill(slopes, values)
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:

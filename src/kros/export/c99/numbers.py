@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from .origin import OriginShift, find_shift
 from .realise import RULE, Realised
 
 Array = npt.NDArray[np.float64]
+DOUBLE, SINGLE = Precision(), Precision("float")
 
 
 @dataclass(frozen=True)
@@ -79,27 +80,16 @@ class Source:
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
-        formulas, write = self.observer.lifting.formulas, Precision().literal
-        return (
-            self.names()
-            | self.sizes()
-            | self.linear()
-            | self.limits()
-            | self.origin()
-            | {
-                "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
-                "gamma": [
-                    c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas
-                ],
-                "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
-                "monitor": self.monitor(),
-                "guard": self.guard(),
-                "bank": self.bank(),
-                "tracked": self.tracked(),
-                "load": self.load_torque(),
-                "sample_period_s": write(self.observer.sample_period_s),
-            }
-        )
+        lifting = self.observer.lifting
+        parts = {"monitor": self.monitor(), "guard": self.guard(), "bank": self.bank(), "tracked": self.tracked()}
+        parts |= self.names() | self.sizes() | self.linear() | self.limits() | self.origin()
+        return parts | {
+            "sigma": [self.code(f.expression) for f in lifting.formulas],
+            "gamma": [self.code(f.expression) for f in lifting.input_formulas],
+            "sigma_uses_parameters": any(set(f.used) & set(lifting.parameters) for f in lifting.formulas),
+            "load": self.load_torque(),
+            "sample_period_s": DOUBLE.literal(self.observer.sample_period_s),
+        }
 
     def names(self) -> dict[str, Any]:
         """Return names and units of measure."""
@@ -156,16 +146,16 @@ class Source:
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
         o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
-        none, wide = np.full(o.lifting.n_states, np.inf), replace(self, precision=Precision())
+        none = np.full(o.lifting.n_states, np.inf)
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
             "clips_estimate": bool(limits),
-            "lower": wide.numbers(limits.get("lower", -none)),
-            "upper": wide.numbers(limits.get("upper", none)),
+            "lower": row(limits.get("lower", -none)),
+            "upper": row(limits.get("upper", none)),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": bounds[:q],
             "u_bounds": bounds[q:],
-            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
+            "default_parameters": self.row(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
 
     @property
@@ -176,18 +166,18 @@ class Source:
     def origin(self) -> dict[str, Any]:
         """Return how the origin moves; nothing where it cannot."""
         keys = ("shift_states", "shift_whole", "shift_rest", "far", "period", "recorded_period")
-        shift, o, write = self.shift, self.observer, Precision().literal
+        shift, o = self.shift, self.observer
         if shift is None:
             return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
         return {
             "shift": shift,
-            "shift_states": self.wide(shift.states),
-            "shift_whole": self.wide(shift.whole),
-            "shift_rest": self.wide(shift.rest),
+            "shift_states": row(shift.states),
+            "shift_whole": row(shift.whole),
+            "shift_rest": row(shift.rest),
             "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
             "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
             "far": self.precision.literal(RULE.far * shift.period),
-            "period": write(shift.period),
+            "period": DOUBLE.literal(shift.period),
             "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
         }
 
@@ -196,7 +186,7 @@ class Source:
         assert self.shift is not None
         whole, text = float(self.shift.whole[j]), f"s->held[{j}]"
         if whole != 0:
-            text += " - s->origin" if whole == 1 else f" - ({Precision().literal(whole)} * s->origin)"
+            text += " - s->origin" if whole == 1 else f" - ({DOUBLE.literal(whole)} * s->origin)"
         return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
 
     def factors(self) -> dict[str, float]:
@@ -217,7 +207,7 @@ class Source:
 
     def literals(self, factors: Sequence[float]) -> list[str]:
         """Return the literals of factors in double precision; none where all are one."""
-        return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
+        return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
     def tracked(self) -> dict[str, Any] | None:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
@@ -226,14 +216,11 @@ class Source:
         o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
         n, states = o.lifting.n_states, o.lifting.states
 
-        def code(slope: Any) -> str:
-            return f"({c_code(slope, self.symbol, self.precision)})"
-
         slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
         for f in o.lifting.formulas:
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
-            lines = [(j, code(d)) for j, d in by_state.items() if d != 0]
-            slopes.append({"by_value": code(f.derivative(name)), "by_state": lines})
+            lines = [(j, f"({self.code(d)})") for j, d in by_state.items() if d != 0]
+            slopes.append({"by_value": f"({self.code(f.derivative(name))})", "by_state": lines})
         return {
             "name": name,
             "place": o.lifting.parameters.index(name),
@@ -252,7 +239,7 @@ class Source:
         """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
         if self.load is None:
             return None
-        level, places, write = self.load.level, self.observer.recorded, Precision().literal
+        level, places, write = self.load.level, self.observer.recorded, DOUBLE.literal
         return {
             "load_name": plain(self.load.load),
             "current_name": plain(self.load.current),
@@ -283,10 +270,10 @@ class Source:
             "first": first,
             "fallback": o.lifting.n_states - first,
             "start": self.sums(self.realised.start),
-            "forget": self.numbers(own.forget),
-            "reach": self.numbers(own.reach),
-            "half": self.numbers(own.half),
-            "recovery": self.numbers(own.recovery),
+            "forget": self.row(own.forget),
+            "reach": self.row(own.reach),
+            "half": self.row(own.half),
+            "recovery": self.row(own.recovery),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
             "one": self.precision.literal(1.0),
@@ -301,7 +288,7 @@ class Source:
         return {
             "bands": len(own.filters),
             "filters": self.matrix(own.filters),
-            "inverse_size": self.numbers(1 / own.size),
+            "inverse_size": self.row(1 / own.size),
             "inverse_limit": self.matrix(1 / own.limits),
             "weights": own.weights.astype(int).tolist(),
             "quiet": self.precision.literal(QUIET),
@@ -318,10 +305,9 @@ class Source:
     def guard(self) -> dict[str, Any]:
         """Return the bounds of states and of the correction, and how long a start takes."""
         own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
-        low, high = (np.clip(side, -self.most, self.most) for side in bounds(own, n, order))
+        low, high = (np.clip(side, -self.precision.largest, self.precision.largest) for side in bounds(own, n, order))
         settle = 0 if own is None else own.settle
-        correction = self.numbers(high[n:])
-        return {"lower": self.wide(low[:n]), "upper": self.wide(high[:n]), "correction": correction, "settle": settle}
+        return {"lower": row(low[:n]), "upper": row(high[:n]), "correction": self.row(high[n:]), "settle": settle}
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
@@ -337,30 +323,29 @@ class Source:
 
     def matrix(self, values: Array) -> list[list[str]]:
         """Return the literals of a matrix, row by row."""
-        return [[self.precision.literal(float(v)) for v in row] for row in values]
+        return [self.row(numbers) for numbers in values]
 
-    def numbers(self, values: Array) -> list[str]:
-        """Return the literals of a row; infinity as the largest number."""
-        return [self.precision.literal(float(np.clip(v, -self.most, self.most))) for v in values]
+    def row(self, values: Array) -> list[str]:
+        """Return the literals of a row."""
+        return row(values, self.precision)
 
-    @property
-    def most(self) -> float:
-        """Largest number of this precision."""
-        return float(np.finfo(np.float32 if self.precision.type == "float" else np.float64).max)
-
-    def wide(self, values: Array) -> list[str]:
-        """Return literals in double precision."""
-        return [Precision().literal(float(v)) for v in values]
+    def code(self, expression: Any) -> str:
+        """Return the C expression of a formula's tree."""
+        return c_code(expression, self.symbol, self.precision)
 
     def bounds(self) -> list[dict[str, str]]:
         """Return the bounds of measurements and inputs in double precision, and those of good samples in single."""
-        screen, single = Screen.of(self.observer), float(np.finfo(np.float32).max)
+        screen = Screen.of(self.observer)
         wide = {name: getattr(screen, name) for name in ("lower", "upper", "least", "most")}
         inner = {"low": np.maximum(screen.lower, screen.least), "high": np.minimum(screen.upper, screen.most)}
-        texts = {name: replace(self, precision=Precision()).numbers(values) for name, values in wide.items()}
-        narrow = replace(self, precision=Precision("float"))
-        texts |= {name: narrow.numbers(np.clip(values, -single, single)) for name, values in inner.items()}
+        texts = {name: row(values) for name, values in wide.items()}
+        texts |= {name: row(values, SINGLE) for name, values in inner.items()}
         return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
+
+
+def row(values: Array, precision: Precision = DOUBLE) -> list[str]:
+    """Return the literals of a row; infinity as the largest number."""
+    return [precision.literal(v) for v in np.clip(values, -precision.largest, precision.largest).tolist()]
 
 
 def _uncorrected(observer: Observer) -> Array:

@@ -82,7 +82,7 @@ class Source:
         """Return everything that the templates name."""
         lifting = self.observer.lifting
         parts = {"monitor": self.monitor(), "guard": self.guard(), "bank": self.bank(), "tracked": self.tracked()}
-        parts |= self.names() | self.sizes() | self.linear() | self.limits() | self.origin()
+        parts |= self.layout() | self.linear() | self.limits() | self.origin()
         return parts | {
             "sigma": [self.code(f.expression) for f in lifting.formulas],
             "gamma": [self.code(f.expression) for f in lifting.input_formulas],
@@ -91,9 +91,10 @@ class Source:
             "sample_period_s": DOUBLE.literal(self.observer.sample_period_s),
         }
 
-    def names(self) -> dict[str, Any]:
-        """Return names and units of measure."""
+    def layout(self) -> dict[str, Any]:
+        """Return names, units of measure, and numbers of states, channels and samples."""
         o, factors, measured = self.observer, self.factors(), self.measured
+        lifting, window = o.lifting, o.lifting.window
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -101,25 +102,20 @@ class Source:
             "real": self.precision.type,
             "suffix": self.precision.suffix,
             "zero": self.precision.literal(0.0),
+            "one": self.precision.literal(1.0),
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
             "measured": plain_names(measured),
             "inputs": plain_names(o.inputs),
-            "parameters": o.lifting.parameters,
+            "parameters": lifting.parameters,
             "signals": self.signals(),
             "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
             "y_factor": self.literals([factors[s] for s in measured]),
             "u_factor": self.literals([factors[s] for s in o.inputs]),
-        }
-
-    def sizes(self) -> dict[str, Any]:
-        """Return numbers of states, channels and samples."""
-        o, lifting, window = self.observer, self.observer.lifting, self.observer.lifting.window
-        return {
             "at": o.measured,
             "n": lifting.n_states,
             "recorded": len(o.recorded),
-            "q": len(o.measured),
+            "q": len(measured),
             "m": len(o.inputs),
             "functions": lifting.n_lifted - lifting.n_states,
             "widened": o.B.shape[1],
@@ -127,8 +123,8 @@ class Source:
             "delay": o.runtime.delay,
             "longest": LONGEST,
             "history": len(window.earlier),
-            "window_shift": [int(i) for i in window.shift] if lifting.history else [],
-            "window_present": [int(i) for i in window.present] if lifting.history else [],
+            "window_shift": window.shift.tolist(),
+            "window_present": window.present.tolist(),
         }
 
     def linear(self) -> dict[str, Any]:
@@ -165,10 +161,9 @@ class Source:
 
     def origin(self) -> dict[str, Any]:
         """Return how the origin moves; nothing where it cannot."""
-        keys = ("shift_states", "shift_whole", "shift_rest", "far", "period", "recorded_period")
         shift, o = self.shift, self.observer
         if shift is None:
-            return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
+            return {"shift": None, "relative_inputs": [], "shift_others": []}
         return {
             "shift": shift,
             "shift_states": row(shift.states),
@@ -231,7 +226,6 @@ class Source:
             "shares": [write(float(v) ** -2) for v in measurement_sizes(o)],
             "settle_s": f"{o.sample_period_s / self.loop.forget:g}",
             "forget": write(self.loop.forget),
-            "one": write(1.0),
             "most": write(MOST),
         }
 
@@ -260,10 +254,9 @@ class Source:
 
     def bank(self) -> dict[str, Any] | None:
         """Return what a filter bank starts with and does in gaps; None where the observer is none."""
-        own, o = self.observer.bank, self.observer
+        own, o, first = self.observer.bank, self.observer, len(self.observer.recorded)
         if own is None:
             return None
-        first = len(o.recorded)
         z = slice(first, first + own.filters)
         return {
             "filters": own.filters,
@@ -276,7 +269,6 @@ class Source:
             "recovery": self.row(own.recovery),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
-            "one": self.precision.literal(1.0),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
@@ -295,7 +287,6 @@ class Source:
             "forget": self.precision.literal(own.forget),
             "first": self.precision.literal(max(own.first, own.forget)),
             "largest": self.precision.literal(LARGEST),
-            "one": self.precision.literal(1.0),
             "settle": own.settle,
             "recovery": RECOVERY,
             "percent": f"{100 * own.false_alarm_rate:g}",
@@ -304,18 +295,16 @@ class Source:
 
     def guard(self) -> dict[str, Any]:
         """Return the bounds of states and of the correction, and how long a start takes."""
-        own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
-        low, high = (np.clip(side, -self.precision.largest, self.precision.largest) for side in bounds(own, n, order))
+        own, n, most = self.observer.guard, self.observer.lifting.n_states, self.precision.largest
+        low, high = np.clip(bounds(own, n, self.observer.controller.n_states), -most, most)
         settle = 0 if own is None else own.settle
         return {"lower": row(low[:n]), "upper": row(high[:n]), "correction": self.row(high[n:]), "settle": settle}
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
         lifting = self.observer.lifting
-        for names, array in ((lifting.window.names, "w"), (lifting.parameters, "p"), (self.observer.inputs, "u")):
-            if name in names:
-                return f"{array}[{names.index(name)}]"
-        raise KeyError(name)
+        places = {"w": lifting.window.names, "p": lifting.parameters, "u": self.observer.inputs}
+        return next(f"{array}[{names.index(name)}]" for array, names in places.items() if name in names)
 
     def sums(self, values: Array) -> list[list[tuple[int, str]]]:
         """Return what is multiplied by which entry of a column, row by row; zeros are left out."""

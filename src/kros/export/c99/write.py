@@ -85,11 +85,7 @@ def export_c(
 
 
 def c_files(
-    observer: Observer,
-    name: str,
-    precision: str,
-    track: str | None = None,
-    load: LoadOutput | None = None,
+    observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
 ) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     for parameter in observer.lifting.parameters:

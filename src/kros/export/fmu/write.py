@@ -97,9 +97,9 @@ def export_fmu(
 def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     observer, name = source.observer, source.name
-    units = {c: plain(recorded_channel(observer, c).unit or "") for c in (*observer.recorded, *observer.inputs)}
+    declared = {c: recorded_channel(observer, c).unit for c in (*observer.recorded, *observer.inputs)}
+    units = {c: plain(unit) for c, unit in declared.items() if unit}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
-    units = {c: unit for c, unit in units.items() if recorded_channel(observer, c).unit}
     context = source.context() | {
         "version": version("kros"),
         "fmi": fmi,

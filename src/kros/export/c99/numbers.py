@@ -93,8 +93,7 @@ class Source:
 
     def layout(self) -> dict[str, Any]:
         """Return names, units of measure, and numbers of states, channels and samples."""
-        o, factors, measured = self.observer, self.factors(), self.measured
-        lifting, window = o.lifting, o.lifting.window
+        o, factors, measured, lifting = self.observer, self.factors(), self.measured, self.observer.lifting
         return {
             "name": self.name,
             "NAME": self.name.upper(),
@@ -122,9 +121,9 @@ class Source:
             "order": o.controller.n_states,
             "delay": o.runtime.delay,
             "longest": LONGEST,
-            "history": len(window.earlier),
-            "window_shift": window.shift.tolist(),
-            "window_present": window.present.tolist(),
+            "history": len(lifting.window.earlier),
+            "window_shift": lifting.window.shift.tolist(),
+            "window_present": lifting.window.present.tolist(),
         }
 
     def linear(self) -> dict[str, Any]:
@@ -142,12 +141,11 @@ class Source:
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
         o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
-        none = np.full(o.lifting.n_states, np.inf)
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
             "clips_estimate": bool(limits),
-            "lower": row(limits.get("lower", -none)),
-            "upper": row(limits.get("upper", none)),
+            "lower": row(limits.get("lower", np.full(o.lifting.n_states, -np.inf))),
+            "upper": row(limits.get("upper", np.full(o.lifting.n_states, np.inf))),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": bounds[:q],
             "u_bounds": bounds[q:],
@@ -297,8 +295,8 @@ class Source:
         """Return the bounds of states and of the correction, and how long a start takes."""
         own, n, most = self.observer.guard, self.observer.lifting.n_states, self.precision.largest
         low, high = np.clip(bounds(own, n, self.observer.controller.n_states), -most, most)
-        settle = 0 if own is None else own.settle
-        return {"lower": row(low[:n]), "upper": row(high[:n]), "correction": self.row(high[n:]), "settle": settle}
+        sides = {"lower": row(low[:n]), "upper": row(high[:n]), "settle": own.settle if own else 0}
+        return sides | {"correction": self.row(high[n:])}
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""

@@ -20,6 +20,7 @@ import paper_slsqp
 import plain
 import problems
 import pytest
+from kros.uncertainty.weights.bilinear import BilinearAxis
 from problems import DT, QUADRATIC
 
 from kros.core import StateSpace, h2_norm, hinf_norm
@@ -31,7 +32,6 @@ from kros.identify.factors import reduce_episode
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf, mixed
 from kros.uncertainty import choose_nominal, fit_magnitude
-from kros.uncertainty.weights.bilinear import BilinearAxis
 from kros.uncertainty.weights.cover import optimal_cover
 
 pytestmark = pytest.mark.filterwarnings("default")

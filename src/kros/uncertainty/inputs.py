@@ -11,6 +11,8 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
+from .forms import check_responses
+from .weights.fit import Target
 
 Array = npt.NDArray[Any]
 
@@ -25,7 +27,7 @@ class Options:
     nominal: Any = None
     max_order: int = 4
     tolerance_db: float = 1.0
-    sample_period_s: float = 0.0
+    sample_period_s: float | None = None
 
     @classmethod
     def of(cls, options: dict[str, Any]) -> Options:
@@ -40,6 +42,10 @@ class Options:
                 f"{read.tolerance_db} not negative."
             )
         return read
+
+    def target(self, sample_period_s: float) -> Target:
+        """Return what weights should be like."""
+        return Target(sample_period_s, self.max_order, self.tolerance_db)
 
     def scales(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Return the ranges of outputs and inputs."""
@@ -75,6 +81,8 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
         options = replace(options, **known)
         models = models.systems(tuple(options.unit_ids or ()))
     system = stack_systems(models)
+    if not system.dt > 0:
+        raise ConfigError("Quantify: continuous systems have no weights; sample them, control.sample_system does it.")
     require_stable(system, tuple(f"unit {name}" for name in options.ids(system.batch_shape[0])))
     return system, options
 
@@ -103,14 +111,10 @@ def stack_systems(models: Any) -> StateSpace:
 
 
 def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output, at rest after a sample or as slow as the slowest."""
+    """Add states without input and output, at rest after a sample."""
     more = n_states - system.n_states
-    A = np.pad(system.A, (0, more))
-    if system.dt == 0 and more:
-        slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
-        A[system.n_states :, system.n_states :] = -max(slowest, np.finfo(float).tiny) * np.eye(more)
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
-    return StateSpace(A, B, C, system.D, system.dt)
+    return StateSpace(np.pad(system.A, (0, more)), B, C, system.D, system.dt)
 
 
 def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
@@ -143,44 +147,26 @@ def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
         return
     first = int(np.argmin(stable))
     poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
-    worst = f"largest real part of a pole {poles.real.max():.6g}"
-    if system.dt > 0:
-        worst = f"spectral radius {np.abs(poles).max():.6f}"
+    worst = f"spectral radius {np.abs(poles).max():.6f}"
     problem = f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all)"
     raise DataError(f"{problem}; identify with more regularisation or leave it out.")
 
 
-def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
-    """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
-    if response.shape != shape:
-        raise DimensionError(f"Quantify: the response of {name!r} should have shape {shape}, found {response.shape}.")
-    finite = np.isfinite(response).all(axis=(1, 2))
-    if not finite.all():
-        at = freqs[int(np.argmin(finite))]
-        raise DataError(
-            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave one of both out."
-        )
-
-
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
-    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
+    """Return responses (frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first, nominal = data[0], options.get("nominal")
-    everything = [*data, nominal] if hasattr(nominal, "frdata") else [*data]
-    for k, other in enumerate(everything):
-        name = f"response {k}" if k < len(data) else "the nominal"
+    named = {f"response {k}": one for k, one in enumerate(data)}
+    named |= {"the nominal": nominal} if hasattr(nominal, "frdata") else {}
+    for name, other in named.items():
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
             raise DimensionError(
                 f"Quantify: {name} has other frequencies than the first response; interpolate to one grid."
             )
-        if other.dt != first.dt or other.frdata.shape != first.frdata.shape:
-            raise DimensionError(
-                f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
-                f"{first.frdata.shape} and {first.dt}; bring them to one."
-            )
-    if first.dt is True:
-        raise DimensionError("Quantify: the responses have no sampling period (dt = True); give it in seconds.")
-    options["sample_period_s"] = float(first.dt or 0.0)
-    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in everything])
-    if len(everything) > len(data):
-        options["nominal"] = responses[-1]
-    return responses[: len(data)], np.asarray(first.omega, float) / (2 * np.pi)
+        if other.dt != first.dt:
+            raise DimensionError(f"Quantify: {name} has dt = {other.dt}, the first response {first.dt}.")
+    if first.dt and first.dt is not True:
+        options["sample_period_s"] = float(first.dt)
+    responses = [np.moveaxis(np.asarray(one.frdata), -1, 0) for one in named.values()]
+    if len(responses) > len(data):
+        options["nominal"] = responses.pop()
+    return check_responses(responses), np.asarray(first.omega, float) / (2 * np.pi)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
 from ..core.small_matrices import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
@@ -44,7 +43,9 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     ConfigError
         When the form is unknown.
     DimensionError
-        When responses do not have these axes, or have NaN.
+        When responses do not have these axes.
+    DataError
+        When one is not finite.
 
     Examples
     --------
@@ -56,9 +57,6 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     (1, [7.0])
     """
     form, G = as_form(form), check_responses(responses)
-    broken = ~np.isfinite(G).all(axis=(1, 2, 3))
-    if broken.any():
-        raise DimensionError(f"Nominal: units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out.")
     n_units, n_freqs = G.shape[:2]
     step = max(1, SET.at_once // n_freqs)
 

@@ -108,24 +108,22 @@ def quantify(
     Parameters
     ----------
     models : IdentifiedModels, ModelSet, systems or responses
-        Of `kros.identify`; or a batch, list or mapping by name of stable systems with `A, B, C, D, dt`, discrete or
-        continuous (``dt = 0``), with as many states as they like; or frequency responses, complex, of shape (unit,
-        frequency, p, m), or objects with `frdata, omega, dt` as python-control has them.
+        Of `kros.identify`; or a batch, list or mapping by name of stable discrete systems with `A, B, C, D, dt`, with
+        as many states as they like; or frequency responses, complex, of shape (unit, frequency, p, m), or objects with
+        `frdata, omega, dt` as python-control has them.
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
         By default 1000 logarithmic points over the six decades below Nyquist, not below what the longest episode of
-        recordings resolves; of continuous systems from a hundredth of the slowest to ten times the fastest pole. To the
-        grid of continuous systems points up to ten times its end are added; beyond these, residuals count as constant.
-        Arrays of responses need it.
+        recordings resolves. Arrays of responses need it.
     work : Work, optional
         Where models of `kros.identify` are quantified.
     **options
         Of models of `kros.identify`: those of `QuantifySettings`. Of all others: ``unit_ids`` (names),
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
         row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
-        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of arrays of
-        responses; zero for continuous time).
+        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of responses
+        that have none: of measured ones at most half the inverse of the highest frequency).
 
     Returns
     -------

@@ -20,9 +20,8 @@ from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from .forms import Form, residual
 from .settings import SET
-from .weights.cover import Cover
+from .weights.cover import Cover, Weight
 from .weights.entries import fit_entries
-from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
@@ -36,7 +35,7 @@ class UnitResiduals:
 
     form: Form
     nominal_id: str
-    unit_ids: tuple[str, ...]  # units that are kept, at most 200 of those covered, and all others
+    unit_ids: tuple[str, ...]  # covered units, and others
     outside: tuple[str, ...]  # units that the weights do not have to cover
     freqs_hz: Array  # (frequency,), Hz
     entries: Array  # (unit, frequency, p', m'): magnitudes of the residual's entries, in scaled coordinates
@@ -82,19 +81,16 @@ def unit_residuals(
         raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
-    sizes, ratio = np.abs(E), cover.ratio(E)
+    sizes = np.abs(E)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
-    rows = np.flatnonzero(inside)  # at most 200 of the covered units, evenly spread, and all others
-    some = rows[np.unique(np.linspace(0, len(rows) - 1, min(SET.units, len(rows))).round().astype(int))]
-    shown = np.sort(np.concatenate([some, np.flatnonzero(~inside)]))
     return UnitResiduals(
         form=form,
         nominal_id=nominal[0],
-        unit_ids=tuple(unit_ids[k] for k in shown),
+        unit_ids=unit_ids,
         outside=tuple(unit for unit in unit_ids if unit in outside),
         freqs_hz=freqs_hz,
-        entries=sizes[shown],
-        ratio=ratio[shown],
+        entries=sizes,
+        ratio=cover.ratio(E),
         largest=sizes[inside].max(axis=0),
         entry_weights=np.abs(fitted.system.frequency_response(freqs_hz)),
         entry_orders=fitted.orders,

@@ -117,7 +117,7 @@ def test_delays():
         (lambda: delays(["a"], 0), "depth: .* equal to 1"),
         (lambda: delays(["a"], 1001), "depth: .* equal to 1000"),
         (lambda: delays(["sin(a)"], 1), "only states and inputs have earlier values"),
-        (lambda: kmeans_centres(np.zeros((50, 2)), 2, 0), "different samples, found 1"),
+        (lambda: kmeans_centres(np.zeros((50, 2)), 2, 0), "have 1 clusters"),
         (lambda: Lifting(("a",), (*polynomials(["a"], 2), "a**2")), "functions repeat one of them"),
         (lambda: family({"kind": "wavelets"}), "known are harmonics"),
         (

@@ -13,14 +13,7 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..evaluate import error_rms
 from ..loops.filtering import recursion
-from ..observer import (
-    Observer,
-    ReliftCertificate,
-    ReliftScales,
-    ReliftStatus,
-    relift_certificate,
-    run_observer,
-)
+from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
 from ..observer.certificate.signals import SignalBound, signal_bound
 from ..observer.estimator.certificate import filter_certificate, left_out_bound
 from ..observer.estimator.gaps import losses
@@ -98,11 +91,7 @@ def _certified_models(
 
 
 def _certified_filters(
-    design: Design,
-    batch: EpisodeBatch,
-    others: Sequence[EpisodeBatch],
-    task: DesignTask,
-    settings: CertificateSettings,
+    design: Design, batch: EpisodeBatch, others: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
 ) -> Design:
     """Certify a filter bank; its errors in training are raised to those on units that were left out."""
     observer = design.observer

@@ -30,13 +30,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
 from ..core.settings import member
-from ..core.small_matrices import (
-    entries_first,
-    entries_last,
-    multiply,
-    pseudo_inverse_first,
-    sigma_max,
-)
+from ..core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
 from .settings import SET
 
 Array = npt.NDArray[Any]

@@ -9,7 +9,7 @@ from typing import Any
 from ..core.artifacts import plain
 from ..data.population import scaling_of
 from ..identify.identified import IdentifiedModels
-from ..observer import Observer, Sensor
+from ..observer import Sensor
 from .task import Design, DesignTask
 
 _SIGNALS = {
@@ -33,7 +33,10 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,
         "columns": {name: asdict(scaling_of(population.scaling, name)) for name in names},
-        "sensor": {name: _sensor(observer, name, known.resolution[name]) for name in population.measured},
+        "sensor": {
+            name: observer.sensor.get(name, Sensor()).no_finer_than(known.resolution[name]).model_dump()
+            for name in population.measured
+        },
         "trained_on": {**trained, "identify_on": known.identify_on},
         "as_it_runs": {**proof, "operating_box": certificate.box},
         "uncertain_set": {"worst_case_h2": facts.get("worst_case_h2"), "reason": facts.get("reason") or ""},
@@ -45,8 +48,3 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     content |= {"recorded_signals": signals} if signals else {}
     json: dict[str, Any] = plain(content)
     return json
-
-
-def _sensor(observer: Observer, name: str, resolution: float) -> dict[str, Any]:
-    declared = observer.sensor.get(name, Sensor())
-    return declared.model_copy(update={"resolution": max(declared.resolution or 0.0, resolution)}).model_dump()

@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -31,7 +31,7 @@ from .about import about
 from .certificates import certify, in_recorded_units
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor, monitor_facts
-from .settings import BASELINES, ObserverSettings, SynthesisSettings
+from .settings import ObserverSettings, SynthesisSettings
 from .task import Design, DesignTask, Method, split_name
 from .uncertain_set import certificate, usable_problem
 from .validation import TrainingSet
@@ -154,37 +154,24 @@ def synthesize_all(
             log.warning("%s could not be designed: %s", task.name, failed[task.name])
     designs = certified(tasks, designs, uncertain.models, work)
     deployed = choose_deployed(list(designs.values()))
-    designs[deployed] = with_monitor(designs[deployed], uncertain.models, sensor, work)
+    design, models = designs[deployed], uncertain.models.models(split_name(deployed)[0])
+    monitor = fit_monitor(design.observer, TrainingSet.whole(uncertain.models, models, sensor), work=work)
+    if monitor is not None:
+        facts = {**design.facts, "monitor": monitor_facts(monitor)}
+        designs[deployed] = replace(design, observer=replace(design.observer, monitor=monitor), facts=facts)
     return Designs(designs, deployed, failed, tuple(task.name for task in tasks))
-
-
-def with_monitor(
-    design: Design, identified: IdentifiedModels, sensor: Sensors | None, work: Work | None = None
-) -> Design:
-    """Return a design whose observer has a monitor, where there are enough units."""
-    training = TrainingSet.whole(identified, identified.models(split_name(design.name)[0]), sensor)
-    monitor = fit_monitor(design.observer, training, work=work)
-    if monitor is None:
-        return design
-    observer = replace(design.observer, monitor=monitor)
-    return replace(design, observer=observer, facts={**design.facts, "monitor": monitor_facts(monitor)})
 
 
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:
     """Return a method and the kind of model that it is named with, or the first one that it is for."""
     kinds = uncertain.models.kinds
-    methods = methods_of([m.name for m in METHODS], estimator) if isinstance(method, str) else [method]
+    methods = methods_of([m.name for m in METHODS], estimator) + ([] if isinstance(method, str) else [method])
     pairs = [(kind, m) for kind in kinds for m in suitable(methods, kind, kinds)]
     for kind, m in pairs:
         if method in (m, m.name, f"{kind}/{m.name}"):
             return kind, m
-    reason = "there is no such method"
-    if method in get_args(BASELINES):
-        reason = "it is a baseline that runs where a study evaluates, and no design"
-    elif not isinstance(method, str) or split_name(method)[1] in {m.name for m in METHODS}:
-        reason = "it is not for these kinds of models; lifted functions are given to kros.identify"
     known = ", ".join(f"{kind}/{m.name}" for kind, m in pairs)
-    raise ConfigError(f"Synthesize, method {method!r}: {reason}; known are {known}.")
+    raise ConfigError(f"Synthesize: there is no method {method!r} for these models; known are {known}.")
 
 
 def tasks_of(
@@ -219,28 +206,18 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
     if any(one.jitter_samples for one in sensor.values()):
         states = TrainingSet.of(identified, models).read().states[..., list(models.measured)]
         steps = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=(0, 1)))
-    variances = []
-    for name, step in zip(names, steps, strict=True):
-        one = sensor.get(name, Sensor())
-        resolution = max(one.resolution or 0.0, identified.facts.resolution[name])
-        variances.append(one.model_copy(update={"resolution": resolution}).variance(step))
-    return np.sqrt(variances)
+    sensors = (sensor.get(name, Sensor()).no_finer_than(identified.facts.resolution[name]) for name in names)
+    return np.sqrt([one.variance(step) for one, step in zip(sensors, steps, strict=True)])
 
 
 def _designed(tasks: Sequence[DesignTask], work: Work) -> tuple[dict[str, Design], dict[str, str]]:
     """Return designs, and reasons of those that failed; the last methods start first, since they take longest."""
-    designs: dict[str, Design] = {}
-    failed: dict[str, str] = {}
     places = {method.name: place for place, method in enumerate(METHODS)}
     order = sorted(tasks, key=lambda task: -places.get(task.method.name, len(places)))
     results = dict(zip((task.name for task in order), work.map("synthesize", _design, order), strict=True))
-    for task in tasks:
-        result = results[task.name]
-        if isinstance(result, Design):
-            designs[task.name] = result
-        else:
-            failed[task.name] = result
-    return designs, failed
+    results = {task.name: results[task.name] for task in tasks}
+    designs = {name: result for name, result in results.items() if isinstance(result, Design)}
+    return designs, {name: result for name, result in results.items() if isinstance(result, str)}
 
 
 def _design(task: DesignTask) -> Design | str:

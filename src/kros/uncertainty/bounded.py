@@ -92,21 +92,16 @@ def _certificate(freqs: Array, bound: Array) -> str:
     if unresolved.size:
         some = ", ".join(f"{f:.4g}" for f in unresolved[:5])
         text += f"; they do not resolve {unresolved.size} peaks of the residuals, at {some} Hz"
-        _LOG.warning(
-            "Weights of responses: the residuals peak within less than a step of the frequencies given, at %s Hz, and "
-            "may be larger beside them; measure more densely there.",
-            some,
-        )
+        _LOG.warning("Weights of responses: residuals peak between frequencies, at %s Hz; measure more densely.", some)
     return text
 
 
 def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
     """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
-    right = np.searchsorted(freqs, at_hz).clip(1, max(len(freqs) - 1, 1))
-    left, right = right - 1, np.minimum(right, len(freqs) - 1)
-    step = np.where(right > left, freqs[right] - freqs[left], 1.0)
-    share = ((at_hz - freqs[left]) / step).clip(0.0, 1.0)[:, None, None]
-    return np.asarray(values[:, left] * (1 - share) + values[:, right] * share)
+    units, _, p, m = values.shape
+    columns = np.moveaxis(values, 1, -1).reshape(-1, len(freqs))
+    between = np.array([np.interp(at_hz, freqs, column) for column in columns])
+    return np.moveaxis(between.reshape(units, p, m, len(at_hz)), -1, 1)
 
 
 def _bound(

@@ -206,9 +206,5 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
 
 def _inverse(matrices: Array) -> Array:
     """Inverses, NaN where a matrix is singular."""
-    try:
-        return np.linalg.inv(matrices)
-    except np.linalg.LinAlgError:
-        regular = np.linalg.cond(matrices) < 1 / np.finfo(float).eps
-        safe = np.where(regular[..., None, None], matrices, np.eye(matrices.shape[-1]))
-        return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
+    regular = (np.linalg.cond(matrices) < 1 / np.finfo(float).eps)[..., None, None]
+    return np.where(regular, np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1]))), np.nan)

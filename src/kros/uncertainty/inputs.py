@@ -3,45 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
+from ..core.settings import Settings
 from .forms import check_responses
 from .weights.fit import Target
 
 Array = npt.NDArray[Any]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
+class Options(Settings):
     """Options of `quantify` for systems and responses, described there."""
 
-    unit_ids: Sequence[str] | None = None
-    output_scale: npt.ArrayLike | None = None
-    input_scale: npt.ArrayLike | None = None
+    unit_ids: tuple[str, ...] | None = None
+    output_scale: Any = None
+    input_scale: Any = None
     nominal: Any = None
-    max_order: int = 4
-    tolerance_db: float = 1.0
+    max_order: int = Field(4, ge=0)
+    tolerance_db: float = Field(1.0, ge=0)
     sample_period_s: float | None = None
-
-    @classmethod
-    def of(cls, options: dict[str, Any]) -> Options:
-        """Check options by name, order and tolerance."""
-        unknown = sorted(set(options) - set(cls.__dataclass_fields__))
-        if unknown:
-            raise ConfigError(f"Quantify: unknown {', '.join(unknown)}; known: {', '.join(cls.__dataclass_fields__)}.")
-        read = cls(**options)
-        if not (isinstance(read.max_order, int | np.integer) and read.max_order >= 0 and read.tolerance_db >= 0):
-            raise ConfigError(
-                f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
-                f"{read.tolerance_db} not negative."
-            )
-        return read
 
     def target(self, sample_period_s: float) -> Target:
         """Return what weights should be like."""
@@ -78,7 +64,7 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
     if hasattr(models, "systems") and hasattr(models, "unit_ids"):
         names = ("output_scale", "input_scale", "unit_ids")
         known = {name: getattr(models, name) for name in names if getattr(options, name) is None}
-        options = replace(options, **known)
+        options = options.model_copy(update=known)
         models = models.systems(tuple(options.unit_ids or ()))
     system = stack_systems(models)
     if not system.dt > 0:
@@ -91,30 +77,29 @@ def stack_systems(models: Any) -> StateSpace:
     """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period."""
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
+            remedy = "give a list of systems, an array of responses, or the result of kros.identify"
             raise DimensionError(
-                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of "
-                "systems, an array of responses, or the result of kros.identify."
+                f"Quantify: needs models of at least two units, found {type(models).__name__}; {remedy}."
             )
         systems = [StateSpace.of(system) for system in models]
         kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(kinds) != 1:
             problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
             raise DimensionError(f"{problem}; identify them alike, and give at least two.")
-        n_states = max(s.n_states for s in systems)
-        systems = [_padded(s, n_states) for s in systems]
-        A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
-        models = StateSpace(A, B, C, D, systems[0].dt)
+        largest, dt = max(s.n_states for s in systems), systems[0].dt
+        padded = [_padded(s, largest - s.n_states) for s in systems]
+        A, B, C, D = (np.stack(matrices) for matrices in zip(*padded, strict=True))
+        models = StateSpace(A, B, C, D, dt)
     if len(models.batch_shape) != 1:
         problem = f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}"
         raise DimensionError(f"{problem}; stack the units.")
     return models
 
 
-def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output, at rest after a sample."""
-    more = n_states - system.n_states
+def _padded(system: StateSpace, more: int) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C, D with further states without input and output, at rest after a sample."""
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
-    return StateSpace(np.pad(system.A, (0, more)), B, C, system.D, system.dt)
+    return np.pad(system.A, (0, more)), B, C, system.D
 
 
 def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
@@ -136,20 +121,12 @@ def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
 
 def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
-    count = (len(names),)
-    matrices = (system.A, system.B, system.C, system.D)
-    finite = np.all([np.broadcast_to(np.isfinite(M).all(axis=(-2, -1)), count) for M in matrices], axis=0)
-    if not finite.all():
-        name = names[int(np.argmin(finite))]
-        raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
-    stable = np.broadcast_to(system.is_stable(), count)
-    if stable.all():
-        return
-    first = int(np.argmin(stable))
-    poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
-    worst = f"spectral radius {np.abs(poles).max():.6f}"
-    problem = f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all)"
-    raise DataError(f"{problem}; identify with more regularisation or leave it out.")
+    for k, name in enumerate(names):
+        if not all(np.isfinite(M).all() for M in (system[k].A, system[k].B, system[k].C, system[k].D)):
+            raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
+        if not system[k].is_stable():
+            problem = f"the model of {name} is unstable (spectral radius {system[k].spectral_radius():.6f})"
+            raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
 
 
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
@@ -159,9 +136,8 @@ def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Ar
     named |= {"the nominal": nominal} if hasattr(nominal, "frdata") else {}
     for name, other in named.items():
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
-            raise DimensionError(
-                f"Quantify: {name} has other frequencies than the first response; interpolate to one grid."
-            )
+            problem = f"{name} has other frequencies than the first response"
+            raise DimensionError(f"Quantify: {problem}; interpolate to one grid.")
         if other.dt != first.dt:
             raise DimensionError(f"Quantify: {name} has dt = {other.dt}, the first response {first.dt}.")
     if first.dt and first.dt is not True:

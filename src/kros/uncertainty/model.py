@@ -139,9 +139,8 @@ class UncertainModel(Uncertainty):
 
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
-        arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS} | _packed(
-            "nominal", self.nominal_system
-        )
+        arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= _packed("nominal", self.nominal_system)
         arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
         arrays |= {"cover_left": self.cover.left, "cover_right": self.cover.right}
         content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS}

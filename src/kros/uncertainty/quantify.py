@@ -164,7 +164,7 @@ def quantify(
             raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
         models, freqs_hz = read_response_data(models, options)
     bound = bound_responses if isinstance(models, np.ndarray) else bound_systems
-    return bound(models, as_form(form), freqs_hz, Options.of(options))
+    return bound(models, as_form(form), freqs_hz, Options.of(options, "Quantify"))
 
 
 def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
@@ -176,17 +176,13 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         problem = f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed"
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     nominal = choose_unit(first, units, settings)
-    options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
+    same = {"max_order": settings.max_order, "tolerance_db": settings.tolerance_db}
+    options = Options(unit_ids=tuple(units), nominal=nominal, **same)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
     return UncertainModels(
-        models=models,
-        nominal=nominal,
-        worst_off_nominal=worst_off_nominal(first, sets[models.kinds[0]]),
-        sets=sets,
-        scores=tuple(scores),
-        outliers=outliers,
+        models, nominal, worst_off_nominal(first, sets[models.kinds[0]]), sets, tuple(scores), outliers
     )
 
 

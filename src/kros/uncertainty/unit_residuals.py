@@ -81,18 +81,7 @@ def unit_residuals(
         raise DimensionError(f"Residuals of units: needs a unit that is covered, found {', '.join(unit_ids)}.")
     E = residual(form, nominal[1], np.stack(list(responses.values())))
     cover = weights.magnitudes(freqs_hz) if isinstance(weights, Weight) else weights
-    sizes = np.abs(E)
+    names = form, nominal[0], unit_ids, tuple(unit for unit in unit_ids if unit in outside)
     fitted = fit_entries(E[inside], freqs_hz, sample_period_s, SET.entry_order)
-    return UnitResiduals(
-        form=form,
-        nominal_id=nominal[0],
-        unit_ids=unit_ids,
-        outside=tuple(unit for unit in unit_ids if unit in outside),
-        freqs_hz=freqs_hz,
-        entries=sizes,
-        ratio=cover.ratio(E),
-        largest=sizes[inside].max(axis=0),
-        entry_weights=np.abs(fitted.system.frequency_response(freqs_hz)),
-        entry_orders=fitted.orders,
-        entry_excess=fitted.excess,
-    )
+    fit = np.abs(fitted.system.frequency_response(freqs_hz)), fitted.orders, fitted.excess
+    return UnitResiduals(*names, freqs_hz, np.abs(E), cover.ratio(E), np.abs(E[inside]).max(axis=0), *fit)

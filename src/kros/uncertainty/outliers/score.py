@@ -7,7 +7,7 @@ nothing is said about the unit instead of "ok".
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
@@ -67,11 +67,9 @@ class OutlierScore:
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
         """Return a score as it was before it became JSON, which has neither infinity nor tuples."""
-        values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
-        if values["detectable_percent"] is None:
-            values["detectable_percent"] = float("inf")
-        entry, status = tuple(values["detectable_entry"]), Status(values["status"])
-        return cls(**values | {"threshold_db": threshold_db, "status": status, "detectable_entry": entry})
+        percent, entry = content["detectable_percent"], tuple(content["detectable_entry"])
+        values = {"threshold_db": threshold_db, "status": Status(content["status"]), "detectable_entry": entry}
+        return cls(**{**content, **values, "detectable_percent": float("inf") if percent is None else percent})
 
 
 @dataclass(frozen=True, eq=False)

@@ -201,7 +201,7 @@ def test_bad_input_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"structure": "diagonal"}, "structure: unknown key"),
+        ({"colour": "red"}, "colour: unknown key"),
         ({"max_order": -1}, "max_order: .*greater than or equal to 0, found -1"),
         ({"tolerance_db": -1.0}, "tolerance_db: .*greater than or equal to 0, found -1.0"),
         ({"nominal": 0.5}, "nominal 0.5 is out of range"),

@@ -119,30 +119,13 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     >>> radial(["position", "velocity"], [[0.5, 0]], [0.1, 2])
     ('exp(-(((position - 0.5)/0.1)**2 + (velocity/2)**2)/2)',)
     """
-    lengths, centres = _scales("radial", length, len(names)), _finite("radial: centres", centres)
+    lengths, centres = np.asarray(length, dtype=float), _finite("radial: centres", centres)
+    if lengths.shape not in ((), (len(names),)):
+        raise ConfigError(f"radial: length = {length} should be one number, or {len(names)}, one for each quantity.")
     if centres.shape[1] != len(names) or not len(centres):
         raise ConfigError(f"radial: centres should have the shape (n, {len(names)}), found shape {centres.shape}.")
+    lengths = np.broadcast_to(lengths, (len(names),))
     return tuple(f"exp(-({_squared_distance(names, centre, lengths)})/2)" for centre in centres)
-
-
-@checked
-def fourier_features(names: Names, n: Count, length: Lengths, seed: int) -> Formulas:
-    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to the Gaussian kernel.
-
-    The kernel is ``exp(-s**2/2)`` with the scaled distance s, as in `radial`, whose other parameters it has too.
-
-    Source: A. Rahimi and B. Recht, "Random features for large-scale kernel machines", NeurIPS 20, 2007.
-
-    >>> from kros.lifting import fourier_features
-    >>> len(fourier_features(["angle", "rate"], n=20, length=[0.5, 2.0], seed=0))
-    20
-    """
-    rng = np.random.default_rng(seed)
-    frequencies = rng.standard_normal(size=(n, len(names))) / _scales("fourier_features", length, len(names))
-    shifts = rng.uniform(0, 2 * np.pi, size=n)
-    size, inner = number(np.sqrt(2 / n)), [wrapped(name) for name in names]
-    angles = (" + ".join(f"({number(w)})*{q}" for w, q in zip(row, inner, strict=True)) for row in frequencies)
-    return tuple(f"{size}*cos({angle} + {number(b)})" for angle, b in zip(angles, shifts, strict=True))
 
 
 @checked
@@ -169,7 +152,6 @@ KINDS: dict[str, Callable[..., Any]] = {
     "harmonics": harmonics,
     "polynomials": polynomials,
     "radial": radial,
-    "fourier": fourier_features,
     "delays": delays,
 }
 
@@ -220,13 +202,6 @@ def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> st
         offset = wrapped(name) if c == 0 else f"({wrapped(name)} {'-' if c > 0 else '+'} {number(abs(c))})"
         terms.append(f"({offset}/{number(scale)})**2" if scale != 1 else f"{offset}**2")
     return " + ".join(terms)
-
-
-def _scales(kind: str, length: float | Sequence[float], n: int) -> Array:
-    lengths = np.asarray(length, dtype=float)
-    if lengths.shape not in ((), (n,)):
-        raise ConfigError(f"{kind}: length = {length} should be one number, or {n}, one for each quantity.")
-    return np.broadcast_to(lengths, (n,))
 
 
 def _finite(what: str, values: Any) -> Array:

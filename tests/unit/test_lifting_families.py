@@ -1,6 +1,5 @@
 """Families: the formulas that they write, that their values are those of the definitions, and what they refuse."""
 
-
 import numpy as np
 import pytest
 

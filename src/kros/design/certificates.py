@@ -46,10 +46,10 @@ DEFAULT = CertificateSettings()
 
 def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSettings = DEFAULT) -> list[Design]:
     """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
-    data, others = certified_on(task.training, settings), other_conditions(task, settings)
+    batches = [certified_on(task.training, settings), *other_conditions(task, settings)]
     if designs[0].observer.bank is not None:
-        return [_certified_filters(design, data, others, task, settings) for design in designs]
-    return _certified_models(designs, data, others, task, settings)
+        return [_certified_filters(design, batches, task, settings) for design in designs]
+    return _certified_models(designs, batches, task, settings)
 
 
 def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> EpisodeBatch:
@@ -67,34 +67,29 @@ def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[Ep
 
 
 def _certified_models(
-    designs: Sequence[Design],
-    batch: EpisodeBatch,
-    others: Sequence[EpisodeBatch],
-    task: DesignTask,
-    settings: CertificateSettings,
+    designs: Sequence[Design], batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
 ) -> list[Design]:
     """Certify corrected models, which run side by side."""
-    observers = [design.observer for design in designs]
-    guards = guards_of(observers, [batch, *others], settings)
-    scales = scales_of(observers, batch, task)
-    certificates = [certify_model(o, s, task, settings.box) for o, s in zip(observers, scales, strict=True)]
-    hidden = hidden_error_percent(observers, [batch, *others])
-    lost, certified = loss_error_percent(observers, batch, settings), []
-    for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
-        observer = observers[k]
+    observers, batch, certified = [design.observer for design in designs], batches[0], []
+    guards, scales = guards_of(observers, batches, settings), scales_of(observers, batch, task)
+    errors = np.stack(
+        [hidden_error_percent(observers, batches), loss_error_percent(observers, batch, settings)], axis=1
+    )
+    for design, guard, scale, (hidden, lost) in zip(designs, guards, scales, errors.tolist(), strict=True):
+        observer = design.observer
+        certificate = certify_model(observer, scale, task, settings.box)
         bound = signal_bound(certificate, observer, batch).in_sizes(factors(observer, {})[0][: len(observer.recorded)])
         certificate = certificate.in_sizes(observer, {})
-        facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
-        observer = replace(observer, guard=guards[k])
-        certified.append(replace(design, observer=observer, certificate=certificate, facts={**design.facts, **facts}))
+        facts = {**design.facts, **_facts(certificate, bound, observer.measured, (hidden, lost))}
+        certified.append(replace(design, observer=replace(observer, guard=guard), certificate=certificate, facts=facts))
     return certified
 
 
 def _certified_filters(
-    design: Design, batch: EpisodeBatch, others: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
+    design: Design, batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
 ) -> Design:
     """Certify a filter bank; its errors in training are raised to those on units that were left out."""
-    observer = design.observer
+    observer, batch = design.observer, batches[0]
     n, measured = len(observer.recorded), observer.measured
     estimates = run_observer(observer, batch.measurements(measured), batch.inputs, observer.own(batch.parameters))
     square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
@@ -104,7 +99,7 @@ def _certified_filters(
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
     growth = design.facts["left_out_to_training"]
     left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
-    hidden = float(hidden_error_percent([observer], [batch, *others], left_out)[0])
+    hidden = float(hidden_error_percent([observer], batches, left_out)[0])
     lost = float(loss_error_percent([observer], batch, settings)[0])
     certificate = filter_certificate(observer, scales)
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
@@ -121,9 +116,8 @@ def _facts(
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
     facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
-    facts["set_bound"] = {
-        s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
-    }
+    cover = zip(bound.states, bound.cover.tolist(), strict=True)
+    facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
@@ -138,14 +132,10 @@ def hidden_error_percent(
 
 def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:
     """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
-    known: dict[bytes, ReliftScales] = {}
-    for observer in observers:
-        model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
-        if model not in known:
-            values = observer.own(batch.parameters)
-            residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
-            known[model] = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
-    return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
+    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
+    recorded = batch.states, batch.inputs, first.own(batch.parameters)
+    residuals = (one_step_residual(first.lifting, o.A, o.B, *recorded) for o in observers)
+    return [ReliftScales.typical(sizes, residual, task.noise) for residual in residuals]
 
 
 def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, settings: CertificateSettings) -> Array:
@@ -166,11 +156,9 @@ def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, si
     """Certify one observer everywhere, or in an operating box where slopes have no global bound."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
-        ranges = [
-            *zip(models.lifting.states, models.output_scale, strict=False),
-            *zip(models.recorded_inputs, models.input_scale, strict=False),
-        ]
-        box = {name: (-size * value, size * value) for name, value in ranges}
+        ranges = dict(zip(models.lifting.states, models.output_scale, strict=False))
+        ranges |= dict(zip(models.recorded_inputs, models.input_scale, strict=False))
+        box = {name: (-size * value, size * value) for name, value in ranges.items()}
         values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
         certificate = relift_certificate(observer, box, scales, values)
     if not certificate.certified:

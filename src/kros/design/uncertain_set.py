@@ -47,8 +47,7 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
     problem = replace(problem, injection=design.synthesis.injection)
     try:
         errors, mean = error_maps(task, design, problem)
-        loop = float(errors.spectral_radius())
-        facts["spectral_radius_max"] = max(loop, float(task.models.spectral_radius().max()))
+        facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))
         bound = certify_errors(problem, errors, mean)[0]
         if observer.bank is None:
             facts |= of_units(task, design, problem)

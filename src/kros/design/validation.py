@@ -63,10 +63,10 @@ class TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
         units = [u for u in facts.pooled if u in models.unit_ids]
-        groups = [
-            facts.keys("train", u, c) for u in units for c in dict.fromkeys(k.condition for k in facts.keys("train", u))
-        ]
-        keys = [k for turn in zip_longest(*groups) for k in turn if k is not None]
+        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+        for key in (key for unit in units for key in facts.keys("train", unit)):
+            groups.setdefault((key.unit, key.condition), []).append(key)
+        keys = [k for turn in zip_longest(*groups.values()) for k in turn if k is not None]
         return cls._of(identified, models, units, keys, sensor)
 
     @classmethod

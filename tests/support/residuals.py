@@ -9,7 +9,7 @@ import numpy as np
 
 from kros.core.lti import StateSpace, gain
 from kros.uncertainty import Form
-from kros.uncertainty.weights.residuals import Residuals
+from kros.uncertainty.weights.fit import Residuals
 
 Array = np.ndarray[Any, Any]
 

@@ -28,12 +28,11 @@ from ..observer.sensor import Sensors, require_measured, sides
 from ..synthesis import ObserverProblem
 from ..uncertainty.quantify import UncertainModels
 from .about import about
-from .certificates import certify, in_recorded_units
+from .certificates import certificate, certify, in_recorded_units, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor, monitor_facts
 from .settings import ObserverSettings, SynthesisSettings
 from .task import Design, DesignTask, Method, split_name
-from .uncertain_set import certificate, usable_problem
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)

@@ -22,8 +22,7 @@ from .inputs import Options, check_candidate, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import NominalChoice, choose_nominal
 from .settings import SET
-from .weights.fit import Target, fit_weight
-from .weights.residuals import Residuals
+from .weights.fit import Residuals, Target, fit_weight
 
 Array = npt.NDArray[Any]
 

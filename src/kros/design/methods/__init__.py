@@ -8,8 +8,7 @@ from collections.abc import Collection, Iterable
 from ...observer import EstimatorSettings
 from ..task import Method, split_name
 from .estimator import Estimator
-from .gains import KalmanTuned, OpenLoop
-from .residual import ResidualH2
+from .gains import KalmanTuned, OpenLoop, ResidualH2
 from .robust import Mixed, Published, WorstCaseH2
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from ...core.lti import StateSpace, block_diagonal, gain
 from ...identify.model_set import kind_of
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
-from ...uncertainty.weights.entries import EntryWeights, fit_entries
+from ...uncertainty.unit_residuals import EntryWeights, fit_entries
 from ..task import Design, DesignTask, Method
 
 

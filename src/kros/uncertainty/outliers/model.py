@@ -15,7 +15,7 @@ Some unit always exceeds the others, and without a model no threshold can hold a
 rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
 extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
 units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
-recorded for too little are left open before (`recorded`). What a score would have shown stands beside it (`score`).
+recorded for too little are left open before (`population`). What a score would have shown stands beside it (`score`).
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
 from kros.uncertainty import Form, quantify
 from kros.uncertainty.weights.fit import checking_grid, joined
+from kros.uncertainty.weights.magnitude import RationalMagnitude
 from kros.uncertainty.weights.proof import ResidualSystems
-from kros.uncertainty.weights.rational import RationalMagnitude
 
 
 def test_the_checking_grid_reaches_from_zero_to_nyquist_and_is_dense_everywhere() -> None:

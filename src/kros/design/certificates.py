@@ -30,7 +30,7 @@ from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..synthesis.worst_case.unit_check import unit_ratios
 from ..uncertainty import UncertainModel
 from .monitor import settling
-from .task import FITTED, Design, DesignTask
+from .task import Design, DesignTask
 from .validation import TrainingSet, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
@@ -242,7 +242,8 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
     facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
     if design.facts.get("rows_fitted_to_single_steps"):
-        return facts | {"reason": FITTED}
+        reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
+        return facts | {"reason": reason}
     if problem is None:
         return facts | {"reason": task.refusal}
     problem = replace(problem, injection=design.synthesis.injection)

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -109,11 +109,9 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings =
     mean, bound = float(highest.mean()), float(prediction_bound(highest, rate))
     if not 1 < shared < settings.motions or bound <= mean:
         return bound
-    every, half = np.array([levels[:shared] for levels in peaks]), shared // 2
-    means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), half)}
-    apart = [
-        means[one] - means[other] for one in means for other in combinations(sorted({*range(shared)} - {*one}), half)
-    ]
+    every = np.array([levels[:shared] for levels in peaks])
+    means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), shared // 2)}
+    apart = [means[one] - means[other] for one, other in product(means, means) if not {*one} & {*other}]
     wider = stdtrit(shared - 1, 1 - rate) ** 2 - stdtrit(settings.motions - 1, 1 - rate) ** 2
     return mean + float(np.sqrt((bound - mean) ** 2 + wider * np.mean(np.square(apart))))
 

@@ -22,7 +22,6 @@ from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, percent_of, rank
 
 Array = npt.NDArray[np.float64]
-FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
 
 
 @dataclass(frozen=True)

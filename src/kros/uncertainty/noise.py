@@ -65,10 +65,10 @@ def noise_share(
     if units < 2 or draws < 2:
         raise DataError(f"Noise share: needs at least two units and two draws of each, found {units} and {draws}.")
     parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
-    finite = np.all([np.isfinite(part).reshape(units, -1).all(axis=1) for part in parts], axis=0)
-    if not finite.all():
-        unit = f"unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not finite"
-        raise DataError(f"Noise share: {unit}; leave the unit out, or raise alpha.")
+    for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
+        if not all(np.isfinite(M).all() for M in matrices):
+            problem = f"unit {unit} has a model or a draw that is not finite"
+            raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
     G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
     noise, step = np.zeros(len(freqs_hz)), max(1, OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):

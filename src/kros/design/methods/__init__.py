@@ -43,6 +43,6 @@ def suitable(methods: Iterable[Method], kind: str, kinds: Collection[str]) -> li
 
 def preferred(observers: Iterable[str]) -> str | None:
     """Return the observer ``<kind of model>/<method>`` whose method is preferred; None where there is none."""
-    order = {method.name: -place for place, method in enumerate(METHODS)}
-    ranks = {name: order[method] for name in observers if (method := split_name(name)[1]) in order}
-    return min(ranks, key=lambda name: ranks[name], default=None)
+    names = [method.name for method in METHODS]
+    known = [name for name in observers if split_name(name)[1] in names]
+    return max(known, key=lambda name: names.index(split_name(name)[1]), default=None)

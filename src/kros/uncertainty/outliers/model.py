@@ -227,17 +227,9 @@ def score_outliers(
     parts = separate(found.levels, rate)
     comparison = Comparison(form, G, freqs, found, parts.inliers)
     inliers = np.flatnonzero(parts.inliers)
-    return OutlierModel(
-        form=form,
-        unit_ids=tuple(ids[k] for k in inliers),
-        freqs_hz=freqs,
-        responses=G[inliers],
-        output_scale=scales[0],
-        input_scale=scales[1],
-        scores=comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist()))),
-        threshold_db=parts.threshold_db,
-        false_alarm_rate=rate,
-    )
+    scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
+    names = tuple(ids[k] for k in inliers)
+    return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
 
 
 def scored_rows(count: int) -> Array:

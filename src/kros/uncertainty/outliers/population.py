@@ -36,14 +36,11 @@ def score_population(
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
-    scored = {
-        condition: identified for condition, identified in known.items() if len(identified.unit_ids) >= LEAST_SCORES
-    }
+    scored = {condition: one for condition, one in known.items() if len(one.unit_ids) >= LEAST_SCORES}
     for condition in sorted(known.keys() - scored.keys()):
         log.info("%s: outlier scores need at least three units", condition)
     tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
-    rows: list[dict[str, Any]] = []
-    found: dict[str, OutlierModel] = {}
+    rows, found = list[dict[str, Any]](), dict[str, OutlierModel]()
     for condition, (outliers, samples) in zip(scored, (work or Work()).run("score outliers", tasks), strict=True):
         found[places[condition]] = outliers
         for score, n_samples in zip(outliers.scores, samples, strict=True):
@@ -111,8 +108,7 @@ class Evidence:
 
     def part(self, episodes: Sequence[int]) -> Evidence:
         """Return some of the episodes."""
-        rows = list(episodes)
-        f = self.factor
+        rows, f = list(episodes), self.factor
         return Evidence(Factor(f.R[rows], f.peak[rows], f.n_samples[rows]), self.lifted[rows])
 
 
@@ -150,10 +146,8 @@ class Recorded:
     def halves(self) -> tuple[Array, Array] | None:
         """Return the responses of all units from every second episode, and from the others."""
         several = [e for e in self.units.values() if len(e.lifted) > 1]
-        if not several:
-            return None
-        one, other = (self.response([e.part(range(k, len(e.lifted), 2)) for e in several]) for k in (0, 1))
-        return one, other
+        one, other = ([e.part(range(k, len(e.lifted), 2)) for e in several] for k in (0, 1))
+        return (self.response(one), self.response(other)) if several else None
 
     def same_motions(self, factor: Factor) -> bool:
         """Tell whether a unit was moved by inputs of the study alone."""

@@ -96,16 +96,9 @@ class Comparison:
         for unit, name in zip(units, ids, strict=True):
             value, margin = float(excess[unit]), margin_db[int(unit)]
             known = bool(np.isfinite(threshold) and np.isfinite(margin))
-            score = OutlierScore(
-                unit=name,
-                score_db=threshold + margin if known else value,
-                threshold_db=threshold,
-                outlier=known and margin > 0,
-                freq_hz=float(freqs[unit]),
-                excess_db=value,
-                lowest_db=float(lowest[unit]),
-                highest_db=float(highest[unit]),
-            )
+            levels_db = value, float(lowest[unit]), float(highest[unit])
+            score_db = threshold + margin if known else value
+            score = OutlierScore(name, score_db, threshold, known and margin > 0, float(freqs[unit]), *levels_db)
             scores.append(self._detectable(score, int(unit), value - margin) if known else score)
         return tuple(scores)
 
@@ -114,18 +107,11 @@ class Comparison:
         cover = float(self.distances.levels[unit].max()) - score.excess_db
         percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
         i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
-        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
-        if score.outlier:
-            status = Status.OUTLIER
-        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
-            status = Status.OK
-        return replace(
-            score,
-            status=status,
-            detectable_percent=smallest,
-            detectable_hz=float(self.freqs_hz[row]),
-            detectable_entry=(i, j),
-        )
+        smallest, hz = float(percent[i, j, row]), float(self.freqs_hz[row])
+        shows = bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent
+        inlier = Status.OK if shows else Status.CANNOT_TELL
+        status = Status.OUTLIER if score.outlier else inlier
+        return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz, detectable_entry=(i, j))
 
     @cached_property
     def _changes(self) -> Array:

@@ -76,8 +76,7 @@ def harmonics(
     >>> harmonics("position", 100, [1], "phase")
     ('sin(100*position + phase)', 'cos(100*position + phase)')
     """
-    inner = wrapped(angle) if ratio == 1 else f"{number(ratio)}*{wrapped(angle)}"
-    inner = inner if phase is None else f"{inner} + {wrapped(phase)}"
+    inner = (f"{number(ratio)}*" if ratio != 1 else "") + wrapped(angle) + (f" + {wrapped(phase)}" if phase else "")
     texts = [inner if k == 1 else f"{k}*({inner})" for k in orders]
     return tuple(f"{function}({text})" for text in texts for function in ("sin", "cos"))
 
@@ -102,10 +101,9 @@ def delays(names: Names, depth: Annotated[int, Field(ge=1, le=MAX_DELAY)]) -> Fo
     >>> delays(["position", "voltage"], 2)
     ('position[-1]', 'voltage[-1]', 'position[-2]', 'voltage[-2]')
     """
-    others = [name for name in names if not name.isidentifier()]
-    if others:
-        remedy = "write the delay inside the formula"
-        raise ConfigError(f"delays: only states and inputs have earlier values, found {others}; {remedy}.")
+    if others := [name for name in names if not name.isidentifier()]:
+        problem = f"only states and inputs have earlier values, found {others}"
+        raise ConfigError(f"delays: {problem}; write the delay inside the formula.")
     _require_count("delays", depth * len(names))
     return tuple(delayed_name(name, d) for d in range(1, depth + 1) for name in names)
 

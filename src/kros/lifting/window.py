@@ -93,26 +93,23 @@ class Window:
         if not self.depths:
             return x
         self.require(x.shape[-2])
-        columns = {name: x[..., i] for i, name in enumerate(self.states)}
-        columns |= {name: u[..., i] for i, name in enumerate(self.inputs)}
+        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
         h, end = self.history, x.shape[-2]
-        earlier = [columns[q][..., h - d : end - d] for q, d in self.delayed]
+        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in self.delayed]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
     def require(self, n_samples: int, beyond: int = 0) -> None:
         """Refuse a recording that is shorter than the history and `beyond` samples after its first window."""
         needed = self.history + 1 + beyond
         if n_samples < needed:
-            name, depth = max(self.depths, key=lambda item: item[1], default=("", 0))
-            reason = f" for the delay of {depth} in {name!r}" if self.depths else ""
-            problem = f"needs at least {needed} samples{reason}, found {n_samples}"
+            delays = "".join(f" for the delay of {d} in {q!r}" for q, d in self.depths if d == self.history)
+            problem = f"needs at least {needed} samples{delays}, found {n_samples}"
             raise DataError(f"Lifting a recording: {problem}; leave the episode out or use shorter delays.")
 
     def require_inputs(self, u: Array) -> None:
         """Refuse inputs that are not those the formulas were written for."""
         if self.inputs and u.shape[-1] != len(self.inputs):
-            needed = f"{len(self.inputs)} inputs {self.inputs} on the last axis"
-            raise DimensionError(f"Lifting: expected {needed}, found shape {u.shape}.")
+            raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} last, found {u.shape}.")
 
     def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
         """Return the columns by name, the present inputs with them where they are given."""
@@ -153,7 +150,7 @@ class FormulaSeparation:
     def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:
         """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
         values = {name: np.asarray(parameters[name], dtype=float) for name in self.parameters}
-        shape = np.broadcast_shapes(*(v.shape for v in values.values())) if values else ()
+        shape = np.broadcast_shapes(*(v.shape for v in values.values()))
         matrix = np.zeros((*shape, len(self.terms), len(self.basis)))
         for i, row in enumerate(self.terms):
             for j, coefficient in row:
@@ -172,8 +169,7 @@ def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
     _require_short(formula, apart)
     pairs = []
     for term in sp.Add.make_args(sp.expand(apart, trig=False)):
-        data = (symbol for symbol in term.free_symbols if symbol not in parameters)
-        coefficient, function = term.as_independent(*data, as_Add=False)
+        coefficient, function = term.as_independent(*(term.free_symbols - parameters), as_Add=False)
         if function.free_symbols & parameters:
             problem = f"parameters {tuple(sorted(p.name for p in parameters))} must enter as factors or as phases"
             raise ConfigError(f"Lifting function {formula.text!r}: {problem} of sin and cos.")

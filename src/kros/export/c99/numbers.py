@@ -68,8 +68,7 @@ class Source:
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         realised = Realised.of(observer)
-        observer = realised.observer
-        loop = None if track is None else PhaseLockedLoop(observer, track, 1)
+        loop = None if track is None else PhaseLockedLoop(realised.observer, track, 1)
         shift = find_shift(realised.observer) if precision == "float" else None
         return cls(realised, name, Precision(precision), shift, loop, load)
 
@@ -100,8 +99,7 @@ class Source:
             "observer_name": plain(o.name),
             "real": self.precision.type,
             "suffix": self.precision.suffix,
-            "zero": self.precision.literal(0.0),
-            "one": self.precision.literal(1.0),
+            **{name: self.precision.literal(value) for name, value in (("zero", 0.0), ("one", 1.0))},
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
             "measured": plain_names(measured),
@@ -109,8 +107,7 @@ class Source:
             "parameters": lifting.parameters,
             "signals": self.signals(),
             "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
-            "y_factor": self.literals([factors[s] for s in measured]),
-            "u_factor": self.literals([factors[s] for s in o.inputs]),
+            **{f"{k}_factor": self.literals([factors[s] for s in v]) for k, v in (("y", measured), ("u", o.inputs))},
             "at": o.measured,
             "n": lifting.n_states,
             "recorded": len(o.recorded),
@@ -261,10 +258,7 @@ class Source:
             "first": first,
             "fallback": o.lifting.n_states - first,
             "start": self.sums(self.realised.start),
-            "forget": self.row(own.forget),
-            "reach": self.row(own.reach),
-            "half": self.row(own.half),
-            "recovery": self.row(own.recovery),
+            **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
@@ -275,16 +269,14 @@ class Source:
         own = self.observer.monitor
         if own is None:
             return None
+        numbers = {"quiet": QUIET, "forget": own.forget, "first": max(own.first, own.forget), "largest": LARGEST}
         return {
             "bands": len(own.filters),
             "filters": self.matrix(own.filters),
             "inverse_size": self.row(1 / own.size),
             "inverse_limit": self.matrix(1 / own.limits),
             "weights": own.weights.astype(int).tolist(),
-            "quiet": self.precision.literal(QUIET),
-            "forget": self.precision.literal(own.forget),
-            "first": self.precision.literal(max(own.first, own.forget)),
-            "largest": self.precision.literal(LARGEST),
+            **{name: self.precision.literal(value) for name, value in numbers.items()},
             "settle": own.settle,
             "recovery": RECOVERY,
             "percent": f"{100 * own.false_alarm_rate:g}",

@@ -150,11 +150,6 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
     return level * (10 / WEIGHT)
 
 
-def monitor_facts(monitor: Monitor) -> dict[str, Any]:
-    """Return what the metrics say of a monitor."""
-    return {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
-
-
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     """Return the samples in which a start is forgotten, by the slowest mode of the observer's linear part."""
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted

@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from itertools import chain
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
 from ..core.work import Work
+from ..data.population import scaling_of
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
@@ -27,10 +30,9 @@ from ..observer import EstimatorSettings, Sensor
 from ..observer.sensor import Sensors, require_measured, sides
 from ..synthesis import ObserverProblem
 from ..uncertainty.quantify import UncertainModels
-from .about import about
 from .certificates import certificate, certify, in_recorded_units, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
-from .monitor import fit_monitor, monitor_facts
+from .monitor import fit_monitor
 from .settings import ObserverSettings, SynthesisSettings
 from .task import Design, DesignTask, Method, split_name
 from .validation import TrainingSet
@@ -156,7 +158,8 @@ def synthesize_all(
     design, models = designs[deployed], uncertain.models.models(split_name(deployed)[0])
     monitor = fit_monitor(design.observer, TrainingSet.whole(uncertain.models, models, sensor), work=work)
     if monitor is not None:
-        facts = {**design.facts, "monitor": monitor_facts(monitor)}
+        known = {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
+        facts = {**design.facts, "monitor": known}
         designs[deployed] = replace(design, observer=replace(design.observer, monitor=monitor), facts=facts)
     return Designs(designs, deployed, failed, tuple(task.name for task in tasks))
 
@@ -267,3 +270,41 @@ def choose_deployed(designs: Sequence[Design], settings: DeploymentSettings | No
     if best is None:
         raise SynthesisError("No observer could be designed; see the reasons above.")
     return best
+
+
+_SIGNALS = {
+    "set_certified": "certified",
+    "set_reason": "reason",
+    "set_bound_percent": "bound_percent",
+    "set_outside": "outside",
+}
+
+
+def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dict[str, Any]:
+    """Return the object ``about`` of an observer's file, in the recordings' units."""
+    population, known, calibration = identified.population, identified.facts, identified.calibration
+    observer, certificate, facts = design.observer, design.certificate, design.facts
+    assert certificate is not None
+    proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
+    trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
+    names = (*population.states, *population.inputs)
+    content: dict[str, Any] = {
+        "kros": version("kros"),
+        "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
+        "largest_in_training": identified.sizes,
+        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in names},
+        "sensor": {
+            name: observer.sensor.get(name, Sensor()).no_finer_than(known.resolution[name]).model_dump()
+            for name in population.measured
+        },
+        "trained_on": {**trained, "identify_on": known.identify_on},
+        "as_it_runs": {**proof, "operating_box": certificate.box},
+        "uncertain_set": {"worst_case_h2": facts.get("worst_case_h2"), "reason": facts.get("reason") or ""},
+    }
+    if calibration is not None and calibration.spec.parameter in observer.lifting.parameters:
+        values = {name: getattr(calibration.spec, name) for name in ("angle", "ratio", "reference", "measured")}
+        content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
+    signals = {name: facts[fact] for fact, name in _SIGNALS.items() if fact in facts}
+    content |= {"recorded_signals": signals} if signals else {}
+    json: dict[str, Any] = plain(content)
+    return json

@@ -111,20 +111,11 @@ def _bound(
     G, form, name = residuals.nominal(freqs), residuals.form, ids[index] if index >= 0 else POOLED
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)
-    left_out = _leaves_out(form, ratio)
-    return {
-        "form": form,
-        "unit_ids": ids,
-        "nominal": index,
-        "nominal_id": name,
-        "freqs_hz": freqs,
-        "bounds": {f: choice.bound for f, choice in choices.items()} | {form: bound},
-        "nominals": {f: ids[choice.index] for f, choice in choices.items()} | {form: name},
-        "cover": cover,
-        "weight": weight,
-        "misfit": ratio,
-        "remainder": fit_weight(replace(residuals, remainder=True), freqs, target)[0] if left_out else None,
-    }
+    fields = {"form": form, "unit_ids": ids, "nominal": index, "nominal_id": name, "freqs_hz": freqs, "misfit": ratio}
+    fields["bounds"] = {f: choice.bound for f, choice in choices.items()} | {form: bound}
+    fields["nominals"] = {f: ids[choice.index] for f, choice in choices.items()} | {form: name}
+    remainder = fit_weight(replace(residuals, remainder=True), freqs, target)[0] if _leaves_out(form, ratio) else None
+    return fields | {"cover": cover, "weight": weight, "remainder": remainder}
 
 
 def _leaves_out(form: Form, ratio: Array) -> bool:

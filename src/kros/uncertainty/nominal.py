@@ -71,12 +71,5 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
         sizes = np.concatenate([sigma_max(residual(form, G[row], part)) for part in parts])
         return sizes.max(axis=0), sizes.argmax(axis=0)
 
-    search = (n_units, n_freqs), _central(G), bound, against
-    return NominalChoice(*smallest_largest(*search, lambda sizes: sizes.max(axis=-1))[:2])
-
-
-def _central(G: Array) -> int:
-    """Return the unit closest to the mean at a few frequencies, to begin with."""
-    some = G[:, np.linspace(0, G.shape[1] - 1, 8).astype(int)]
-    distance = np.abs(some - some.mean(axis=0)).max(axis=(2, 3))
-    return int(np.argmin((distance / np.maximum(distance.max(axis=0), np.finfo(float).tiny)).max(axis=1)))
+    search = smallest_largest((n_units, n_freqs), 0, bound, against, lambda sizes: sizes.max(axis=-1))
+    return NominalChoice(*search[:2])

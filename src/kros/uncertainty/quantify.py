@@ -181,9 +181,8 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
-    return UncertainModels(
-        models, nominal, worst_off_nominal(first, sets[models.kinds[0]]), sets, tuple(scores), outliers
-    )
+    worst_off = worst_off_nominal(first, sets[models.kinds[0]])
+    return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
 
 
 def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) -> str:

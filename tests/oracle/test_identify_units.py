@@ -145,6 +145,7 @@ def test_a_constant_is_a_constant_in_any_unit():
     constant = np.full(1000, 0.1)
     converted = constant * (1 + 2e-16 * (np.arange(1000) % 2))  # a bit of rounding apart
     assert all(is_constant(column) for column in (constant, converted, np.zeros(5)))
+    assert not is_constant(np.full(5, np.inf))  # is told by itself, without a warning
     moving = constant.copy()
     moving[700] *= 1 + 1e-10
     for factor in (1e-9, 1.0, 1e9):

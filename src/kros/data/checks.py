@@ -63,6 +63,8 @@ def checked_blocks(
 def is_constant(column: Array, first: float | None = None) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
     first = column[0] if first is None else first
+    if not np.isfinite(first):
+        return False
     room = CHECK.constant * abs(first)
     lower, upper = first - room, first + room
     return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))

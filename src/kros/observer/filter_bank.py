@@ -9,7 +9,8 @@ inputs alone with their own estimate :math:`x^u` of all recorded states. The fal
 continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. The age a of a gap is
 the number of samples that are missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as
 the filters forget what stood for them. Every state has its own :math:`\mu`: a state that is estimated from slow
-filters is wrong for longer. The estimate of a state that is not measured is
+filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below one percent after five time
+constants of :math:`\mu`. The estimate of a state that is not measured is
 
 .. math:: x_{k+1} + m \, (f_{k+1} - x_{k+1}), \qquad m = a^2 / (a^2 + T^2).
 
@@ -112,6 +113,11 @@ class FilterBank:
         return replace(self, start=turn @ self.start)
 
 
+def longest_age(half: Array) -> Array:
+    """Return the largest ages that count when measurements return: m is then below 1 % after five time constants."""
+    return np.asarray(0.1 * np.exp(5) * half)
+
+
 class Gaps:
     """State of the gaps of filter banks over a batch of machines."""
 
@@ -160,7 +166,7 @@ class Gaps:
             self.offset[moving], self.age[moving], self.count[moving] = offset[moving], 0.0, 0.0
             return
         count = np.where(missing, self.count + 1, 0.0)
-        recovered = np.where(some[:, None], self.age, bank.recovery * self.age)
+        recovered = np.where(some[:, None], self.age, bank.recovery * np.minimum(self.age, longest_age(bank.half)))
         age = np.maximum(recovered, count.max(axis=1, keepdims=True, initial=0.0))
         share = self.hidden * bank.level(age)
         fallback = following[:, self.fallback] + offset

@@ -13,6 +13,7 @@ from ...core.errors import ConfigError
 from ...lifting.program import Precision, c_code
 from ...motor_drive import AngleLoad
 from ...observer import Observer
+from ...observer.filter_bank import longest_age
 from ...observer.monitor import LARGEST, QUIET, RECOVERY
 from ...observer.runtime import bounds
 from ...observer.screen import BEYOND, LONGEST, Screen
@@ -259,6 +260,7 @@ class Source:
             "fallback": o.lifting.n_states - first,
             "start": self.sums(self.realised.start),
             **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
+            "longest": self.row(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],

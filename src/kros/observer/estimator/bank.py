@@ -21,6 +21,7 @@ from .channels import Channels
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
+_BLOCK = 64  # samples that are summed at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,17 +66,14 @@ class Bank:
 
     def rows(self, v: Array, at: npt.NDArray[np.int64]) -> Array:
         """Return the bank at samples `at` of signals v (n_samples, channels), shape (len(at), len(self))."""
-        from scipy.signal import lfilter
-
         moving, past = v[:, :-1], v[:, : self.delayed]
         before = np.concatenate([np.repeat(past[:1], self.taps[-1], axis=0), past])
         sums = np.concatenate([np.zeros((1, self.delayed)), np.cumsum(before - past[:1], axis=0)])
         ends = at + self.taps[-1] + 1
         means = [(sums[ends - a] - sums[ends - b]) / (b - a) for a, b in pairwise(self.taps)]
         parts = [moving[at], *(one - other for one, other in pairwise(means))]
-        for tau in self.lags:
-            a = np.exp(-1 / tau)
-            parts.append(lfilter([1 - a], [1, -a], moving, axis=0, zi=a * moving[:1])[0][at])
+        if self.lags:
+            parts.append(lagged(moving, np.exp(-1 / np.array(self.lags)), at))
         parts += [np.exp(-at / tau)[:, None] * v[0] for tau in self.starts]
         return np.hstack([*parts, np.ones((len(at), 1))])
 
@@ -138,3 +136,24 @@ class Bank:
             place += c
         B[-1, -1] = S[-1, -1] = 1.0
         return A, B, S
+
+
+def lagged(v: Array, a: Array, at: npt.NDArray[np.int64]) -> Array:
+    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples for every a, (len(at), a by channels).
+
+    Sums over whole blocks of samples lead to the block of a sample, and a sum within it to the sample.
+    """
+    from scipy.signal import lfilter
+
+    inside, blocks = np.arange(_BLOCK), len(v) // _BLOCK
+    weights = (1 - a)[:, None] * a[:, None] ** inside
+    whole = v[: blocks * _BLOCK].reshape(blocks, _BLOCK, v.shape[1])
+    sums = np.tensordot(weights[:, ::-1], whole, (1, 1))
+    through = a**_BLOCK
+    ends = [lfilter([1.0], [1.0, -b], each, axis=0, zi=b * v[:1])[0] for b, each in zip(through, sums, strict=True)]
+    before = np.concatenate([np.broadcast_to(v[:1], (len(a), 1, v.shape[1])), ends], axis=1)
+    block, place = np.divmod(at, _BLOCK)
+    latest = v[np.maximum(at[:, None] - inside, 0)]
+    within = np.where(inside <= place[:, None], weights[:, None], 0.0).swapaxes(0, 1) @ latest
+    rest = (a ** (place[:, None] + 1))[..., None] * before[:, block].swapaxes(0, 1)
+    return np.asarray(within + rest).reshape(len(at), -1)

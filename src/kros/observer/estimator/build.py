@@ -91,14 +91,18 @@ def identify_estimator(
     first = first_estimate(channels, recordings)
     reach = settings.reach * recordings.size[list(measured)]
 
-    def observer_of(*readouts: Readout) -> tuple[Filters, Filters, Observer]:
-        filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in readouts)
+    def observer_of(filters: Filters, fallback: Filters) -> Observer:
         own = name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
-        return filters, fallback, assembled(*own)
+        return assembled(*own)
 
-    filters, fallback, observer = observer_of(readout, blind)
+    filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
+    observer = observer_of(filters, fallback)
     group, unseen = readout.left_out_group()
-    *_, trial = observer_of(readout.without(group), blind.without(group))
+    partial, rest = readout.without(group), blind.without(group)
+    trial = observer_of(
+        reduced(partial, errors_of(partial), len(filters.A), settings.loss),
+        reduced(rest, errors_of(rest), len(fallback.A), settings.loss),
+    )
     assert observer.bank is not None
     observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings))
     observer = replace(observer, runtime=bounded(observer, recordings, settings.room))

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from ..filter_bank import FilterBank
+from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
 from ..step import Parameters
@@ -81,17 +81,17 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     ages[..., at] = tried[:, None, None]
     assert trial.bank is not None
     side = replace(trial.bank, forget=forget, half=ages.reshape(-1, n), recovery=np.zeros(n))
-    lost, u = (np.tile(s, (1, len(tried), 1)) for s in (np.where(missing[..., None], np.nan, y), inputs))
+    shown, u = (np.tile(s, (1, len(tried), 1)) for s in (np.where(missing[..., None], np.nan, y), inputs))
     several = {name: np.tile(values, len(tried)) for name, values in own.items()}
-    estimates = recorded_estimates(replace(trial, bank=side), lost, u, several)
+    estimates = recorded_estimates(replace(trial, bank=side), shown, u, several)
     T, mu = (grid.reshape(-1, 1) for grid in np.meshgrid(halves, recoveries))
+    truth, lost = np.tile(states, (1, len(tried), 1)), np.tile(missing, (1, len(tried)))
+    every = blended_errors(truth, estimates[..., :n], estimates[..., n:], lost, forget, T, mu)
     least, best = np.full(batch, np.inf), bank
-    for i, age in enumerate(tried):
-        x = estimates[:, i * batch : (i + 1) * batch]
-        errors = blended_errors(states, x[..., :n], x[..., n:], missing, forget, T, mu)
+    for age, errors in zip(tried, np.split(every, len(tried), axis=1), strict=True):
         choice = earliest(errors, T[:, 0], settings.margin)
         score = errors[choice, :, range(n)][hidden or at].mean(axis=0)
-        if i == 0 or is_less(score, least, settings.margin):
+        if age == tried[0] or is_less(score, least, settings.margin):
             half, recovery = np.full(n, age), np.zeros(n)
             half[hidden], recovery[hidden] = T[choice[hidden], 0], mu[choice[hidden], 0]
             least, best = score, replace(bank, forget=forget, half=half, recovery=recovery)
@@ -127,7 +127,7 @@ def blended_errors(
     x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
     for k, lost in enumerate(missing[:-1]):
         count = np.where(lost, count + 1, 0.0)
-        age = np.maximum(np.where(lost, age, recovery * age), count)
+        age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
         level = (age**2 / (age**2 + half**2))[..., None]
         fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])

@@ -46,10 +46,9 @@ class Filters:
 def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> Filters:
     """Return the filters of a readout, reduced until errors (n,) of the estimates grow by a share, or to an order."""
     design = readout.design
-    fine = replace(design, bank=design.bank.fine)
-    A, B, S = fine.bank.system()
+    A, B, S = design.bank.fine.system()
     weights = design.bank.refined(readout.coefficients).T
-    X, w = fine.sample()
+    X, w = design.fine_sample
     size = np.sqrt(w @ (X * X))
     size = np.where(size > 0, size, 1.0)
     A, B, S = A * size / size[:, None], B / size[:, None], S / size[:, None]

@@ -179,6 +179,11 @@ class Design:
         found = self.recordings.groups(self.settings.folds, self.settings.parts)
         return dict(zip(self.recordings.keys, found, strict=True))
 
+    @cached_property
+    def fine_sample(self) -> tuple[Array, Array]:
+        """Thinned rows of the bank with every delay, and their weights."""
+        return replace(self, bank=self.bank.fine).sample()
+
     def sample(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
         """Return thinned rows of the bank, and weights that sum to one."""
         parts = list(self.rows(self.recordings.some(150), self.settings.sample, offset))

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..data import EpisodeBatch
+from ..data.population import EpisodeKey
 from ..evaluate import error_rms
 from ..identify import ModelSet
 from ..loops.filtering import recursion
@@ -24,14 +25,14 @@ from ..observer.residual.one_step import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
 from ..observer.simulate import run_observers
-from ..observer.units import factors, in_sizes
+from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
 from ..synthesis.worst_case.unit_check import unit_ratios
 from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import TrainingSet, hidden_mean, percent_of
+from .validation import hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -53,24 +54,26 @@ DEFAULT = CertificateSettings()
 
 def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSettings = DEFAULT) -> list[Design]:
     """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
-    batches = [certified_on(task.training, settings), *other_conditions(task, settings)]
+    batches = certified_on(task, settings)
     if designs[0].observer.bank is not None:
         return [_certified_filters(design, batches, task, settings) for design in designs]
     return _certified_models(designs, batches, task, settings)
 
 
-def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> EpisodeBatch:
-    """Return episodes whose signals make the certified set: the start of the first one of every unit, or short ones."""
-    first = training.first_of_units().read().head(settings.samples)
-    return first if len(first.states) > training.settings.short else training.read()
+def certified_on(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
+    """Return episodes whose signals make the certified set, and the same of every other condition.
 
-
-def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
-    """Return the same of every condition that observers are not certified for."""
+    They are the start of the first episode of every unit, or all of short ones.
+    """
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    keys = [k for k in task.recordings.keys if k.condition not in home and k.unit in units]
-    groups = [tuple(k for k in keys if k.condition == c) for c in dict.fromkeys(k.condition for k in keys)]
-    return [certified_on(replace(task.recordings, keys=group), settings) for group in groups]
+    others: dict[str, list[EpisodeKey]] = {}
+    for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
+        others.setdefault(key.condition, []).append(key)
+    batches = []
+    for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
+        first = training.first_of_units().read().head(settings.samples)
+        batches.append(first if len(first.states) > training.settings.short else training.read())
+    return batches
 
 
 def _certified_models(
@@ -217,12 +220,6 @@ def _guard(
     low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
     correction = (1 + 2 * settings.room) * np.maximum(correction, np.finfo(float).tiny)
     return Guard(low, high, correction, settling(observer))
-
-
-def in_recorded_units(design: Design) -> Design:
-    """Return a design whose observer and controller are in the recordings' units."""
-    observer = in_sizes(design.observer, {})
-    return replace(design, observer=observer, synthesis=replace(design.synthesis, controller=observer.controller))
 
 
 def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) -> tuple[ObserverProblem | None, str]:

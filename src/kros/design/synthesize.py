@@ -28,9 +28,9 @@ from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
 from ..observer.sensor import Sensors, require_measured, sides
-from ..synthesis import ObserverProblem
+from ..observer.units import in_sizes
 from ..uncertainty.quantify import UncertainModels
-from .certificates import certificate, certify, in_recorded_units, usable_problem
+from .certificates import certificate, certify, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
 from .monitor import fit_monitor
 from .settings import ObserverSettings, SynthesisSettings
@@ -233,51 +233,38 @@ def _design(task: DesignTask) -> Design | str:
 def certified(
     tasks: Sequence[DesignTask], designs: Mapping[str, Design], identified: IdentifiedModels, work: Work
 ) -> dict[str, Design]:
-    """Certify observers on every member of the uncertain set and as nonlinear ones, a lifting side by side."""
+    """Certify observers as nonlinear ones, a lifting side by side, and on the set with disturbances a method chose."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
     groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
-    linear = [partial(certificate, task, design, _assumed(task, pairs)) for task, design in pairs]
+    chosen = {task.models.name: design.problem for task, design in reversed(pairs) if design.problem is not None}
+    linear = [partial(certificate, task, design, chosen.get(task.models.name, task.problem)) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
     by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
     final = {}
     for (task, _), facts in zip(pairs, results[len(nonlinear) :], strict=True):
-        design = in_recorded_units(by_name[task.name])
-        design = replace(design, facts={**design.facts, **facts})
-        observer = replace(design.observer, about=about(task, identified, design))
-        final[task.name] = replace(design, observer=observer)
+        design = by_name[task.name]
+        observer = in_sizes(design.observer, {})  # in the recordings' units
+        solved = replace(design.synthesis, controller=observer.controller)
+        design = replace(design, observer=observer, synthesis=solved, facts={**design.facts, **facts})
+        final[task.name] = replace(design, observer=replace(observer, about=about(task, identified, design)))
     return final
 
 
-def _assumed(task: DesignTask, pairs: Iterable[tuple[DesignTask, Design]]) -> ObserverProblem | None:
-    """Return the set that all observers of a kind of model are certified for, with disturbances that a method chose."""
-    chosen = (d.problem for other, d in pairs if other.models.name == task.models.name and d.problem is not None)
-    return next(chosen, task.problem)
-
-
-def choose_deployed(designs: Sequence[Design], settings: DeploymentSettings | None = None) -> str:
+def choose_deployed(designs: Sequence[Design], rule: DeploymentSettings | None = None) -> str:
     """Return the most accurate observer with all certificates that tolerates dropouts."""
-    settings = settings or DeploymentSettings()
-    errors = {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
+    rule, errors = rule or DeploymentSettings(), {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
     bounded = [d for d in designs if d.certificate and d.certificate.certified and np.isfinite(errors[d.name])]
     safe = [d for d in bounded if d.certified] or bounded
-    candidates = [d for d in safe if d.facts["loss_error_percent"] < settings.diverged] or safe
+    candidates = [d for d in safe if d.facts["loss_error_percent"] < rule.diverged] or safe
     least = min((errors[d.name] for d in candidates), default=np.inf)
-    good = [d.name for d in candidates if errors[d.name] <= settings.as_good * least]
+    good = [d.name for d in candidates if errors[d.name] <= rule.as_good * least]
     best = preferred(good or [d.name for d in designs])
     if best is None:
         raise SynthesisError("No observer could be designed; see the reasons above.")
     return best
-
-
-_SIGNALS = {
-    "set_certified": "certified",
-    "set_reason": "reason",
-    "set_bound_percent": "bound_percent",
-    "set_outside": "outside",
-}
 
 
 def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dict[str, Any]:
@@ -287,12 +274,12 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     assert certificate is not None
     proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
     trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
-    names = (*population.states, *population.inputs)
+    channels = (*population.states, *population.inputs)
     content: dict[str, Any] = {
         "kros": version("kros"),
         "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
         "largest_in_training": identified.sizes,
-        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in names},
+        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in channels},
         "sensor": {
             name: observer.sensor.get(name, Sensor()).no_finer_than(known.resolution[name]).model_dump()
             for name in population.measured
@@ -304,7 +291,6 @@ def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dic
     if calibration is not None and calibration.spec.parameter in observer.lifting.parameters:
         values = {name: getattr(calibration.spec, name) for name in ("angle", "ratio", "reference", "measured")}
         content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
-    signals = {name: facts[fact] for fact, name in _SIGNALS.items() if fact in facts}
-    content |= {"recorded_signals": signals} if signals else {}
-    json: dict[str, Any] = plain(content)
-    return json
+    names = (name for name in ("certified", "reason", "bound_percent", "outside") if f"set_{name}" in facts)
+    signals = {name: facts[f"set_{name}"] for name in names}
+    return dict(plain(content | ({"recorded_signals": signals} if signals else {})))

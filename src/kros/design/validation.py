@@ -131,7 +131,6 @@ def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:
     size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
     groups = np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])  # an episode without motion has no size
     size = np.array([size[groups == group].max(axis=0) for group in groups])
-    x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
     return np.where(np.isfinite(errors), errors, np.inf)

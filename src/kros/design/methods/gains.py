@@ -85,8 +85,11 @@ class ResidualH2(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Return the best of the models that promise the smallest errors."""
-        models = promising(task)[: self.compared]
-        syntheses = [self.gains(task, model) for model in models]
+        models, n = promising(task)[: self.compared], task.models.lifting.n_states
+        C, scale, dt = task.selector[:, :n], task.models.output_scale[:n], task.models.sample_period_s
+        problems = [synthesis.ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
+        lifted, order = task.models.lifting.n_lifted, self.max_order
+        syntheses = [synthesis.residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
         observers = [
             task.observer(one, model.A, model.B) if model.refitted else task.observer(one)
             for model, one in zip(models, syntheses, strict=True)
@@ -100,13 +103,6 @@ class ResidualH2(Method):
             "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in models[best].refitted],
         }
         return Design(task.name, observers[best], syntheses[best], facts)
-
-    def gains(self, task: DesignTask, model: ResidualModel) -> Synthesis:
-        """Return the synthesis for a model."""
-        models, n = task.models, task.models.lifting.n_states
-        C, scale, dt = task.selector[:, :n], models.output_scale[:n], models.sample_period_s
-        problem = synthesis.ResidualProblem(model.dynamics, C, model.spectra, task.noise, scale, dt)
-        return synthesis.residual_h2(problem, n_lifted=models.lifting.n_lifted, max_order=self.max_order)
 
 
 def promising(task: DesignTask) -> list[ResidualModel]:

@@ -12,7 +12,7 @@ from tests.support.residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty import quantify
-from kros.uncertainty.weights.fit import Target, fit_weight
+from kros.uncertainty.weights.fit import fit_weight
 
 Array = np.ndarray[Any, Any]
 
@@ -159,7 +159,7 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     def residuals(freqs: np.ndarray) -> np.ndarray:
         return np.array([response(u, freqs) - response(units[0], freqs) for u in units])
 
-    weight, best = fit_weight(of_function(residuals), GRID, Target(1.0, 1, 0.1))
+    weight, best = fit_weight(of_function(residuals), GRID, 1.0, 1, 0.1)
     assert weight.overbound_db_max == pytest.approx(
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )

@@ -22,7 +22,7 @@ from .inputs import Options, check_candidate, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import NominalChoice, choose_nominal
 from .settings import SET
-from .weights.fit import Residuals, Target, fit_weight
+from .weights.fit import Residuals, fit_weight
 
 Array = npt.NDArray[Any]
 
@@ -48,7 +48,7 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
     residuals = Residuals(
         form, base.frequency_response, lambda f, rows: units[rows].frequency_response(f), len(ids), (base, units)
     )
-    fields = _bound(residuals, freqs, options.target(system.dt), ids, index, choices)
+    fields = _bound(residuals, freqs, (system.dt, options.max_order, options.tolerance_db), ids, index, choices)
     return UncertainModel(nominal_system=chosen, output_scale=scales[0], input_scale=scales[1], **fields)
 
 
@@ -71,7 +71,7 @@ def bound_responses(
     residuals = Residuals(
         form, lambda f: _between(freqs, base, f)[0], lambda f, rows: _between(freqs, units[rows], f), len(ids)
     )
-    fields = _bound(residuals, freqs, options.target(float(dt)), ids, index, choices)
+    fields = _bound(residuals, freqs, (float(dt), options.max_order, options.tolerance_db), ids, index, choices)
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     certificate = _certificate(freqs, fields["bounds"][form])
     return ResponseUncertainty(nominal_response=chosen, certificate=certificate, **fields)
@@ -104,17 +104,22 @@ def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
 
 
 def _bound(
-    residuals: Residuals, freqs: Array, target: Target, ids: tuple[str, ...], index: int, choices: dict[Form, Any]
+    residuals: Residuals,
+    freqs: Array,
+    target: tuple[float, int, float],
+    ids: tuple[str, ...],
+    index: int,
+    choices: dict[Form, Any],
 ) -> dict[str, Any]:
     """Return the set around the nominal `index`, with the remainder where the form leaves one."""
-    weight, cover = fit_weight(residuals, freqs, target)
+    weight, cover = fit_weight(residuals, freqs, *target)
     G, form, name = residuals.nominal(freqs), residuals.form, ids[index] if index >= 0 else POOLED
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)
     fields = {"form": form, "unit_ids": ids, "nominal": index, "nominal_id": name, "freqs_hz": freqs, "misfit": ratio}
     fields["bounds"] = {f: choice.bound for f, choice in choices.items()} | {form: bound}
     fields["nominals"] = {f: ids[choice.index] for f, choice in choices.items()} | {form: name}
-    remainder = fit_weight(replace(residuals, remainder=True), freqs, target)[0] if _leaves_out(form, ratio) else None
+    remainder = fit_weight(replace(residuals, remainder=True), freqs, *target)[0] if _leaves_out(form, ratio) else None
     return fields | {"cover": cover, "weight": weight, "remainder": remainder}
 
 

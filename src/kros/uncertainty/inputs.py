@@ -13,7 +13,6 @@ from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
 from ..core.settings import Settings
 from .forms import check_responses
-from .weights.fit import Target
 
 Array = npt.NDArray[Any]
 
@@ -28,10 +27,6 @@ class Options(Settings):
     max_order: int = Field(4, ge=0)
     tolerance_db: float = Field(1.0, ge=0)
     sample_period_s: float | None = None
-
-    def target(self, sample_period_s: float) -> Target:
-        """Return what weights should be like."""
-        return Target(sample_period_s, self.max_order, self.tolerance_db)
 
     def scales(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Return the ranges of outputs and inputs."""

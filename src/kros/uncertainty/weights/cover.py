@@ -47,10 +47,6 @@ class Cover:
         """Return the cover at some frequencies."""
         return Cover(self.left[rows], self.right[rows])
 
-    def entries(self) -> Array:
-        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m')."""
-        return self.left[:, :, None] * self.right[:, None, :]
-
     def cost_db(self) -> Array:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))

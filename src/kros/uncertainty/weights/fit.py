@@ -26,19 +26,15 @@ from .proof import Certificate, ResidualSystems, certify
 Array = npt.NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Target:
-    """What a weight should be like: time of its systems, largest order of an entry, overbound that is good enough."""
+def fit_weight(
+    residuals: Residuals, freqs_hz: Array, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+) -> tuple[Weight, Cover]:
+    """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`.
 
-    sample_period_s: float
-    max_order: int = 4
-    tolerance_db: float = 1.0
-
-
-def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[Weight, Cover]:
-    """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`."""
-    fit = _Fit(residuals, freqs_hz, target)
-    weight = fit.start()
+    The tolerance is the overbound at which a lower order of the entries is good enough.
+    """
+    fit = _Fit(residuals, freqs_hz, sample_period_s)
+    weight = fit.start(max_order, tolerance_db)
     proof, ratio = fit.proven(weight)
     for _ in range(FIT.rounds):
         missed = fit.costly(weight)
@@ -78,24 +74,24 @@ def joined(freqs_hz: Array, others_hz: Array) -> Array:
 class _Fit:
     """One fit, and again with frequencies that it missed."""
 
-    def __init__(self, residuals: Residuals, freqs_hz: Array, target: Target) -> None:
-        self.residuals, self.target, self.band = residuals, target, freqs_hz[[0, -1]]
-        grid, realised = checking_grid(freqs_hz, target.sample_period_s), residuals.realised
+    def __init__(self, residuals: Residuals, freqs_hz: Array, dt: float) -> None:
+        self.residuals, self.dt, self.band = residuals, dt, freqs_hz[[0, -1]]
+        grid, realised = checking_grid(freqs_hz, dt), residuals.realised
         modes = np.zeros(0) if realised is None else realised.modes_hz(grid)
         self.checked_hz = joined(grid, modes)
         self.freqs_hz = joined(freqs_hz, modes[(modes >= self.band[0]) & (modes <= self.band[1])])
         self.known = residuals.at(self.freqs_hz)
         self.optimal = optimal_cover(self.known)
 
-    def start(self) -> Weight:
+    def start(self, max_order: int, tolerance_db: float) -> Weight:
         """Fit at evenly chosen frequencies, and at fewer beyond the band."""
-        dt, (p, m) = self.target.sample_period_s, self.known.shape[2:]
+        dt, (p, m) = self.dt, self.known.shape[2:]
         if not self.known.any():
             return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m, np.nan, np.nan)
         even = np.unique(np.linspace(0, len(self.freqs_hz) - 1, FIT.points).round().astype(int))
         beyond = self.checked_hz[(self.checked_hz < self.band[0]) | (self.checked_hz > self.band[1])][::4]
         self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)))
-        self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db)
+        self.fitted = fit_jointly(self.problem, near, max_order, tolerance_db)
         return self._weight()
 
     def costly(self, weight: Weight) -> Array:
@@ -124,7 +120,7 @@ class _Fit:
 
     def _weight(self) -> Weight:
         sections, p = self.fitted.sections, self.known.shape[2]
-        systems, orders = sections.systems(self.target.sample_period_s), tuple(sections.orders.tolist())
+        systems, orders = sections.systems(self.dt), tuple(sections.orders.tolist())
         return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:], np.nan, np.nan)
 
     def _problem(self, freqs_hz: Array) -> tuple[JointProblem, Cover]:
@@ -137,7 +133,7 @@ class _Fit:
         cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
         inside = (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
         optimal = np.where(inside, np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
-        tau = bilinear_squared(freqs_hz, self.target.sample_period_s)
+        tau = bilinear_squared(freqs_hz, self.dt)
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
 
 

@@ -53,7 +53,8 @@ def main() -> None:
     config = load_config(options.study, options.settings)
     with tempfile.TemporaryDirectory() as scratch:
         kros.run(config, Path(scratch), until=Stage.READ)
-        population = kros.read(next(Path(scratch).glob("*/population.json")).parent)
+        stored = [path.parent for path in Path(scratch).glob("*/population.json")]
+        population = kros.read(stored[0] if stored else config.data.source)
         lifting = Lifting(population.states, config.lifting.functions or ())
         hidden = [i for i, name in enumerate(population.states) if name not in population.measured]
         found = []

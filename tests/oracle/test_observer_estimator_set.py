@@ -18,6 +18,7 @@ from kros.lifting import Lifting
 from kros.observer import Runtime, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
 from kros.observer.estimator.certificate import linear_estimate, outside_percent
+from kros.observer.estimator.channels import products, without_limits
 from kros.observer.sensor import Sensor
 from kros.synthesis import ObserverProblem
 from kros.synthesis.problem.uncertainty_location import LOCATIONS
@@ -231,3 +232,8 @@ def test_every_entry_of_a_bank_belongs_to_the_channel_that_moves_it():
         moved[:, channel] += rng.normal(size=60)
         changed = (bank.rows(moved, np.arange(60)) != bank.rows(v, np.arange(60))).any(axis=0)
         np.testing.assert_array_equal(changed, bank.channel == channel)
+
+
+def test_messages_name_quantities_without_their_limits():
+    texts = products(["angle"], ["drive"], {"angle": (-3.0, -1.0), "drive": (-6.5, 7.25)}, 0.25)
+    assert [without_limits(text) for text in texts] == ["drive*abs(drive)", "drive**2", "drive*angle"]

@@ -42,6 +42,7 @@ __all__ = ["Differentiate", "Offset", "Resample", "Scale", "Shift", "Step", "Tri
 __getattr__ = refusing(__name__)
 
 Float = npt.NDArray[np.float64]
+GAP = 10.0  # median steps of time that a straight line bridges
 Channels = tuple[Channel, ...]
 
 
@@ -230,6 +231,13 @@ class Trim(Step):
         return recording.cut(self.start, stop)
 
 
+def longest_stretch(time_s: Float, limit_s: float) -> tuple[int, int]:
+    """Return the first sample of the longest stretch without steps of time above a limit, and the one after its last."""
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > limit_s) + 1, [len(time_s)]])
+    longest = int(np.argmax(np.diff(edges)))
+    return int(edges[longest]), int(edges[longest + 1])
+
+
 @dataclass(frozen=True)
 class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
@@ -242,7 +250,8 @@ class Resample(Step):
     ----------
     period_s : float, s
     max_gap_s : float, optional, s
-        Longest gap in time that a straight line bridges, a longer one is an error; default: ten median steps.
+        Longest gap in time that a straight line bridges, default: ten median steps. A recording with longer ones is
+        cut there, and its longest stretch stays.
     passband : float
         Cut-off of the filter as a share of the new Nyquist frequency.
     """
@@ -266,16 +275,14 @@ class Resample(Step):
         time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        median, gap = estimate_period(timed), int(np.diff(time).argmax())
-        longest, limit = time[gap + 1] - time[gap], 10 * median if self.max_gap_s is None else self.max_gap_s
-        if longest > limit:
-            bridge = f"bridge a gap of {longest:g} s after sample {gap} (allowed: {limit:g} s)"
-            raise DataError(f"{what} would {bridge}; cut the episode there, or raise max_gap_s.")
+        stretch = slice(*longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed)))
+        time, values = time[stretch], recording.values[stretch]
+        median = estimate_period(replace(recording, values=values, time_s=time))
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
             make = f"would make {count:g} samples of {len(time)}"
             raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
-        return replace(recording, values=self.on_grid(time, recording.values, median), time_s=None)
+        return replace(recording, values=self.on_grid(time, values, median), time_s=None)
 
     def on_grid(self, time_s: Float, values: Float, median_s: float) -> Float:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""

@@ -281,7 +281,18 @@ def _resampling(
     text = f"time is uneven: everything is brought to a period of {period_s:g} s {recorded}"
     if uneven:
         text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
-    return ({"step": "resample", "period_s": period_s},), [text]
+    return ({"step": "resample", "period_s": period_s},), [text, *_gaps(population, source, looks)]
+
+
+def _gaps(population: Population, source: Path, looks: Sequence[EpisodeLook]) -> list[str]:
+    """Say what gaps in time leave of recordings."""
+    cut = sorted((s for s in looks if s.gap[0] > 0), key=lambda s: s.kept)
+    if not cut:
+        return []
+    first, where = cut[0], _relative(population, source, cut[0].key)
+    gap = f"a gap of {first.gap[0]:.3g} s after sample {first.gap[1]} of {where}"
+    text = f"{gap}, whose longest stretch without one is {100 * first.kept:.0f} % of it; that alone is taken"
+    return [text if len(cut) == 1 else f"{text}, as of {len(cut) - 1} more recordings with gaps, which lose less"]
 
 
 def _reading(population: Population, source: Path) -> str:

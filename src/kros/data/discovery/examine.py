@@ -13,6 +13,7 @@ from ...core.work import Work
 from ..checks import GroupWatch, NonFiniteError, check_episode, copies_among, digest_of
 from ..population import EpisodeKey, Population
 from ..recording import check_increasing
+from ..steps import GAP, longest_stretch
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,6 @@ class DiscoveryRule:
     sampled: int = 6  # files whose numbers say what columns are
     pieces: int = 5  # episodes that a single long recording is cut into
     shortest_piece: int = 200  # samples that each of them needs
-    gap: float = 10.0  # median steps that a step may take before it is a gap, as in the step `resample`
 
 
 RULE = DiscoveryRule()
@@ -42,7 +42,8 @@ class EpisodeLook:
     n_samples: int = 0
     period_s: float = np.nan  # median step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
-    longest: tuple[float, int] = (0.0, 0)  # longest step of time, s, and the sample before it
+    gap: tuple[float, int] = (0.0, 0)  # longest step of time where it is a gap, s, and the sample before it
+    kept: float = 1.0  # share of the samples in the longest stretch without a gap
     nan: str = ""  # where it holds NaN or infinity, or nothing
     digest: str = ""
 
@@ -51,8 +52,6 @@ def examine(population: Population, work: Work | None = None) -> list[EpisodeLoo
     """Read every episode once, as it was recorded, and say what is wrong with it alone or beside the others."""
     tasks = [population.select([u], [c]) for u, c, _ in population.groups()]
     looks = [look for group in (work or Work()).map("look", _look, tasks) for look in group]
-    median = median_period(looks)
-    looks = [_without_gap(look, median) for look in looks]
     copies = dict(copies_among((s.key, s.digest) for s in looks if s.digest and not s.wrong))
     return [replace(s, wrong=f"a copy of {copies[s.key]}") if s.key in copies else s for s in looks]
 
@@ -60,14 +59,6 @@ def examine(population: Population, work: Work | None = None) -> list[EpisodeLoo
 def median_period(looks: Sequence[EpisodeLook]) -> float:
     """Return the median of the sampling periods of usable episodes, s."""
     return float(np.median([s.period_s for s in looks if not s.wrong] or [np.nan]))
-
-
-def _without_gap(look: EpisodeLook, median: float) -> EpisodeLook:
-    """Return a look that says what is wrong where a step of time is longer than resampling bridges."""
-    step, sample = look.longest
-    if look.wrong or step <= RULE.gap * min(median, look.period_s):
-        return look
-    return replace(look, wrong=f"a gap of {step:.3g} s after sample {sample}")
 
 
 def _look(population: Population) -> list[EpisodeLook]:
@@ -85,7 +76,10 @@ def _look(population: Population) -> list[EpisodeLook]:
                 steps = np.diff(time)
                 period, deviation = float(np.median(steps)), np.abs(steps / np.median(steps) - 1)
                 uneven, longest = ((float(x.max()), int(x.argmax())) for x in (deviation, steps))
-                looks[key] = replace(looks[key], period_s=period, uneven=uneven, longest=longest)
+                looks[key] = replace(looks[key], period_s=period, uneven=uneven)
+                if longest[0] > GAP * period:
+                    start, stop = longest_stretch(time, GAP * period)
+                    looks[key] = replace(looks[key], gap=longest, kept=(stop - start) / len(time))
             check_episode(values, key, population.columns)
             looks[key] = replace(looks[key], digest=digest_of(values))
             watch.add(key, values)

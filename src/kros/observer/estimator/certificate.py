@@ -27,7 +27,7 @@ from ..certificate.error import ReliftScales
 from ..certificate.signals import SignalBound
 from ..data import ObserverData
 from ..sensor import delay_of
-from .channels import CONSTANT
+from .channels import CONSTANT, without_limits
 from .regression import Readout
 
 Array = npt.NDArray[np.float64]
@@ -83,7 +83,7 @@ def linear_estimate(
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         shares = ", ".join(f"{name} {percent:.2g} %" for name, percent in (outside or {}).items() if percent)
         share = f"; it carries, of the range of estimates: {shares}" if shares else ""
-        reason = f"the models have no signal {unknown[0]}{more}{share}."
+        reason = f"the models have no signal {without_limits(unknown[0])}{more}{share}."
         raise SynthesisError(f"not certified for the set of plants: {reason}")
     A = weights[:, :size].copy()
     A[:, list(observer.measured)] = 0.0  # measurements stand there

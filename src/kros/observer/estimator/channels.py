@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -94,6 +95,11 @@ def clipped(name: str, ranges: Ranges, beyond: float) -> str:
     low, high = ranges[name]
     low, high = low - beyond * (high - low), high + beyond * (high - low)
     return f"((abs({name} - {low!r}) - abs({name} - {high!r}) + {low + high!r})/2)".replace("- -", "+ ")
+
+
+def without_limits(text: str) -> str:
+    """Return a formula with every quantity that `clipped` wrote by its name alone, for messages."""
+    return re.sub(r"\(\(abs\((\w+)[^)]*\) - abs\([^)]*\)[^)]*\)/2\)", r"\1", text)
 
 
 def products(measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, beyond: float) -> list[str]:

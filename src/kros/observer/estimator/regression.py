@@ -241,8 +241,8 @@ class Moments:
     def of(cls, design: Design, whitening: Whitening) -> Moments:
         """Sum the rows of every group."""
         sums: dict[Group, list[Array]] = {}
-        groups = design.groups
-        for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
+        groups, recordings = design.groups, design.recordings.some(design.settings.episodes)
+        for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
             group = groups[key]
             F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
             t = targets * np.sqrt(weights)[:, None]

@@ -37,6 +37,7 @@ class EstimatorSettings(Settings):
         description="share of the training span that nonlinear channels may go beyond it; they are cut off there",
     )
     rows: int = Field(60_000, ge=1000, description="rows of the regression; more are thinned evenly")
+    episodes: int = Field(300, ge=4, description="episodes of the regression; of more, some evenly spread over all")
     sample: int = Field(8_000, ge=1000, description="rows from which principal directions and covariances are found")
     penalties: tuple[float, ...] = Field(
         tuple(10.0**decade for decade in range(-16, 1, 2)),

@@ -11,9 +11,9 @@ from scipy.special import hyp2f1
 
 import kros
 from kros.core import StateSpace, SynthesisError, gain, h2_norm, hinf_norm
+from kros.design.certificates import certificate, error_maps
 from kros.design.methods.estimator import Estimator
 from kros.design.synthesize import tasks_of
-from kros.design.uncertain_set import certificate, error_maps
 from kros.lifting import Lifting
 from kros.observer import Runtime, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank

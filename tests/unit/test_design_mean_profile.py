@@ -9,7 +9,7 @@ import kros
 from kros.core.errors import DataError
 from kros.data import EpisodeBatch
 from kros.data.population import EpisodeKey, Population
-from kros.design.mean_profile import make_mean_profile
+from kros.design.baselines import make_mean_profile
 from kros.design.validation import TrainingSet
 
 N = 60

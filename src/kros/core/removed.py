@@ -79,6 +79,8 @@ Report and figures of a run are no longer written by public functions; use kros 
     kros.report: render write_figures
 Models of units are no longer converted by a function of their own; use to_control(models.systems([unit])[0]).
     kros.interop: models_to_control
+Random Fourier features are no longer a family of liftings; use radial, with centres by k-means.
+    kros.lifting: fourier_features
 """
 
 

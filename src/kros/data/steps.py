@@ -232,7 +232,7 @@ class Trim(Step):
 
 
 def longest_stretch(time_s: Float, limit_s: float) -> tuple[int, int]:
-    """Return the first sample of the longest stretch without steps of time above a limit, and the one after its last."""
+    """Return the first sample of the longest stretch without steps of time above a limit, and its end."""
     edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > limit_s) + 1, [len(time_s)]])
     longest = int(np.argmax(np.diff(edges)))
     return int(edges[longest]), int(edges[longest + 1])

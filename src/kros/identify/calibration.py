@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import IdentificationError
+from ..core.rounding import TINY
 from ..core.store import digest_of
 from ..core.work import Work
 from ..data.population import EpisodeKey, Population
@@ -160,7 +161,7 @@ def find_segments(angle: Array, reference: Array, measured: Array, dt: float, sp
 def _speed_per_reference(angle: Array, reference: Array, steady: npt.NDArray[np.bool_], dt: float) -> float:
     """Speed of the angle over the reference: one where their units of measure match, zero where nothing moves."""
     moving = steady[:-1] & steady[1:]
-    top = max(float(np.max(np.abs(reference))), np.finfo(float).tiny)
+    top = max(float(np.max(np.abs(reference))), TINY)
     speed = reference[:-1][moving] / top
     power = float(speed @ speed)
     return float(speed @ np.diff(angle)[moving]) / (power * dt * top) if power else 0.0

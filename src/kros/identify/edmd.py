@@ -23,6 +23,7 @@ import numpy.typing as npt
 from ..core.errors import IdentificationError
 from ..core.linalg import qr_triangle
 from ..core.lti import StateSpace
+from ..core.rounding import EPS, TINY
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -106,8 +107,8 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
     triangle = qr_triangle(np.concatenate([top, bottom], axis=-2))
     R11, R12 = triangle[..., :p, :p], triangle[..., :p, p:]
     pivots = relative_pivots(R11)
-    if np.any(pivots < p * np.finfo(float).eps):
-        *unit, column = (int(i) for i in np.argwhere(pivots < p * np.finfo(float).eps)[0])
+    if np.any(pivots < p * EPS):
+        *unit, column = (int(i) for i in np.argwhere(pivots < p * EPS)[0])
         where = f" of unit number {unit[0]}" if unit else ""
         raise IdentificationError(
             f"EDMD: column {column} of the lifted data{where} depends on the others (relative pivot "
@@ -119,7 +120,7 @@ def edmd(R: Array, n_lifted: int, alpha: npt.ArrayLike = 0.0) -> KoopmanMatrices
 
 def relative_pivots(R: Array) -> Array:
     """Return what is left of every column of a triangle beside those before it, relative to the column."""
-    size = np.maximum(np.linalg.norm(R, axis=-2), np.finfo(float).tiny)
+    size = np.maximum(np.linalg.norm(R, axis=-2), TINY)
     return np.asarray(np.abs(np.diagonal(R, axis1=-2, axis2=-1)) / size)
 
 

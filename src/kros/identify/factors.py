@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
+from ..core.rounding import EPS
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd, relative_pivots
@@ -177,7 +178,7 @@ def require_excitation(
     if factor.input_range is None:
         return
     low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
-    still = high - low <= 450 * np.finfo(float).eps * np.maximum(np.abs(low), np.abs(high))
+    still = high - low <= 450 * EPS * np.maximum(np.abs(low), np.abs(high))
     dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
     for i, j in np.argwhere(still):
         kind = "zero" if low[i, j] == 0 else "constant"
@@ -194,7 +195,7 @@ def require_excitation(
 def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
     """Refuse lifted data in which one column follows from those before it."""
     pivots = relative_pivots(factor.R[..., : len(names)])
-    for unit, column in np.argwhere(pivots < len(names) * np.finfo(float).eps):
+    for unit, column in np.argwhere(pivots < len(names) * EPS):
         raise IdentificationError(
             f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
             f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rounding import TINY
 from ..data.population import EpisodeKey, Population
 
 Array = npt.NDArray[np.float64]
@@ -59,7 +60,7 @@ class _Unit:
 
     @classmethod
     def of(cls, episodes: Sequence[Array], column: int, n_states: int, test: PeriodicTest) -> _Unit:
-        scale = np.maximum(np.max([np.abs(v).max(axis=0) for v in episodes], axis=0), np.finfo(float).tiny)
+        scale = np.maximum(np.max([np.abs(v).max(axis=0) for v in episodes], axis=0), TINY)
         lags, rows, targets, angles, left = test.lags, [], [], [], test.samples
         for values in episodes:
             x, n = values[:left] / scale, min(left, len(values)) - test.lags
@@ -85,7 +86,7 @@ class _Unit:
         columns -= self.basis @ (self.basis.T @ columns)
         u, s, _ = np.linalg.svd(columns, full_matrices=False)
         u = u[:, s > 1e-8 * np.sqrt(len(self.angle))]
-        energy = np.maximum(np.sum(self.residuals**2, axis=0), np.finfo(float).tiny)
+        energy = np.maximum(np.sum(self.residuals**2, axis=0), TINY)
         return float(np.max(np.sum((u.T @ self.residuals) ** 2, axis=0) / energy, initial=0.0))
 
     def spectrum(self, low: float, cell: float, n_bins: int) -> Array:

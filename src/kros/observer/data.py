@@ -25,6 +25,7 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from ..core.linalg import solve_balanced
 from ..core.lti import StateSpace
+from ..core.rounding import ITERATED
 from ..core.settings import member
 from ..lifting import Lifting
 from ..synthesis.result import Injection
@@ -162,7 +163,7 @@ class ObserverData:
         n = self.lifting.n_states
         if self.bank is not None:
             return np.eye(n)[:, list(self.measured)]
-        return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=1e-9)
+        return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=ITERATED)
 
     @property
     def one_step(self) -> Array:

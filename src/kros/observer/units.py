@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ..core.errors import DataError
 from ..core.files import shortened
 from ..core.lti import StateSpace
+from ..core.rounding import ROUNDING, TINY
 from ..data.discovery.roles import unit_of_factor
 from ..synthesis.result import Injection
 from .data import ObserverData
@@ -82,7 +83,7 @@ def recorded_channel(observer: ObserverData, name: str) -> RecordedChannel:
         [*([f"the column comes {lag} samples late"] if lag else []), *([f"added: {offset}"] if offset else [])]
     )
     factor = factor if converted == 1.0 else factor / converted
-    if math.isclose(factor, 1.0, rel_tol=1e-12):
+    if math.isclose(factor, 1.0, rel_tol=ROUNDING):
         return RecordedChannel(1.0, unit, note)
     return RecordedChannel(factor, unit_of_factor(factor, unit) or f"{factor:.6g} {unit or 'of the study'}", note)
 
@@ -95,7 +96,7 @@ def recorded_factors(observer: ObserverData, names: Sequence[str]) -> npt.NDArra
 def _factor(observer: ObserverData, name: str, value: Any) -> float:
     """Return a factor that a number of the file can be."""
     number = isinstance(value, (int, float)) and not isinstance(value, bool)
-    if not number or not abs(value) < 1e300 or not abs(value) > 1e-300:
+    if not number or not abs(value) < 1e300 or not abs(value) > TINY:
         raise DataError(
             f"Observer {observer.name}: the factor of {name!r} should be a finite number other than zero, found "
             f"{shortened(repr(value), 60)}; correct about.columns of its file."

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError, SynthesisError
 from ..core.linalg import balanced_size
+from ..core.rounding import ITERATED, ROUNDING, TINY
 from .generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
@@ -39,10 +40,10 @@ def unreachable_modes(A: Array, B: Array, dt: float) -> list[complex]:
     """Return the eigenvalues on or beyond the stability boundary that B does not reach (Hautus test)."""
     A, B = _balanced(A, B)
     modes = np.linalg.eigvals(A) if A.size else np.zeros(0)
-    outside = modes[np.abs(modes) >= 1 - 1e-12] if dt > 0 else modes[modes.real >= -1e-12 * (1 + np.abs(modes))]
+    outside = modes[np.abs(modes) >= 1 - ROUNDING] if dt > 0 else modes[modes.real >= -ROUNDING * (1 + np.abs(modes))]
     pencils = (np.hstack([A - mode * np.eye(len(A)), B]) for mode in outside)
     sizes = (np.linalg.svd(pencil, compute_uv=False) for pencil in pencils)
-    return [complex(mode) for mode, s in zip(outside, sizes, strict=True) if s[-1] <= 1e-9 * max(s[0], 1e-300)]
+    return [complex(mode) for mode, s in zip(outside, sizes, strict=True) if s[-1] <= ITERATED * max(s[0], TINY)]
 
 
 def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[tuple[str, str], str]:
@@ -98,12 +99,12 @@ def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
     size = balanced_size(A)
     A, B = A * size / size[:, None], B / size[:, None]
     sizes = np.linalg.norm(B, axis=0)
-    return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), 1e-300)
+    return A, B / np.where(sizes > 0, sizes, 1.0) * max(float(np.linalg.norm(A, 2)), TINY)
 
 
 def _rank(matrix: Array) -> int:
     values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
-    return int(np.sum(values > _RANK * max(values.max(initial=0.0), 1e-300)))
+    return int(np.sum(values > _RANK * max(values.max(initial=0.0), TINY)))
 
 
 def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
@@ -116,7 +117,7 @@ def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[c
     zeros = []
     for mode in np.linalg.eigvals(inner):
         distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))
-        if distance < 1e-12:
+        if distance < ROUNDING:
             values = np.linalg.svd(np.hstack([inner - mode * np.eye(len(A)), seen]), compute_uv=False)
             if values[-1] <= 1e-10 * values[0]:
                 zeros.append(complex(mode))

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ...core.errors import IdentificationError
 from ...core.linalg import qr_triangle, radius_text
+from ...core.rounding import EPS, TINY
 from ...data.population import EpisodeKey, Population
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
@@ -242,9 +243,9 @@ def normalised(problem: RefinementProblem, V: Array) -> RefinementProblem:
 
 def _whitening(R11: Array, n_samples: int) -> Array:
     """T with ``(R11 T)^T (R11 T) = n_samples I``; a direction that the data do not excite keeps its size."""
-    size = np.maximum(np.linalg.norm(R11, axis=0), np.finfo(float).tiny)
+    size = np.maximum(np.linalg.norm(R11, axis=0), TINY)
     _, values, right = np.linalg.svd(R11 / size)
-    values = np.maximum(values, len(values) * np.finfo(float).eps * values[0])
+    values = np.maximum(values, len(values) * EPS * values[0])
     return np.asarray((right.T / values) * np.sqrt(n_samples) / size[:, None])
 
 

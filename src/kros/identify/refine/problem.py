@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import TINY
 from ...lifting import Lifting
 from ..edmd import KoopmanMatrices
 from ..factors import Factor
@@ -182,7 +183,7 @@ def stability_barrier(V: Array, T: Array, guard: float, weight: float) -> Array:
     size = np.abs(values)
     excess = np.maximum(0.0, (size - 1 + guard) / guard)  # (problem, eigenvalue)
     left = np.linalg.pinv(right)  # rows y^H, with y^H x = 1
-    turn = np.conj(values) / np.maximum(size, np.finfo(float).tiny)
+    turn = np.conj(values) / np.maximum(size, TINY)
     columns = np.swapaxes(right, -1, -2) @ T[:n]  # x^T of every eigenvalue, through dA = dV T^T
     slope = (turn[..., None, None] * left[..., :, None] * columns[..., None, :]).real.reshape(problems, n, n * p)
     J = np.where(excess[..., None] > 0, slope / guard, 0.0)

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import ConfigError
+from ...core.rounding import EPS, TINY
 
 Array = npt.NDArray[np.float64]
 Evaluate = Callable[[Array], Array]
@@ -99,7 +100,7 @@ def _step(matrix: Array, mu: Array) -> Array:
     H = np.where(fine[:, None, None], matrix[:, :-1, :-1], np.eye(matrix.shape[-1] - 1))
     g = np.where(fine[:, None], matrix[:, :-1, -1], 0.0)
     diagonal = np.diagonal(H, axis1=1, axis2=2)
-    least = np.finfo(float).eps ** 2 * diagonal.max(axis=1, keepdims=True) + np.finfo(float).tiny
+    least = EPS**2 * diagonal.max(axis=1, keepdims=True) + TINY
     scale = 1 / np.sqrt(np.maximum(diagonal, least))
     scaled = H * scale[:, :, None] * scale[:, None, :] + mu[:, None, None] * np.eye(H.shape[-1])
     return np.asarray(np.linalg.solve(scaled, (g * scale)[..., None])[..., 0] * scale)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import SynthesisError
+from ...core.rounding import TINY
 from ...synthesis import kalman
 from ...synthesis.result import Synthesis
 
@@ -28,4 +29,4 @@ def kalman_candidates(A: Array, C: Array, shape: Array, R: Array, dt: float) -> 
 def like_measurement_noise(covariance: Array, R: Array) -> float:
     """Return the factor that brings a covariance of the measurements to the size of their noise R."""
     shares = np.diag(covariance) / np.diag(R)
-    return 1.0 / max(float(np.mean(shares)), np.finfo(float).tiny)
+    return 1.0 / max(float(np.mean(shares)), TINY)

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError, DimensionError
+from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
 
@@ -99,7 +100,7 @@ class Moments:
             )
         h, delays = len(self.estimated), self.settings.delays
         products = self.products[rows].sum(axis=0)
-        size = np.sqrt(np.maximum(np.diag(products), np.finfo(float).tiny))
+        size = np.sqrt(np.maximum(np.diag(products), TINY))
         scaled = products / np.outer(size, size)
         penalty = self.settings.penalty * np.diag([0.0, *[1.0] * (len(size) - h - 1)])
         weights = np.linalg.solve(scaled[:-h, :-h] + penalty, scaled[:-h, -h:]) * size[-h:] / size[:-h, None]

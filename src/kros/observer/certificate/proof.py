@@ -33,6 +33,7 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace
 from ...core.norms import gramian, hinf_norm
+from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
 Array = npt.NDArray[np.float64]
@@ -113,7 +114,7 @@ def proposals(system: ErrorSystem) -> Iterator[Proof]:
     if multipliers is None or not np.isfinite(least):
         return
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
-    least = max(least, np.sqrt(np.finfo(float).eps) ** 1.5 * size, np.finfo(float).tiny)  # nothing arrives: any will do
+    least = max(least, np.sqrt(EPS) ** 1.5 * size, TINY)  # nothing arrives: any will do
     for factor in SETTINGS.above:  # multipliers that grow with the gain leave room for what the grid did not see
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
@@ -133,7 +134,7 @@ def best_multipliers(H: Complex, width: int) -> Array | None:
         if least <= known * (1 + SETTINGS.accuracy):
             break
         cuts = np.vstack([cuts, _cuts(H, query, known)])
-        result = linprog([*np.zeros(width), 1.0], -cuts[:, :-1], -cuts[:, -1], bounds=(0, 1 / np.finfo(float).eps))
+        result = linprog([*np.zeros(width), 1.0], -cuts[:, :-1], -cuts[:, -1], bounds=(0, 1 / EPS))
         if result.status != 0:
             break
         known = float(result.x[-1])
@@ -146,7 +147,7 @@ def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
     through = np.sqrt(np.max(np.sum(np.abs(H[:, width:, :width]) ** 2, axis=1), axis=0))
     by_slopes = through @ np.sqrt(np.max(np.sum(np.abs(H[:, :width, width:]) ** 2, axis=2), axis=0))
     size = max(float(np.linalg.norm(H[:, width:, width:], 2, axis=(1, 2)).max()), float(by_slopes)) or 1.0
-    through = np.maximum(through, 1e-12 * size)
+    through = np.maximum(through, ROUNDING * size)
     H = H / np.concatenate([through, np.full(H.shape[2] - width, size)])
     H[:, :width] *= through[:, None]
     return through**2, H
@@ -184,11 +185,11 @@ def _responses(system: ErrorSystem) -> Complex:
     C, D = np.vstack([system.M, system.C]), np.hstack([system.nested, system.D])
     D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
     plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
-    poles = np.log(plant.poles().astype(complex) + np.finfo(float).tiny)
+    poles = np.log(plant.poles().astype(complex) + TINY)
     nyquist, angle, width = 0.5 / system.dt, np.abs(poles.imag), np.abs(poles.real)
     beside = np.maximum(angle + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], width), 0.0).ravel()
     marks = np.concatenate([angle, width, np.abs(poles), beside]) / (2 * np.pi * system.dt)
-    low = max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, 1e-9 * nyquist)
+    low = max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, ITERATED * nyquist)
     grid = np.geomspace(low, nyquist, SETTINGS.frequencies)
     return plant.frequency_response(np.unique(np.concatenate([[0.0], grid, marks[marks <= nyquist]])))
 
@@ -205,7 +206,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     if room <= 0:
         return None
     spread = hinf_norm(StateSpace(A, inputs, np.eye(n), np.zeros((n, inputs.shape[1])), system.dt), 1e-2)
-    extra = SETTINGS.spare * room / max(spread, np.finfo(float).tiny) ** 2
+    extra = SETTINGS.spare * room / max(spread, TINY) ** 2
     Q, W = outputs.T @ outputs + extra * np.eye(n), feed.T @ feed - np.eye(inputs.shape[1])
     try:
         R = np.linalg.cholesky(solve_discrete_are(A, inputs, Q, W, s=outputs.T @ feed)).T
@@ -220,7 +221,7 @@ def reachable_coordinates(A: Array, B: Array, dt: float) -> tuple[Array, Array]:
     size = np.sqrt(np.maximum(np.diag(W), 0.0))
     size[size == 0] = 1.0
     values, vectors = np.linalg.eigh(W / np.outer(size, size))
-    root = np.sqrt(np.maximum(values, 1e-12 * values.max()))
+    root = np.sqrt(np.maximum(values, ROUNDING * values.max()))
     return size[:, None] * vectors * root, (vectors / root).T / size
 
 

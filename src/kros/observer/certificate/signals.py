@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
 from ..data import ObserverData
@@ -107,7 +108,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
     system = error_system(observer, scales, certificate.box, certificate.parameters)
     w = np.concatenate([seen.omega, seen.noise], axis=-1)
     frozen, acted = (rms(signal) for signal in frozen_response(system, w, seen.first))
-    share = np.maximum(acted.max(axis=0), np.finfo(float).tiny)
+    share = np.maximum(acted.max(axis=0), TINY)
     gains, moving = mismatch_gains(system, share, n), np.linalg.norm(acted / share, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
         added = np.where(moving > 0, gains * moving, 0.0)

@@ -17,6 +17,7 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import ITERATED
 from .channels import Channels
 from .settings import EstimatorSettings
 
@@ -81,7 +82,7 @@ class Bank:
         """Return the sizes of entries, their RMS; for the start that of its constant, since machines start at rest."""
         size, count = rms.copy(), len(self.starts) * self.channels
         size[-1 - count : -1] = np.repeat(rms[-1 - count : -1].reshape(-1, self.channels)[:, -1], self.channels)
-        return np.maximum(size, 1e-9 * size.max())
+        return np.maximum(size, ITERATED * size.max())
 
     def trust(self, settings: EstimatorSettings) -> Array:
         """Return the share of its size by which every entry may be wrong, shape (len(self),)."""
@@ -139,7 +140,7 @@ class Bank:
 
 
 def lagged(v: Array, a: Array, at: npt.NDArray[np.int64]) -> Array:
-    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples for every a, (len(at), a by channels).
+    """Return ``h_k = a h_{k-1} + (1 - a) v_k``, ``h_{-1} = v_0``, at some samples, shape (len(at), a by channels).
 
     Sums over whole blocks of samples lead to the block of a sample, and a sum within it to the sample.
     """

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import TINY
 from ..filter_bank import FilterBank, longest_age
 from ..observer import Observer
 from ..simulate import Course
@@ -44,7 +45,7 @@ def forgetting(apart: Array) -> Array:
         now, later = apart[:-lag], apart[lag:]
         a, b, c = (np.mean(x, axis=(0, 1)) for x in (later * later, later * now, now * now))
         error = a - 2 * np.outer(rhos**lag, b) + np.outer(rhos ** (2 * lag), c)
-        score += np.log(np.maximum(error, 1e-300))
+        score += np.log(np.maximum(error, TINY))
     return rhos[np.argmin(score, axis=0)]
 
 
@@ -132,4 +133,4 @@ def blended_errors(
         fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])
         squares += (x - states[k + 1]) ** 2
-    return np.log(squares / len(missing) + np.finfo(float).tiny)
+    return np.log(squares / len(missing) + TINY)

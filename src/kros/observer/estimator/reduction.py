@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.norms import gramian_root
+from ...core.rounding import EPS
 from ...loops import recursion
 from .regression import Readout
 
@@ -59,10 +60,10 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     root = gramian_root(A.T, (C[used] / errors[used, None]).T, 1.0).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
-    kept = values > np.finfo(float).eps * values[0]
+    kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]
     _, sigma, V = np.linalg.svd((X / size * np.sqrt(w)[:, None]) @ L.T, full_matrices=False)
-    scale = np.maximum(sigma, np.finfo(float).eps * sigma[0])  # states of RMS one
+    scale = np.maximum(sigma, EPS * sigma[0])  # states of RMS one
     left, right = (V @ L) / scale[:, None], (inverse @ V.T) * scale
     whole = Filters(left @ A @ right, left @ B, C @ right, D, left @ S, sigma)
     if order is not None:

@@ -20,6 +20,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.linalg import qr_triangle
+from ...core.rounding import EPS, ROUNDING
 from ...data import EpisodeBatch
 from ...data.population import EpisodeKey
 from .bank import Bank
@@ -28,7 +29,7 @@ from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
 Read = Callable[[EpisodeKey], EpisodeBatch]
-_SMALLEST = 5e4 * np.finfo(float).eps  # of singular values: what is smaller is rounding
+_SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
 
 @dataclass(frozen=True)
@@ -269,7 +270,7 @@ class Moments:
         weights = weights / weights.sum()
         gram = np.tensordot(weights, self.gram, 1) + whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
-        rounding = 16 * len(gram) * np.finfo(float).eps
+        rounding = 16 * len(gram) * EPS
         for penalty in penalties:
             A = gram + np.diag(penalty * whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
@@ -372,7 +373,7 @@ def condition_weights(moments: Moments, whitening: Whitening) -> Array:
     weights = np.ones(len(conditions))
     if len(set(conditions)) == 1:
         return weights
-    (first,) = moments.solved(whitening, weights, [1e-12])
+    (first,) = moments.solved(whitening, weights, [ROUNDING])
     errors = np.exp(np.log(moments.errors(first, np.arange(len(weights)))).mean(axis=1))
     for condition in set(conditions):
         weights[conditions == condition] = 1 / errors[conditions == condition].mean()

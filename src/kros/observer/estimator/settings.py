@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
+from ...core.rounding import ITERATED
 from ...core.settings import Settings
 
 
@@ -65,8 +66,8 @@ class EstimatorSettings(Settings):
     )
     halves: tuple[float, ...] = Field(
         (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
-        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses, among every "
-        "other one for measured states",
+        description="ages of a gap at which the fallback counts one half, in longest delays; training chooses, "
+        "among every other one for measured states",
     )
     recoveries: tuple[float, ...] = Field(
         (0.3, 3.0, 30.0),
@@ -91,7 +92,7 @@ class EstimatorSettings(Settings):
     def lags(self, length: float) -> tuple[float, ...]:
         """Return the time constants of the lags in samples, for a median episode of this length in samples."""
         last = self.last_lag * length
-        count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - 1e-9)))
+        count = max(0, int(np.ceil(np.log(last / self.first_lag) / np.log(self.lag_ratio) - ITERATED)))
         return tuple(last / self.lag_ratio**i for i in range(count, -1, -1))
 
     def blocks(self, length: float) -> tuple[int, ...]:

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.linalg import least_squares
+from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...lifting import Lifting
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, promised_errors
@@ -115,7 +116,7 @@ def residual_models(
             ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
         )
         models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))
-    return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], np.finfo(float).tiny)))))
+    return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], TINY)))))
 
 
 def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int, ...]]:

@@ -14,8 +14,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data.population import EpisodeKey
-from ...design.baselines import Baseline, make_difference, make_extended, make_learned
-from ...design.mean_profile import make_mean_profile
+from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.task import split_name
 from ...design.validation import TrainingSet

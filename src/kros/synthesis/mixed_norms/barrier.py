@@ -32,6 +32,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import ITERATED, ROUNDING, TINY
+
 Array = npt.NDArray[Any]
 
 _SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below the second, and Newton steps at most
@@ -112,7 +114,7 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
     inside = np.clip(start, -0.9 * programme.box, 0.9 * programme.box)
     point = np.append(inside, 1.5 * max(worst, 0.0) + 1.0)
     extended = _Programme(goal, lifted, np.append(programme.box, 10 * point[n]), programme.end)
-    outcome = _follow(extended, point, 1e-9, stop_below=0.0)
+    outcome = _follow(extended, point, ITERATED, stop_below=0.0)
     if outcome.x is not None and outcome.x[n] < 0 and programme.holds(outcome.x[:n]):
         return replace(outcome, x=outcome.x[:n])
     ending = Ending.TIME if outcome.ending is Ending.TIME else Ending.STALLED
@@ -143,11 +145,11 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
         if eigenvalues.max(initial=0.0) <= 1:
             lower = max(lower, programme.value(x + direction) - mu * (size - float(eigenvalues @ eigenvalues)))
         here, proven = programme.value(x), np.isfinite(stop_below) and lower > stop_below
-        if proven or here - lower <= rtol * max(abs(here), 1e-12) or (here < stop_below - 1e-7 and decrement < 1):
+        if proven or here - lower <= rtol * max(abs(here), ROUNDING) or (here < stop_below - 1e-7 and decrement < 1):
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
         step = _line_search(float(programme.c @ direction) / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
-        if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), 1e-300) and decrement > _CENTRED:
+        if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), TINY) and decrement > _CENTRED:
             break
         x = x + step * direction
         mu = mu * _SHRINK if decrement < _CENTRED else mu

@@ -36,6 +36,7 @@ import numpy.typing as npt
 from ...core.linalg import balancing
 from ...core.lti import StateSpace
 from ...core.norms import gramian, h2_norm
+from ...core.rounding import TINY
 from ..generalized_plant import GeneralizedPlant
 from ..riccati.h2 import h2
 from .barrier import Block
@@ -81,7 +82,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
     size = h2_norm(plant.channel(rows, slice(None)).close(K))
     scale = np.ones(plant.sizes[3])
-    scale[rows] = 1 / max(size, 1e-300)
+    scale[rows] = 1 / max(size, TINY)
     measurements = np.sqrt(np.diag(plant.C2 @ E @ plant.C2.T + plant.D21 @ plant.D21.T))
     controls = size / np.linalg.norm(plant.D12[rows], axis=0)
     balanced = plant.transformed(x=(T, back), z=np.diag(scale), y=np.diag(1 / measurements), u=np.diag(controls))

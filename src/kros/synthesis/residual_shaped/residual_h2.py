@@ -25,6 +25,7 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
+from ...core.rounding import TINY
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
@@ -226,9 +227,7 @@ class _Scaled:
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
-        return np.asarray(
-            np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), np.finfo(float).tiny))
-        )
+        return np.asarray(np.sqrt(np.maximum(np.diag(loop.C @ gramian(loop.A, loop.B, self.dt) @ loop.C.T), TINY)))
 
     def norm(self, shaping: StateSpace, K: StateSpace) -> float:
         """Root mean square of the scaled error."""

@@ -17,6 +17,7 @@ from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
+from ...core.rounding import ITERATED, TINY
 
 Array = npt.NDArray[Any]
 
@@ -31,7 +32,7 @@ def solve_riccati(A: Array, B: Array, Q: Array, R: Array, S: Array, dt: float, m
         return solve_continuous_lyapunov(A.T, -Q)
     if dt > 0:
         X = _doubling(A, B, Q, R, S)
-        if X is not None and _residual(A, B, Q, R, S, X) < 1e-9:
+        if X is not None and _residual(A, B, Q, R, S, X) < ITERATED:
             return X
     try:
         X = (solve_discrete_are if dt > 0 else solve_continuous_are)(A, B, Q, R, s=S)
@@ -58,7 +59,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
         return float("inf")
     cost = Q + S @ F + F.T @ S.T + F.T @ R @ F
     # A plant that can be inverted costs nothing, X = 0: what is left is measured against the terms that cancel.
-    size = max(float(np.linalg.norm(X)), float(np.linalg.norm(Q)), 1e-300)
+    size = max(float(np.linalg.norm(X)), float(np.linalg.norm(Q)), TINY)
     return float(np.linalg.norm(closed.T @ X @ closed + cost - X)) / size
 
 

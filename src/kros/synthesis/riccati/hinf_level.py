@@ -31,14 +31,14 @@ from ...core.errors import SynthesisError
 from ...core.linalg import balanced_size, balancing
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
+from ...core.rounding import EPS, TINY
 from ..generalized_plant import GeneralizedPlant, split
 from .equations import absorb_feedthrough, solve_riccati
 
 Array = npt.NDArray[Any]
 
-_EPS = float(np.finfo(float).eps)
-_DOUBT = float(np.sqrt(_EPS))  # relative: conditions that hold or fail by less than this decide nothing
-_SINGULAR = 1e-2 / _EPS  # condition of a matrix that rounding makes singular
+_DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
+_SINGULAR = 1e-2 / EPS  # condition of a matrix that rounding makes singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +117,7 @@ def _half(A: Array, B1: Array, B2: Array, C: Array, D1: Array, D2: Array, gamma:
 def _lowest(X: Array, size: float) -> float:
     """Lowest eigenvalue over the largest magnitude, which is at least a size."""
     values = np.linalg.eigvalsh(X)
-    return float(values.min(initial=0.0) / max(float(np.abs(values).max(initial=0.0)), size, np.finfo(float).tiny))
+    return float(values.min(initial=0.0) / max(float(np.abs(values).max(initial=0.0)), size, TINY))
 
 
 def _central(p: GeneralizedPlant, gamma: float, X: Array, F: Array, Y: Array, L: Array) -> StateSpace:
@@ -172,4 +172,4 @@ def _root(M: Array, size: float) -> Array:
 
 def _size(A: Array, B: Array) -> float:
     """Size of a Riccati solution to expect for dynamics A and inputs or outputs B."""
-    return float(np.linalg.norm(B)) ** 2 / max(float(np.linalg.norm(A)), np.finfo(float).tiny)
+    return float(np.linalg.norm(B)) ** 2 / max(float(np.linalg.norm(A)), TINY)

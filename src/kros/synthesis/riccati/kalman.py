@@ -17,6 +17,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm
+from ...core.rounding import ROUNDING, TINY
 from ..assumptions import require_detectable
 from ..result import Injection, Status, Synthesis
 from .equations import discrete_gain, solve_riccati
@@ -69,7 +70,7 @@ def kalman(A: npt.ArrayLike, C: npt.ArrayLike, Q: npt.ArrayLike, R: npt.ArrayLik
     if np.linalg.eigvalsh((R + R.T) / 2).min() <= 0:
         raise SynthesisError("Kalman predictor: R is not positive definite; every measurement needs some noise.")
     values, vectors = np.linalg.eigh((Q + Q.T) / 2)
-    if values.min() < -1e-12 * max(values.max(), 1e-300):
+    if values.min() < -ROUNDING * max(values.max(), TINY):
         problem = f"Q has the eigenvalue {values.min():.3g}"
         raise SynthesisError(f"Kalman predictor: {problem}; it must be positive semidefinite.")
     require_detectable(A, C, dt, "Kalman predictor")

@@ -15,11 +15,12 @@ from scipy.linalg import null_space
 
 from ...core.linalg import adjoint
 from ...core.norms import first_frequencies
+from ...core.rounding import EPS
 from ..generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
 
-_EPS = float(np.finfo(float).eps)
+_EPS = float(EPS)
 _RANK = float(np.sqrt(_EPS))  # relative: signals that are smaller prove nothing
 
 

@@ -38,6 +38,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
+from ...core.rounding import EPS, TINY
 from ..problem.observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
@@ -123,7 +124,7 @@ def _with_gains(U: Array, gains: Array) -> Array:
 def below(spectrum: Array) -> Array:
     """Return a diagonal spectrum below a full one, proportional to its diagonal: shape (f, b) for (f, b, b)."""
     power = np.real(np.einsum("fii->fi", spectrum))
-    root = np.sqrt(np.maximum(power, 1e-300))
+    root = np.sqrt(np.maximum(power, TINY))
     least = np.linalg.eigvalsh(spectrum / (root[:, :, None] * root[:, None, :]))[:, 0]
     return power * np.clip(least, 0.0, 1.0)[:, None]
 
@@ -144,7 +145,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     g, multipliers = _without_centre(s, q)
     g = g + np.sqrt(c.sum(axis=(-2, -1)) / max(s.shape[-1], 1))[..., None]
     g, multipliers = _descended(c, d, g, multipliers)
-    rounding = 4 * np.finfo(float).eps
+    rounding = 4 * EPS
     g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
     slack = g[..., :, None] + multipliers[..., None, :] - d
     rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
@@ -185,7 +186,7 @@ def _best_rows(c: Array, shift: Array, steps: int = 4) -> Array:
     for _ in range(steps):
         inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
         terms = c * inverse * inverse
-        h = np.maximum(terms.sum(axis=1), 1e-300)
-        slope = np.maximum((terms * inverse).sum(axis=1), 1e-300)
+        h = np.maximum(terms.sum(axis=1), TINY)
+        slope = np.maximum((terms * inverse).sum(axis=1), TINY)
         x = np.maximum(x + (h * np.sqrt(h) - h) / slope, 0.0)
     return least + x

@@ -24,6 +24,7 @@ import numpy.typing as npt
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm
+from ...core.rounding import ITERATED, ROUNDING
 from ..problem.observer_problem import ObserverProblem
 from ..result import Status, Synthesis
 from .ball import spread, uncertain_ball
@@ -159,12 +160,12 @@ def _edges(centers: Array) -> Array:
     """Panel edges: three a decade, and a row of widths around each pole's angle."""
     angle, width = np.abs(centers.imag), np.abs(centers.real)
     size = np.hypot(angle, width)
-    low = min(max(1e-2 * size.min(initial=np.pi), 1e-12), 1e-3)
+    low = min(max(1e-2 * size.min(initial=np.pi), ROUNDING), 1e-3)
     widths = np.concatenate([-(4.0 ** np.arange(8)), [0.0], 4.0 ** np.arange(8)])
     around = (angle[:, None] + width[:, None] * widths).ravel()
     around = around[(around > low) & (around < np.pi)]
     edges = np.unique(np.concatenate([np.geomspace(low, np.pi, 2 + int(3 * np.log10(np.pi / low))), around]))
-    apart = np.concatenate([[True], np.diff(np.log(edges)) > 1e-9])
+    apart = np.concatenate([[True], np.diff(np.log(edges)) > ITERATED])
     return np.concatenate([[0.0], edges[apart]])
 
 

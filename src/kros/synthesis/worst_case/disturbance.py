@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace, block_diagonal, gain
+from ...core.rounding import ROUNDING
 from ..problem.observer_problem import ObserverProblem
 from .ball import Ball, below, uncertain_ball
 
@@ -80,7 +81,7 @@ def is_diagonal(system: StateSpace) -> bool:
     if np.any(system.D[off]):
         return False
     for _ in range(2 * system.n_states):
-        if np.any(np.abs((system.C @ block)[off]) > 1e-12 * size):
+        if np.any(np.abs((system.C @ block)[off]) > ROUNDING * size):
             return False
         block = system.A @ block
     return True

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from ...core.linalg import adjoint
 from ...core.lti import StateSpace
+from ...core.rounding import ITERATED, TINY
 from .arcs import Enclosure, least_ratio
 from .ball import Ball, below
 from .disturbance import Channels, Shaping, Spectrum, is_diagonal
@@ -45,7 +46,7 @@ class Everywhere:
         problem = channels.problem
         self.channels, self.dt = channels, problem.nominal.dt
         inside = 2 * np.pi * self.dt * channels.freqs_hz
-        self.edges = np.unique(np.concatenate([[0.0], inside[inside < np.pi * (1 - 1e-9)], [np.pi]]))
+        self.edges = np.unique(np.concatenate([[0.0], inside[inside < np.pi * (1 - ITERATED)], [np.pi]]))
         self.M = Enclosure(problem.M)
         self.N = None if problem.N is None else Enclosure(problem.N)
         self.remainder: tuple[Enclosure, Enclosure] | None = None
@@ -84,7 +85,7 @@ class Everywhere:
             far, nu = np.linalg.norm(reach_N, axis=-1), np.linalg.norm(N, 2, axis=(-2, -1))
             room = 1 - nu - far
             with np.errstate(invalid="ignore"):
-                distance = (distance + far * (size_M + distance) / np.maximum(room, 1e-300)) / (1 - nu)
+                distance = (distance + far * (size_M + distance) / np.maximum(room, TINY)) / (1 - nu)
             distance = np.where(room > 0, distance, np.inf)
         root = np.sqrt(spectrum.power(Ball.of(N, M, self.channels.problem.W_L.n_inputs), self.channels.nearest(theta)))
         if not spectrum.correlated:

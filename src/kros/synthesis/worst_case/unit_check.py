@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm
+from ...core.rounding import TINY
 from ..problem.interconnect import interconnect
 from ..problem.observer_problem import ObserverProblem
 from .certificate import certify, density
@@ -42,7 +43,7 @@ def unit_ratios(problem: ObserverProblem, controller: StateSpace, units: StateSp
     bound = np.sqrt(np.maximum(density(problem, loop, freqs) - np.sum(np.abs(noise) ** 2, axis=(-2, -1)), 0.0))
     size = [np.linalg.norm(e.frequency_response(freqs), axis=(-2, -1)) for e in errors]
     norms = np.array([h2_norm(e) for e in errors]) / certify(problem, controller)[0]
-    return norms, np.array([np.max(s / np.maximum(bound, 1e-300)) for s in size])
+    return norms, np.array([np.max(s / np.maximum(bound, TINY)) for s in size])
 
 
 def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p: Array) -> StateSpace:

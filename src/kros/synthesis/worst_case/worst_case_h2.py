@@ -35,6 +35,7 @@ import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, gain
+from ...core.rounding import ROUNDING
 from ..problem.observer_problem import ObserverProblem
 from ..problem.plants import penalise, shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
@@ -151,5 +152,5 @@ def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order
         )
         plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
         squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1)
-        bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - 1e-12))))
+        bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - ROUNDING))))
     return [bound for bound in bounds if bound > 0]

@@ -31,7 +31,6 @@ from kros.identify.factors import reduce_episode
 from kros.observer import run_observer
 from kros.synthesis import h2, hinf, mixed
 from kros.uncertainty import choose_nominal, fit_magnitude
-from kros.uncertainty.weights.bilinear import BilinearAxis
 from kros.uncertainty.weights.cover import optimal_cover
 
 pytestmark = pytest.mark.filterwarnings("default")
@@ -215,13 +214,11 @@ def magnitudes() -> Stage:
     magnitude = np.abs((s + 1) ** 2 / ((s + 0.1) * (s + 10)))
 
     def ours() -> Any:
-        axis = BilinearAxis.over(omega / (2 * np.pi))
-        system = axis.continuous(
-            fit_magnitude(
-                axis.discrete_hz(omega / (2 * np.pi)), magnitude, axis.period_s, max_order=2, tolerance_db=0.0
-            ).system
-        )
-        return np.abs(system.frequency_response(omega / (2 * np.pi))[:, 0, 0])
+        freqs = omega / (2 * np.pi)
+        period = np.sqrt(10.0) / (np.pi * freqs[-1])  # of the bilinear map, which takes magnitudes to discrete time
+        mapped = np.arctan(np.pi * period * freqs) / (np.pi * period)
+        fitted = fit_magnitude(mapped, magnitude, period, max_order=2, tolerance_db=0.0)
+        return np.abs(fitted.system.frequency_response(mapped)[:, 0, 0])
 
     def dkpy() -> Entry:
         import dkpy

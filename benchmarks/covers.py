@@ -28,7 +28,7 @@ from kros.study import validate_config
 from kros.study.commands.demo import Simulation, simulate_to
 from kros.study.config import Stage
 from kros.uncertainty import Form, UncertainModel, quantify
-from kros.uncertainty.weights.weight import Weight
+from kros.uncertainty.weights.cover import Weight
 
 Array = npt.NDArray[Any]
 HEADER = "| form | model | population | orders | cover_max, fit | cover_max, independent | overbound, dB | seconds |"

@@ -24,7 +24,7 @@ from scipy.stats import beta, chi2
 
 import kros
 from kros.data import EpisodeBatch, Unit
-from kros.design.monitor import MonitorSettings, fit_monitor, monitor_facts
+from kros.design.monitor import MonitorSettings, fit_monitor
 from kros.design.validation import TrainingSet
 from kros.identify.identified import IdentifiedModels
 from kros.observer import Observer
@@ -148,7 +148,7 @@ def main() -> None:
     observer, training = designed(args.loop, args.method, args.work)
     if args.own:
         own = replace(observer, monitor=fit_monitor(observer, training, MonitorSettings(args.rate)))
-        print(json.dumps(monitor_facts(own.monitor)), flush=True)
+        print(json.dumps({"units": own.monitor.units, "settle_samples": own.monitor.settle}), flush=True)
         count = Count()
         for start in range(0, args.own, 20):
             drives = draw_parameters(DESIGN_SEED, UNITS + start + 20, 1.0).take(slice(UNITS + start, None))

@@ -269,7 +269,7 @@ def random_table(rng: np.random.Generator) -> dict[str, Any]:
         [[0, 1]],
         {},
     ]
-    kinds = ["harmonics", "polynomials", "radial", "fourier", "delays", "other"]
+    kinds = ["harmonics", "polynomials", "radial", "delays", "other"]
     keys = [
         "names",
         "degree",
@@ -291,7 +291,6 @@ def random_table(rng: np.random.Generator) -> dict[str, Any]:
             "centres": {"kind": "kmeans", "n": 5, "seed": 0},
             "length": 1,
         },
-        "fourier": {"n": 4, "length": 1, "seed": 0},
         "delays": {"depth": 2},
     }
     table |= needed.get(table["kind"], {})

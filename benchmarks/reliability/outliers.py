@@ -25,7 +25,7 @@ from kros.identify import Factor, ModelSet
 from kros.identify.factors import reduce_episode
 from kros.lifting import Lifting
 from kros.uncertainty import OutlierModel, score_outliers
-from kros.uncertainty.outliers.recorded import Evidence, Recorded
+from kros.uncertainty.outliers.population import Evidence, Recorded
 from kros.uncertainty.outliers.score import Status
 
 Array = npt.NDArray[Any]

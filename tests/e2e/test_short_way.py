@@ -16,8 +16,7 @@ import pytest
 import kros
 from kros.data import write_parquet
 from kros.design import Design
-from kros.design.methods import METHODS, suitable
-from kros.design.methods.robust import WorstCaseH2
+from kros.design.methods import suitable
 from kros.observer import Observer
 from kros.plants import PLANTS
 from kros.study import load_config
@@ -31,14 +30,11 @@ ROLES = {
     "target_velocity": 'role = "input"',
 }
 STATE = 'role = "state"'
-# Fewer candidates, and methods that take long for one kind of models each: what chooses among them is the same.
+# Methods that take long for one kind of models each: what chooses among them is the same.
 FEWER: dict[str, Any] = {
     "design.synthesize.suitable": lambda methods, kind, kinds: [
         m for m in suitable(methods, kind, kinds) if ONCE.get(m.name, kind) == kind
     ],
-    "design.methods.METHODS": tuple(
-        WorstCaseH2(corners=(None, 1e-3)) if m.name == "worst_case_h2" else m for m in METHODS
-    ),
 }
 ONCE = {"estimator": "koopman", "worst_case_h2": "linear", "mixed": "koopman_edmd", "residual_h2": "koopman_edmd"}
 LIFTING = "sin(100*position + phase)"

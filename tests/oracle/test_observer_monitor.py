@@ -8,7 +8,7 @@ from machines import DT, LIMITS, drive, filters, samples, watched
 
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import gain
-from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor, monitor_facts
+from kros.design.monitor import MonitorSettings, bound_of_peaks, fit_monitor
 from kros.design.validation import TrainingSet
 from kros.lifting import Lifting
 from kros.observer import Observer, SampleStatus
@@ -160,8 +160,7 @@ def test_the_bound_is_that_of_one_more_unit():
     highest, wider = peaks.max(axis=1), (student[2] ** 2 - student[5] ** 2) * np.mean(apart)
     over = prediction_bound(highest, 0.05) - highest.mean()
     assert abs(highest.mean() + np.sqrt(over**2 + wider)) < 1e-5  # levels are over the bound already
-    facts = monitor_facts(monitor)
-    assert facts["units"] == 6
+    assert monitor.units == 6
     loudest = records[max(found, key=found.get)]
     y, u = loudest[:, :1], loudest[:, 3:]
     shaken = y + 1e-2 * np.sin(100 * y)  # three short motions differ so much that the bound is wide

@@ -10,7 +10,7 @@ from kros.core.lti import StateSpace, gain
 from kros.core.norms import hinf_norm
 from kros.uncertainty import Form, fit_magnitude, residual
 from kros.uncertainty.weights.cover import Cover
-from kros.uncertainty.weights.fit import Target, fit_weight
+from kros.uncertainty.weights.fit import fit_weight
 from kros.uncertainty.weights.proof import Method, ResidualSystems, certify
 
 DT = 1e-3
@@ -97,7 +97,7 @@ def test_a_peak_between_grid_points_is_found_and_is_the_norm() -> None:
 def test_weights_hold_between_grid_points(form: str) -> None:
     nominal, units = population(5, 3, 2, 2)
     residuals = of_systems(form, nominal, units)
-    weight, _ = fit_weight(residuals, GRID, Target(DT, 3, 3.0))
+    weight, _ = fit_weight(residuals, GRID, DT, 3, 3.0)
     assert weight.method is Method.LEVEL_SETS
     freqs = np.linspace(0.0, 500.0, 20001)
     assert weight.magnitudes(freqs).ratio(residuals.at(freqs)).max() <= 1

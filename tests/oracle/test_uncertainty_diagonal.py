@@ -6,7 +6,7 @@ import numpy as np
 from tests.support.residuals import of_function
 
 from kros.core import StateSpace
-from kros.uncertainty.weights.fit import Target, fit_weight
+from kros.uncertainty.weights.fit import fit_weight
 from kros.uncertainty.weights.sections import Sections
 
 DT = 1e-3
@@ -53,10 +53,11 @@ def lags_and_leads(freqs: np.ndarray) -> np.ndarray:
 
 
 def test_diagonal_residuals_that_can_be_represented_are_met_with_lower_orders() -> None:
-    weight, cover = fit_weight(of_function(lags_and_leads), FREQS, Target(DT, tolerance_db=0.3))
+    weight, cover = fit_weight(of_function(lags_and_leads), FREQS, DT, tolerance_db=0.3)
     assert weight.overbound_db_max <= 0.3
     assert sum(weight.left_orders) + sum(weight.right_orders) <= 4  # three would do
-    used = weight.magnitudes(FREQS).entries()
+    used = weight.magnitudes(FREQS)
+    used = used.left[:, :, None] * used.right[:, None, :]
     exact = np.abs(np.einsum("kfii->fi", lags_and_leads(FREQS)))
     assert (np.einsum("fii->fi", used) >= exact * (1 - 1e-9)).all()
     np.testing.assert_allclose(cover.cost_db(), 20 * np.log10(exact).mean(axis=1), atol=0.02)
@@ -71,7 +72,7 @@ def test_higher_orders_are_taken_where_four_are_not_enough() -> None:
             None, :, None, None
         ]
 
-    four, _ = fit_weight(of_function(peaks), freqs, Target(DT))
-    six, _ = fit_weight(of_function(peaks), freqs, Target(DT, max_order=6))
+    four, _ = fit_weight(of_function(peaks), freqs, DT)
+    six, _ = fit_weight(of_function(peaks), freqs, DT, max_order=6)
     assert max(four.left_orders) <= 4 < max(six.left_orders) <= 6
     assert six.overbound_db_max < four.overbound_db_max

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kros.core import StateSpace
-from kros.core.errors import DimensionError
+from kros.core.errors import DataError
 from kros.uncertainty import Form, choose_nominal
 
 FORMS = list(Form)
@@ -85,5 +85,5 @@ def test_ties_go_to_the_first_of_the_best() -> None:
 def test_what_cannot_be_searched_is_refused() -> None:
     G = random_responses(3, 5, (2, 2), 10)
     G[1, 2, 0, 0] = np.nan
-    with pytest.raises(DimensionError, match=r"units \[1\] have NaN"):
+    with pytest.raises(DataError, match="unit '1' has NaN"):
         choose_nominal(G, "additive")

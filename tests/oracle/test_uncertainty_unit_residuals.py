@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from kros.uncertainty import Form
-from kros.uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from kros.uncertainty.unit_residuals import UnitResiduals, fit_entries, unit_residuals
 from kros.uncertainty.weights.cover import Cover
-from kros.uncertainty.weights.entries import fit_entries
 
 DT = 1e-2
 FREQS = np.geomspace(0.01, 50.0, 30)

@@ -7,11 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import expm
 from tests.support.residuals import of_function
 
 from kros.core import StateSpace
 from kros.uncertainty import quantify
-from kros.uncertainty.weights.fit import Target, fit_weight
+from kros.uncertainty.weights.fit import fit_weight
 
 Array = np.ndarray[Any, Any]
 
@@ -82,19 +83,14 @@ def resonances(freqs: Array) -> Array:
     return np.array(rows)[:, :, None, None]
 
 
-@pytest.mark.parametrize("period", [0.0, 1.0])
-def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they_are(period: float) -> None:
+def test_weights_of_responses_touch_at_a_given_frequency_and_tell_how_loose_they_are() -> None:
     freqs = np.geomspace(1e-3, 0.4999, 40)
     given = resonances(freqs)
-    found = quantify(given, "additive", freqs, sample_period_s=period, max_order=2)
+    found = quantify(given, "additive", freqs, sample_period_s=1.0, max_order=2)
     E = given - found.nominal_response
     allowed = np.abs(response(found.weight.left, freqs) @ response(found.weight.right, freqs))[:, 0, 0]
     ratio = np.abs(E).max(axis=0)[:, 0, 0] / allowed
-    assert ratio.max() <= 1 + 1e-9
-    if (
-        period
-    ):  # the ends of a continuous grid are held, too; between given points, on straight lines, it may touch first
-        assert ratio.max() >= 0.5
+    assert 0.5 <= ratio.max() <= 1 + 1e-9
     loose = -20 * np.log10(ratio.min())
     assert found.overbound_db_max == pytest.approx(loose, abs=1e-6)
 
@@ -163,19 +159,20 @@ def test_diagonal_weights_say_how_far_they_are_from_the_optimal_cover() -> None:
     def residuals(freqs: np.ndarray) -> np.ndarray:
         return np.array([response(u, freqs) - response(units[0], freqs) for u in units])
 
-    weight, best = fit_weight(of_function(residuals), GRID, Target(1.0, 1, 0.1))
+    weight, best = fit_weight(of_function(residuals), GRID, 1.0, 1, 0.1)
     assert weight.overbound_db_max == pytest.approx(
         (weight.magnitudes(GRID).cost_db() - best.cost_db()).max(), abs=1e-6
     )
 
 
 def test_peaks_that_no_grid_point_meets_are_covered() -> None:
-    """Light resonances, continuous, a hundred points over four decades; an order in between whose best magnitude vanishes at infinity."""
+    """Light resonances, a hundred points over four decades."""
     tops = np.array([1.0, 0.93, 1.04])
     A = np.zeros((3, 2, 2))
     A[:, 0, 1], A[:, 1, 0], A[:, 1, 1] = 1.0, -(tops**2), -0.004 * tops
-    C = np.stack([tops[:, None] ** 2, np.zeros((3, 1))], axis=-1)
-    units = StateSpace(A, np.tile([[0.0], [1.0]], (3, 1, 1)), C, np.linspace(0.01, 0.02, 3).reshape(-1, 1, 1), 0.0)
+    A = np.array([expm(0.03 * a) for a in A])
+    C = np.stack([0.03 * tops[:, None] ** 2, np.zeros((3, 1))], axis=-1)
+    units = StateSpace(A, np.tile([[0.0], [1.0]], (3, 1, 1)), C, np.linspace(0.01, 0.02, 3).reshape(-1, 1, 1), 0.03)
     model = quantify(
         units, "additive", np.geomspace(1e-2, 1e2, 100) / (2 * np.pi), nominal=0, max_order=2, tolerance_db=60.0
     )

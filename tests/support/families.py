@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from kros.lifting import delays, fourier_features, harmonics, polynomials, radial
+from kros.lifting import delays, harmonics, polynomials, radial
 
 STATES, INPUTS = ("position", "velocity"), ("voltage",)
 CENTRES = np.random.default_rng(0).uniform(-2, 2, (5, 2))
@@ -10,7 +10,6 @@ FAMILIES = {
     "harmonics": harmonics("position", 100, [1, 2, 5], "phase"),
     "polynomials": polynomials(STATES, 4),
     "gaussian": radial(STATES, CENTRES, [0.3, 1.7]),
-    "fourier": fourier_features(STATES, 6, 0.8, 1),
     "delays": delays((*STATES, *INPUTS), 3),
     "free": (
         "tanh(velocity/0.05)*phase",

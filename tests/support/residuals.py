@@ -9,7 +9,7 @@ import numpy as np
 
 from kros.core.lti import StateSpace, gain
 from kros.uncertainty import Form
-from kros.uncertainty.weights.residuals import Residuals
+from kros.uncertainty.weights.fit import Residuals
 
 Array = np.ndarray[Any, Any]
 
@@ -17,19 +17,16 @@ Array = np.ndarray[Any, Any]
 def of_function(function: Callable[[Array], Array]) -> Residuals:
     """Return residuals, shape (unit, frequency, p, m), of a function of Hz."""
     units, _, p, m = function(np.array([0.1])).shape
-    return Residuals(
-        Form.ADDITIVE, lambda f: np.zeros((len(f), p, m)), lambda f, rows: function(f)[rows] + 0j, np.arange(units)
-    )
+    return Residuals(Form.ADDITIVE, lambda f: np.zeros((len(f), p, m)), lambda f, rows: function(f)[rows] + 0j, units)
 
 
 def of_systems(form: str, nominal: StateSpace, units: StateSpace) -> Residuals:
     """Return the residuals of a form with the systems behind them."""
-    rows = np.arange(units.batch_shape[0])
     return Residuals(
         Form(form),
         nominal.frequency_response,
         lambda f, some: units[some].frequency_response(f),
-        rows,
+        units.batch_shape[0],
         (nominal, units),
     )
 

@@ -6,7 +6,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.core.lti import gain
-from kros.lifting import Lifting, fourier_features, polynomials
+from kros.lifting import Lifting, polynomials
 from kros.lifting.families import check_family
 from kros.lifting.formula import Formula
 from kros.observer import Observer, ReliftStatus, relift_certificate
@@ -75,7 +75,6 @@ def test_multiplying_out_has_an_end():
     [
         lambda: polynomials(["x", "y", "z"], 10**6),
         lambda: polynomials(["x"], 10**400),
-        lambda: fourier_features(["x"], 10**12, 1.0, 0),
         lambda: check_family(
             {"kind": "radial", "names": ["x"], "length": 1, "centres": {"kind": "kmeans", "n": 10**12, "seed": 0}}
         ),

@@ -1,4 +1,4 @@
-"""Where weights are checked, what counts between sampled responses, and what degenerate magnitudes give: cases worked out by hand."""
+"""Where weights are checked, and what degenerate magnitudes give: cases worked out by hand."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from kros.core import KrosError, StateSpace
 from kros.core.errors import ConfigError
 from kros.core.frequency import log_grid
 from kros.uncertainty import Form, quantify
-from kros.uncertainty.bounded import _between
 from kros.uncertainty.weights.fit import checking_grid, joined
+from kros.uncertainty.weights.magnitude import RationalMagnitude
 from kros.uncertainty.weights.proof import ResidualSystems
-from kros.uncertainty.weights.rational import RationalMagnitude
 
 
 def test_the_checking_grid_reaches_from_zero_to_nyquist_and_is_dense_everywhere() -> None:
@@ -26,13 +25,6 @@ def test_the_checking_grid_reaches_from_zero_to_nyquist_and_is_dense_everywhere(
     assert np.tan(np.pi * inner[0]) == pytest.approx(1e-2 * np.tan(np.pi * 0.01))
     assert (inner[1:] / inner[:-1]).max() <= 10 ** (1 / 29)
     np.testing.assert_array_equal(checking_grid(np.array([0.0, 0.5]), 1.0)[[0, -1]], [0.0, 0.5])
-
-
-def test_responses_between_points_are_on_straight_lines_and_constant_beyond_the_ends() -> None:
-    values = np.array([4.0, 1.0, 2.0j])[None, :, None, None]
-    freqs, at = np.array([1.0, 2.0, 4.0]), np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 20.0])
-    np.testing.assert_allclose(_between(freqs, values, at)[0, :, 0, 0], [4, 4, 2.5, 1, 0.5 + 1j, 2j, 2j])
-    np.testing.assert_allclose(_between(freqs[:1], values[:, :1], at)[0, :, 0, 0], 4.0)
 
 
 def pair(radius: float, angle: float, gain: float = 1.0) -> StateSpace:

@@ -7,7 +7,7 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.core.frequency import bilinear_squared, check_grid, log_grid, nyquist_hz
-from kros.uncertainty.weights.rational import RationalMagnitude
+from kros.uncertainty.weights.magnitude import RationalMagnitude
 
 DT = 1e-3
 

@@ -78,7 +78,7 @@ def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> Non
     assert bad.outlier
     assert bad.score_db > good.score_db
     assert bad.threshold_db == model.threshold_db
-    with pytest.raises(DimensionError, match="stored frequencies"):
+    with pytest.raises(DimensionError, match="same frequencies"):
         model.score("short", G[11][:3])
 
 
@@ -101,15 +101,15 @@ def test_one_unit_beside_identical_ones_is_flagged() -> None:
 
 def test_bad_input_is_refused() -> None:
     G = responses(4, 7)
-    with pytest.raises(DataError, match="three units"):
+    with pytest.raises(DataError, match="3 units"):
         score_outliers(G[:2], FREQS)
-    with pytest.raises(DataError, match="frequency"):
+    with pytest.raises(DimensionError, match="as many freqs_hz"):
         score_outliers(G, FREQS[:-1])
     with pytest.raises(ConfigError, match="rate"):
         score_outliers(G, FREQS, false_alarm_rate=2.0)
     with pytest.raises(DimensionError, match="unit, frequency"):
         score_outliers(G[0], FREQS)
-    with pytest.raises(DimensionError, match="unit c has a response of shape"):
+    with pytest.raises(DimensionError, match="'c' has the shape"):
         score_outliers([G[0], G[1], G[2, :, :2]], FREQS, unit_ids=("a", "b", "c"))
     with pytest.raises(DimensionError, match="positive numbers"):
         score_outliers(G, FREQS, output_scale=[1.0, 0.0, 1.0])
@@ -117,8 +117,8 @@ def test_bad_input_is_refused() -> None:
         score_outliers(G, FREQS, "sideways")
     broken = G.copy()
     broken[2, 10, 1, 0] = np.nan
-    with pytest.raises(DataError, match=r"unit 2 is .*nan.* entry \(1, 0\)"):
+    with pytest.raises(DataError, match="unit '2' has NaN"):
         score_outliers(broken, FREQS)
     model = score_outliers(G, FREQS)
-    with pytest.raises(DataError, match="unit new"):
+    with pytest.raises(DataError, match="unit 'new'"):
         model.score("new", np.full_like(model.responses[0], np.nan))

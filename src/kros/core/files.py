@@ -186,8 +186,8 @@ def _take(handle: int, path: Path, shared: bool) -> None:
     except BlockingIOError:
         busy = True
     except OSError as error:
-        log.warning("%s: no locks here (%s); do not run two studies in one folder at once", path, error)
+        log.warning("%s: no file locks here (%s); do not run two studies in one folder at once", path, error)
         busy = False
     if busy:
         holder = os.read(handle, 200).decode(errors="replace") or "another process"
-        raise ConfigError(f"Folder {path.parent}: {holder} is at work in it; wait until it ends, or name another.")
+        raise ConfigError(f"Folder {path.parent}: {holder} is using it; wait until it ends, or name another.")

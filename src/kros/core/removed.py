@@ -83,6 +83,8 @@ Models of units are no longer converted by a function of their own; use to_contr
     kros.interop: models_to_control
 The array format of pykoop is no longer in kros.data; use from_pykoop and to_pykoop of kros.interop.
     kros.data: from_pykoop to_pykoop
+Random Fourier features are no longer a family of liftings; use radial, with centres by k-means.
+    kros.lifting: fourier_features
 """
 
 

@@ -37,7 +37,7 @@ class Settings(BaseModel):
     def _explain(cls, error: Any) -> str:
         key, value = ".".join(p for p in error["loc"] if isinstance(p, str)), error.get("input")
         unknown, text = error["type"] == "extra_forbidden", str(error["msg"]).lower()
-        if reason := instead_of(f"{key}={value}" if isinstance(value, str) and not unknown else key):
+        if reason := instead_of(key if unknown else f"{key}={value}"):
             return reason
         if unknown:
             known = cls._names_in(error["loc"][:-1])

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, SynthesisError
+from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data import EpisodeBatch
-from ..data.population import EpisodeKey
+from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
@@ -23,7 +23,6 @@ from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
 from ..observer.screen import Screen, Screened
 from ..observer.sensor import delay_of
-from .methods.gains import EQUAL, RESIDUAL
 from .validation import TrainingSet, rank
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +35,6 @@ class BaselineSettings:
 
     levels: tuple[float, ...] = (-4.0, -2.0, 0.0, 2.0, 4.0)  # decades of the extended filter's process noise
     extended_samples: int = 2_000  # of an episode, on which these are compared
-    profile_samples: int = 5_000_000  # of the mean profile, at most, once every unit and condition has been read
     same_motion: float = 0.01  # RMS difference of inputs of the same motion, share of the largest input
 
 
@@ -71,18 +69,17 @@ class Baseline:
         units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
             units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
-        samples, estimate = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), np.empty(0)
+        samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
             estimator, some = self.by_unit[unit], samples.of(rows)
             if isinstance(estimator, ExtendedKalman):
-                part = estimator.run(some.y, some.u, values, some.starts)
+                parts.append(estimator.run(some.y, some.u, values, some.starts))
             elif self.restarts:
-                part = restarted(estimator, some, values)
+                parts.append(restarted(estimator, some, values))
             else:
-                part = estimator.run(some.y, some.u, values)
-            estimate = estimate if estimate.size else np.empty((*y.shape[:2], part.shape[-1]))
-            estimate[:, rows] = part
+                parts.append(estimator.run(some.y, some.u, values))
+        estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
 
@@ -104,39 +101,33 @@ def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, 
 def make_extended(
     training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
 ) -> Baseline:
-    """Tune the extended Kalman filter of a nominal model: process noise of two shapes, all run side by side."""
+    """Tune the extended Kalman filter of a nominal model: process noise of many sizes, all run side by side."""
     batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
     residual = one_step_residual(lifting, models.A[row], models.B[row], batch.states, batch.inputs, batch.parameters)
-    shapes = {EQUAL: np.diag(models.output_scale[:n] ** 2)}
-    shapes[RESIDUAL] = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    sized = {name: shape * like_measurement_noise(shape[np.ix_(C, C)], R) for name, shape in shapes.items()}
-    tried = [(name, level, 10**level * shape) for name, shape in sized.items() for level in settings.levels]
+    shape = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+    shape = shape * like_measurement_noise(shape[np.ix_(C, C)], R)
     filters = ExtendedKalman(
         lifting,
         models.A[row],
         models.B[row],
         models.measured,
         models.recorded_inputs,
-        np.stack([Q for *_, Q in tried]),
+        np.stack([10**level * shape for level in settings.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
     short = batch.head(settings.extended_samples)
-    percents = [
-        error_percent(estimate, short.states, short.lengths).mean(axis=0)
-        for estimate in filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
-    ]
+    estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
+    percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
-    ranks = [rank(p, np.full(n, 100.0), models.measured) for p in bounded]
-    first = min(range(len(tried)), key=lambda i: ranks[i])
+    first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
     if not np.isfinite(bounded[first]).all():
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
-    shape, level, Q = tried[first]
-    facts = {"status": "tuned", "process_noise_level": 10**level, "process_noise_shape": shape}
-    tuned = {"": replace(filters, Q=Q)}
+    facts = {"status": "tuned", "process_noise_level": 10 ** settings.levels[first]}
+    tuned = {"": replace(filters, Q=filters.Q[first])}
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
 
@@ -146,17 +137,14 @@ def make_difference(training: TrainingSet, measured: tuple[int, ...]) -> Baselin
     y, period = batch.measurements(measured), population.sample_period_s
     pairs = followed(batch, measured)
     if not pairs:
-        states = ", ".join(population.states)
-        raise ConfigError(
-            f"Filtered difference: no state of {states} follows the rate of a measured one; record the rate."
-        )
+        problem = f"no state of {', '.join(population.states)} follows the rate of a measured one"
+        raise ConfigError(f"Filtered difference: {problem}; record the rate.")
     estimated = tuple(state for _, state in pairs)
-    truth, tried = batch.states[..., estimated], list[tuple[float, FilteredDifference]]()
-    for cutoff in cutoffs_hz(period):
-        trial = FilteredDifference(len(population.states), pairs, float(cutoff), period).scaled_to(batch, measured)
-        error = error_percent(trial.run(y, batch.inputs)[..., estimated], truth, batch.lengths)
-        tried.append((float(error.mean()), trial))
-    best = min(tried, key=lambda pair: pair[0])[1]
+    plain = (FilteredDifference(len(population.states), pairs, float(cutoff), period) for cutoff in cutoffs_hz(period))
+    trials = [trial.scaled_to(batch, measured) for trial in plain]
+    estimates = [trial.run(y, batch.inputs)[..., estimated] for trial in trials]
+    errors = [error_percent(one, batch.states[..., estimated], batch.lengths).mean() for one in estimates]
+    best = trials[int(np.argmin(errors))]
     facts = {"status": "tuned", "cutoff_hz": best.cutoff_hz}
     return Baseline({"": best}, measured, estimated, facts, seen=training.seen)
 
@@ -169,3 +157,95 @@ def make_learned(training: TrainingSet, measured: tuple[int, ...]) -> Baseline:
     facts = {"status": "trained", "episodes": len(training.keys), "left_out": "the unit under test"}
     estimators = {unit: moments.estimator([unit]) for unit in moments.units} | {"": moments.estimator()}
     return Baseline(estimators, measured, moments.estimated, facts, seen=training.seen)
+
+
+@dataclass(frozen=True, eq=False)
+class MeanProfile:
+    """Mean states of motions that are known by their inputs, for machines that repeat a motion."""
+
+    n_states: int
+    estimated: tuple[int, ...]
+    inputs: Sequence[Array]  # (n_samples, m)
+    states: Sequence[Array]  # (n_samples, h)
+
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Estimate a batch from its first sample on, each member by the motion whose inputs are nearest."""
+        del parameters
+        estimate, sizes = np.full((*y.shape[:2], self.n_states), np.nan), largest_of(self.inputs)
+        for i in range(y.shape[1]):
+            nearest = int(np.argmin([difference(u[:, i], motion, sizes) for motion in self.inputs]))
+            estimate[:, i, list(self.estimated)] = held(self.states[nearest], len(y))
+        return estimate
+
+
+def held(signal: Array, n_samples: int) -> Array:
+    """Return a signal, shape (n, ...), of `n_samples` samples: cut, or held at its last one."""
+    return np.asarray(signal[np.minimum(np.arange(n_samples), len(signal) - 1)])
+
+
+def largest_of(inputs: Sequence[Array]) -> Array:
+    """Return the largest absolute value of every input over motions, one where it is always zero."""
+    largest = np.max([np.abs(motion).max(axis=0) for motion in inputs], axis=0)
+    return np.asarray(np.where(largest > 0, largest, 1.0))
+
+
+def difference(u: Array, motion: Array, sizes: Array) -> float:
+    """Return the RMS difference of inputs, shape (n_samples, m), as a share of `sizes`; the largest of all inputs."""
+    return float(np.sqrt(np.mean(((u - held(motion, len(u))) / sizes) ** 2, axis=0)).max())
+
+
+def make_mean_profile(
+    training: TrainingSet,
+    measured: tuple[int, ...],
+    population: Population,
+    keys: Iterable[EpisodeKey],
+    settings: BaselineSettings = DEFAULT,
+) -> Baseline:
+    """Average the states of training episodes that have the same motions, over units, and without each unit."""
+    n, same = len(population.states), settings.same_motion
+    estimated = tuple(i for i in range(n) if i not in measured)
+    if not population.inputs or not estimated:
+        raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
+    motions = different_motions(population, keys, same)
+    means, closest, episodes = unit_means(training, list(motions.values()), estimated, same)
+    for key, of_units, apart in zip(motions, means, closest, strict=True):
+        if len(of_units) < 2:
+            reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
+            distance = f"{100 * apart:.3g} % of the largest (RMS), at most {100 * same:g} % is allowed"
+            raise DataError(f"Mean profile: {reason}; the nearest inputs differ by {distance}.")
+
+    def without(left_out: str) -> MeanProfile:
+        states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
+        return MeanProfile(n, estimated, list(motions.values()), states)
+
+    by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
+    facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
+    return Baseline(by_unit, measured, estimated, facts, restarts=False, seen=training.seen)
+
+
+def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
+    """Return the inputs of episodes that differ, (n_samples, m) each."""
+    motions: dict[EpisodeKey, Array] = {}
+    for key in keys:
+        u = population.read_parts(key)[1]
+        sizes = largest_of([*motions.values(), u])
+        if all(difference(u, motion, sizes) > same for motion in motions.values()):
+            motions[key] = u
+    return motions
+
+
+def unit_means(
+    training: TrainingSet, motions: Sequence[Array], estimated: Sequence[int], same: float
+) -> tuple[list[dict[str, Array]], Array, int]:
+    """Return the mean states of every motion by unit, how near inputs came to it, and the episodes that were used."""
+    sizes, closest, used = largest_of(motions), np.full(len(motions), np.inf), 0
+    profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
+    for part in training.one_by_one():
+        apart = np.array([difference(motion, part.inputs[:, 0], sizes) for motion in motions])
+        closest, at = np.minimum(closest, apart), int(apart.argmin())
+        if apart[at] <= same:
+            states = held(part.states[:, 0, list(estimated)], len(motions[at]))
+            profiles[at].setdefault(part.units[0], []).append(states)
+            used += 1
+    means = [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]
+    return means, closest, used

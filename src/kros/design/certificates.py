@@ -1,4 +1,4 @@
-"""Certificates of observers as nonlinear systems, with their errors and guards from training episodes."""
+"""Certificates of observers for the uncertain set and as nonlinear systems, with errors and guards from training."""
 
 from __future__ import annotations
 
@@ -10,28 +10,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import SynthesisError
+from ..core.lti import StateSpace, gain
 from ..data import EpisodeBatch
+from ..data.population import EpisodeKey
 from ..evaluate import error_rms
+from ..identify import ModelSet
 from ..loops.filtering import recursion
-from ..observer import (
-    Observer,
-    ReliftCertificate,
-    ReliftScales,
-    ReliftStatus,
-    relift_certificate,
-    run_observer,
-)
+from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
 from ..observer.certificate.signals import SignalBound, signal_bound
-from ..observer.estimator.certificate import filter_certificate, left_out_bound
+from ..observer.estimator.certificate import filter_certificate, left_out_bound, linear_estimate
 from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
 from ..observer.simulate import run_observers
-from ..observer.units import factors, in_sizes
+from ..observer.units import factors
+from ..synthesis import ObserverProblem
+from ..synthesis.worst_case.certificate import attained, certify_errors
+from ..synthesis.worst_case.unit_check import unit_ratios
+from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import TrainingSet, hidden_mean, percent_of
+from .validation import hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -53,59 +54,52 @@ DEFAULT = CertificateSettings()
 
 def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSettings = DEFAULT) -> list[Design]:
     """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
-    data, others = certified_on(task.training, settings), other_conditions(task, settings)
+    batches = certified_on(task, settings)
     if designs[0].observer.bank is not None:
-        return [_certified_filters(design, data, others, task, settings) for design in designs]
-    return _certified_models(designs, data, others, task, settings)
+        return [_certified_filters(design, batches, task, settings) for design in designs]
+    return _certified_models(designs, batches, task, settings)
 
 
-def certified_on(training: TrainingSet, settings: CertificateSettings = DEFAULT) -> EpisodeBatch:
-    """Return episodes whose signals make the certified set: the start of the first one of every unit, or short ones."""
-    first = training.first_of_units().read().head(settings.samples)
-    return first if len(first.states) > training.settings.short else training.read()
+def certified_on(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
+    """Return episodes whose signals make the certified set, and the same of every other condition.
 
-
-def other_conditions(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
-    """Return the same of every condition that observers are not certified for."""
+    They are the start of the first episode of every unit, or all of short ones.
+    """
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
-    keys = [k for k in task.recordings.keys if k.condition not in home and k.unit in units]
-    groups = [tuple(k for k in keys if k.condition == c) for c in dict.fromkeys(k.condition for k in keys)]
-    return [certified_on(replace(task.recordings, keys=group), settings) for group in groups]
+    others: dict[str, list[EpisodeKey]] = {}
+    for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
+        others.setdefault(key.condition, []).append(key)
+    batches = []
+    for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
+        first = training.first_of_units().read().head(settings.samples)
+        batches.append(first if len(first.states) > training.settings.short else training.read())
+    return batches
 
 
 def _certified_models(
-    designs: Sequence[Design],
-    batch: EpisodeBatch,
-    others: Sequence[EpisodeBatch],
-    task: DesignTask,
-    settings: CertificateSettings,
+    designs: Sequence[Design], batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
 ) -> list[Design]:
     """Certify corrected models, which run side by side."""
-    observers = [design.observer for design in designs]
-    guards = guards_of(observers, [batch, *others], settings)
-    scales = scales_of(observers, batch, task)
-    certificates = [certify_model(o, s, task, settings.box) for o, s in zip(observers, scales, strict=True)]
-    hidden = hidden_error_percent(observers, [batch, *others])
-    lost, certified = loss_error_percent(observers, batch, settings), []
-    for k, (design, certificate) in enumerate(zip(designs, certificates, strict=True)):
-        observer = observers[k]
+    observers, batch, certified = [design.observer for design in designs], batches[0], []
+    guards, scales = guards_of(observers, batches, settings), scales_of(observers, batch, task)
+    errors = np.stack(
+        [hidden_error_percent(observers, batches), loss_error_percent(observers, batch, settings)], axis=1
+    )
+    for design, guard, scale, (hidden, lost) in zip(designs, guards, scales, errors.tolist(), strict=True):
+        observer = design.observer
+        certificate = certify_model(observer, scale, task, settings.box)
         bound = signal_bound(certificate, observer, batch).in_sizes(factors(observer, {})[0][: len(observer.recorded)])
         certificate = certificate.in_sizes(observer, {})
-        facts = _facts(certificate, bound, observer.measured, (float(hidden[k]), float(lost[k])))
-        observer = replace(observer, guard=guards[k])
-        certified.append(replace(design, observer=observer, certificate=certificate, facts={**design.facts, **facts}))
+        facts = {**design.facts, **_facts(certificate, bound, observer.measured, (hidden, lost))}
+        certified.append(replace(design, observer=replace(observer, guard=guard), certificate=certificate, facts=facts))
     return certified
 
 
 def _certified_filters(
-    design: Design,
-    batch: EpisodeBatch,
-    others: Sequence[EpisodeBatch],
-    task: DesignTask,
-    settings: CertificateSettings,
+    design: Design, batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
 ) -> Design:
     """Certify a filter bank; its errors in training are raised to those on units that were left out."""
-    observer = design.observer
+    observer, batch = design.observer, batches[0]
     n, measured = len(observer.recorded), observer.measured
     estimates = run_observer(observer, batch.measurements(measured), batch.inputs, observer.own(batch.parameters))
     square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
@@ -115,7 +109,7 @@ def _certified_filters(
     scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
     growth = design.facts["left_out_to_training"]
     left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
-    hidden = float(hidden_error_percent([observer], [batch, *others], left_out)[0])
+    hidden = float(hidden_error_percent([observer], batches, left_out)[0])
     lost = float(loss_error_percent([observer], batch, settings)[0])
     certificate = filter_certificate(observer, scales)
     scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
@@ -132,9 +126,8 @@ def _facts(
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
     facts |= {"hidden_error_percent": errors[0], "loss_error_percent": errors[1]}
     facts |= bound.facts(measured) | {"assumptions": certificate.assumptions}
-    facts["set_bound"] = {
-        s: float(v) if np.isfinite(v) else None for s, v in zip(bound.states, bound.cover, strict=True)
-    }
+    cover = zip(bound.states, bound.cover.tolist(), strict=True)
+    facts["set_bound"] = {state: value if np.isfinite(value) else None for state, value in cover}
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
@@ -149,14 +142,10 @@ def hidden_error_percent(
 
 def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTask) -> list[ReliftScales]:
     """Return the sizes that every gain refers to: ranges, one-step residuals of the observer's model, quantisation."""
-    known: dict[bytes, ReliftScales] = {}
-    for observer in observers:
-        model, n = observer.A.tobytes() + observer.B.tobytes(), len(observer.recorded)
-        if model not in known:
-            values = observer.own(batch.parameters)
-            residual = one_step_residual(observer.lifting, observer.A, observer.B, batch.states, batch.inputs, values)
-            known[model] = ReliftScales.typical(task.models.output_scale[:n], residual, task.noise)
-    return [known[observer.A.tobytes() + observer.B.tobytes()] for observer in observers]
+    first, sizes = observers[0], task.models.output_scale[: len(observers[0].recorded)]
+    recorded = batch.states, batch.inputs, first.own(batch.parameters)
+    residuals = (one_step_residual(first.lifting, o.A, o.B, *recorded) for o in observers)
+    return [ReliftScales.typical(sizes, residual, task.noise) for residual in residuals]
 
 
 def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, settings: CertificateSettings) -> Array:
@@ -177,11 +166,9 @@ def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, si
     """Certify one observer everywhere, or in an operating box where slopes have no global bound."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
-        ranges = [
-            *zip(models.lifting.states, models.output_scale, strict=False),
-            *zip(models.recorded_inputs, models.input_scale, strict=False),
-        ]
-        box = {name: (-size * value, size * value) for name, value in ranges}
+        ranges = dict(zip(models.lifting.states, models.output_scale, strict=False))
+        ranges |= dict(zip(models.recorded_inputs, models.input_scale, strict=False))
+        box = {name: (-size * value, size * value) for name, value in ranges.items()}
         values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
         certificate = relift_certificate(observer, box, scales, values)
     if not certificate.certified:
@@ -193,27 +180,34 @@ def guards_of(
     observers: Sequence[Observer], batches: Sequence[EpisodeBatch], settings: CertificateSettings
 ) -> list[Guard | None]:
     """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
+    extents = [_extents(observers, batch, first) for batch in batches for first in (0, len(batch.states) // 2)]
+    low, high, size, corrections = zip(*extents, strict=True)
+    least, most, largest = np.min(low, axis=0), np.max(high, axis=0), settings.largest * np.max(size, axis=0)
+    room = settings.room * np.maximum(most - least, np.finfo(float).tiny)
+    least = np.maximum(least - room, np.minimum(least, -largest))
+    most = np.minimum(most + room, np.maximum(most, largest))
+    of_corrections = [np.max(one, axis=0) for one in zip(*corrections, strict=True)]
+    return [_guard(*one, settings) for one in zip(observers, least, most, of_corrections, strict=True)]
+
+
+def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> tuple[Array, Array, Array, list[Array]]:
+    """Return bounds of estimates and recordings (observer, n), sizes of recordings (n,), and largest corrections."""
     n, q = observers[0].lifting.n_states, list(observers[0].measured)
-    low, high = np.full((len(observers), n), np.inf), np.full((len(observers), n), -np.inf)
-    size, largest = np.zeros(n), [np.zeros(o.controller.n_states) for o in observers]
-    for batch in batches:
-        y, recorded = batch.measurements(q), batch.states.shape[-1]
-        for first in (0, len(y) // 2):
-            x = run_observers(observers, y[first:], batch.inputs[first:], observers[0].own(batch.parameters))
-            inside = (np.arange(first, len(y))[:, None] < batch.lengths)[..., None]
-            states, least, most = batch.states[first:], np.full(n, np.inf), np.full(n, -np.inf)
-            least[:recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
-            most[:recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
-            size = np.maximum(size, np.maximum(np.abs(least), np.abs(most)))
-            low = np.minimum(low, np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least))
-            high = np.maximum(high, np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most))
-            for i, o in enumerate(observers):
-                nu = np.where(inside & np.isfinite(y[first:]), y[first:] - x[i][..., q], 0.0)
-                corrections = recursion(o.controller.A, nu, np.zeros((nu.shape[1], len(largest[i]))), o.controller.B)
-                largest[i] = np.maximum(largest[i], np.abs(corrections).max(axis=(0, 1), initial=0.0))
-    room, most = settings.room * np.maximum(high - low, np.finfo(float).tiny), settings.largest * size
-    low, high = np.maximum(low - room, np.minimum(low, -most)), np.minimum(high + room, np.maximum(high, most))
-    return [_guard(o, a, b, c, settings) for o, a, b, c in zip(observers, low, high, largest, strict=True)]
+    y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
+    recorded = np.arange(n) < states.shape[-1]
+    inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
+    x = run_observers(observers, y, inputs, observers[0].own(batch.parameters))
+    least, most = np.full(n, np.inf), np.full(n, -np.inf)
+    least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
+    most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)
+    low = np.minimum(x.min(axis=(1, 2), where=inside, initial=np.inf), least)
+    high = np.maximum(x.max(axis=(1, 2), where=inside, initial=-np.inf), most)
+    corrections = []
+    for o, estimate in zip(observers, x, strict=True):
+        nu = np.where(inside & np.isfinite(y), y - estimate[..., q], 0.0)
+        states_c = recursion(o.controller.A, nu, np.zeros((nu.shape[1], o.controller.n_states)), o.controller.B)
+        corrections.append(np.abs(states_c).max(axis=(0, 1), initial=0.0))
+    return low, high, np.maximum(np.abs(least), np.abs(most)), corrections
 
 
 def _guard(
@@ -228,7 +222,67 @@ def _guard(
     return Guard(low, high, correction, settling(observer))
 
 
-def in_recorded_units(design: Design) -> Design:
-    """Return a design whose observer and controller are in the recordings' units."""
-    observer = in_sizes(design.observer, {})
-    return replace(design, observer=observer, synthesis=replace(design.synthesis, controller=observer.controller))
+def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) -> tuple[ObserverProblem | None, str]:
+    """Return the synthesis problem of one kind of model, or None and why there is none."""
+    try:
+        problem = ObserverProblem.from_uncertain(models, uncertain, noise)
+        problem.require_sound()
+        return problem, ""
+    except SynthesisError as error:
+        log.warning("%s: there are no robust observers and no certificates: %s", models.name, error)
+        return None, str(error)
+
+
+def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
+    """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
+    observer = design.observer
+    order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
+    facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
+    if design.facts.get("rows_fitted_to_single_steps"):
+        reason = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
+        return facts | {"reason": reason}
+    if problem is None:
+        return facts | {"reason": task.refusal}
+    problem = replace(problem, injection=design.synthesis.injection)
+    try:
+        errors, mean = error_maps(task, design, problem)
+        facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))
+        bound = certify_errors(problem, errors, mean)[0]
+        if observer.bank is None:
+            facts |= of_units(task, design, problem)
+        else:
+            facts["constant_h2"] = float(np.linalg.norm(mean))
+            facts["worst_case_h2_attained"] = attained(problem, errors, mean)
+            require_useful(problem, observer, bound)
+        return facts | {"worst_case_h2": bound}
+    except SynthesisError as error:
+        log.warning("%s: no certificate, %s", task.name, error)
+        return facts | {"reason": str(error)}
+
+
+def require_useful(problem: ObserverProblem, observer: Observer, bound: float) -> None:
+    """Refuse a bound that is no better than that of no estimate: the set does not relate inputs as recordings do."""
+    columns = len(observer.measured) + problem.nominal.n_outputs + problem.nominal.n_inputs
+    nothing = gain(np.zeros((problem.nominal.n_outputs, columns)), problem.nominal.dt)
+    without = certify_errors(problem, problem.estimate_error(nothing), np.zeros(1))[0]
+    if bound >= without:
+        both = f"the bound over the set is {bound:.3g}, and without an estimate {without:.3g}"
+        raise SynthesisError(f"{both}: the inputs of the set are independent, recorded ones are not.")
+
+
+def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tuple[StateSpace, Array]:
+    """Return the system from what drives plants of the set to the weighted error of an observer, and the mean error."""
+    if design.observer.bank is None:
+        return problem.error_system(design.synthesis.controller), np.zeros(1)
+    estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
+    weight = problem.performance.frequency_response([0.0])[0].real
+    return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
+
+
+def of_units(task: DesignTask, design: Design, problem: ObserverProblem) -> dict[str, Any]:
+    """Return whether the bound holds for the models of all units."""
+    ratios = unit_ratios(problem, design.synthesis.controller, task.models.systems(task.covered))
+    of_norm, of_density = (float(ratio.max(initial=0.0)) for ratio in ratios)
+    if of_norm > 1:
+        log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, of_norm)
+    return {"bound_holds": of_norm <= 1, "unit_to_h2_bound_max": of_norm, "unit_to_density_max": of_density}

@@ -12,7 +12,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -60,8 +60,7 @@ def fit_monitor(
     episodes = {group: run for group, run in zip(groups, runs, strict=True) if run}
     units, every = list(dict.fromkeys(unit for unit, _ in episodes)), [e for run in episodes.values() for e in run]
     if len(units) < LEAST_SCORES:
-        needed = f"its bound needs training episodes of {LEAST_SCORES} units, found {len(units)}"
-        log.info("%s has no monitor: %s.", observer.name, needed)
+        log.info("%s has no monitor: it needs %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
     size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged in every], axis=0))
     if not np.isfinite(size).all() or np.any(size <= 0):
@@ -71,10 +70,8 @@ def fit_monitor(
     free = Monitor(filters, forget, settle, size, even, weighted(even), rate, len(units), first)
     # Mean squares are computed wherever they are needed: all of them would fill a memory.
     squares = {group: partial(free.in_turn, run) for group, run in episodes.items()}
-    largest = {
-        group: 10 * np.log10(np.maximum(np.max([p.max(axis=0) for p in of()], axis=0), 1e-30))
-        for group, of in squares.items()
-    }
+    most = {group: np.max([p.max(axis=0) for p in of()], axis=0) for group, of in squares.items()}
+    largest = {group: 10 * np.log10(np.maximum(values, 1e-30)) for group, values in most.items()}
     weights = weighted(steady(largest, settings))
     peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
     bound = bound_of_peaks([max((p for (u, _), p in peaks.items() if u == unit), key=max) for unit in units], settings)
@@ -87,15 +84,11 @@ def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[
     """Take some episodes of some units, by unit and condition."""
     groups = list(dict.fromkeys((key.unit, key.condition) for key in training.keys))
     units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
-    for unit, condition in groups:
-        if unit in units:
-            keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
-            population, parameters = training.population.select([unit], [condition]), training.parameters.get(unit, {})
-            chosen = tuple(spread(keys, settings.episodes))
-            yield (
-                (unit, condition),
-                replace(training, population=population, keys=chosen, parameters={unit: parameters}),
-            )
+    for unit, condition in (group for group in groups if group[0] in units):
+        keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
+        parts: dict[str, Any] = {"population": training.population.select([unit], [condition])}
+        parts |= {"parameters": {unit: training.parameters.get(unit, {})}}
+        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), **parts)
 
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
@@ -116,11 +109,9 @@ def bound_of_peaks(peaks: Sequence[Sequence[float]], settings: MonitorSettings =
     mean, bound = float(highest.mean()), float(prediction_bound(highest, rate))
     if not 1 < shared < settings.motions or bound <= mean:
         return bound
-    every, half = np.array([levels[:shared] for levels in peaks]), shared // 2
-    means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), half)}
-    apart = [
-        means[one] - means[other] for one in means for other in combinations(sorted({*range(shared)} - {*one}), half)
-    ]
+    every = np.array([levels[:shared] for levels in peaks])
+    means = {part: every[:, part].max(axis=1).mean() for part in combinations(range(shared), shared // 2)}
+    apart = [means[one] - means[other] for one, other in product(means, means) if not {*one} & {*other}]
     wider = stdtrit(shared - 1, 1 - rate) ** 2 - stdtrit(settings.motions - 1, 1 - rate) ** 2
     return mean + float(np.sqrt((bound - mean) ** 2 + wider * np.mean(np.square(apart))))
 
@@ -157,11 +148,6 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
     for channel, band in np.argwhere(weights > 0):
         level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], 1e-30))
     return level * (10 / WEIGHT)
-
-
-def monitor_facts(monitor: Monitor) -> dict[str, Any]:
-    """Return what the metrics say of a monitor."""
-    return {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
 
 
 def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:

@@ -9,31 +9,32 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from importlib.metadata import version
 from itertools import chain
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.artifacts import plain
 from ..core.errors import ConfigError, SynthesisError
 from ..core.settings import require_kind
 from ..core.work import Work
+from ..data.population import scaling_of
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..lifting import Lifting
 from ..observer import EstimatorSettings, Sensor
 from ..observer.sensor import Sensors, require_measured, sides
-from ..synthesis import ObserverProblem
+from ..observer.units import in_sizes
 from ..uncertainty.quantify import UncertainModels
-from .about import about
-from .certificates import certify, in_recorded_units
+from .certificates import certificate, certify, usable_problem
 from .methods import METHODS, methods_of, preferred, suitable
-from .monitor import fit_monitor, monitor_facts
-from .settings import BASELINES, ObserverSettings, SynthesisSettings
+from .monitor import fit_monitor
+from .settings import ObserverSettings, SynthesisSettings
 from .task import Design, DesignTask, Method, split_name
-from .uncertain_set import certificate, usable_problem
 from .validation import TrainingSet
 
 log = logging.getLogger(__name__)
@@ -154,37 +155,25 @@ def synthesize_all(
             log.warning("%s could not be designed: %s", task.name, failed[task.name])
     designs = certified(tasks, designs, uncertain.models, work)
     deployed = choose_deployed(list(designs.values()))
-    designs[deployed] = with_monitor(designs[deployed], uncertain.models, sensor, work)
+    design, models = designs[deployed], uncertain.models.models(split_name(deployed)[0])
+    monitor = fit_monitor(design.observer, TrainingSet.whole(uncertain.models, models, sensor), work=work)
+    if monitor is not None:
+        known = {"false_alarm_rate": monitor.false_alarm_rate, "units": monitor.units, "settle_samples": monitor.settle}
+        facts = {**design.facts, "monitor": known}
+        designs[deployed] = replace(design, observer=replace(design.observer, monitor=monitor), facts=facts)
     return Designs(designs, deployed, failed, tuple(task.name for task in tasks))
-
-
-def with_monitor(
-    design: Design, identified: IdentifiedModels, sensor: Sensors | None, work: Work | None = None
-) -> Design:
-    """Return a design whose observer has a monitor, where there are enough units."""
-    training = TrainingSet.whole(identified, identified.models(split_name(design.name)[0]), sensor)
-    monitor = fit_monitor(design.observer, training, work=work)
-    if monitor is None:
-        return design
-    observer = replace(design.observer, monitor=monitor)
-    return replace(design, observer=observer, facts={**design.facts, "monitor": monitor_facts(monitor)})
 
 
 def _named(uncertain: UncertainModels, method: str | Method, estimator: EstimatorSettings) -> tuple[str, Method]:
     """Return a method and the kind of model that it is named with, or the first one that it is for."""
     kinds = uncertain.models.kinds
-    methods = methods_of([m.name for m in METHODS], estimator) if isinstance(method, str) else [method]
+    methods = methods_of([m.name for m in METHODS], estimator) + ([] if isinstance(method, str) else [method])
     pairs = [(kind, m) for kind in kinds for m in suitable(methods, kind, kinds)]
     for kind, m in pairs:
         if method in (m, m.name, f"{kind}/{m.name}"):
             return kind, m
-    reason = "there is no such method"
-    if method in get_args(BASELINES):
-        reason = "it is a baseline that runs where a study evaluates, and no design"
-    elif not isinstance(method, str) or split_name(method)[1] in {m.name for m in METHODS}:
-        reason = "it is not for these kinds of models; lifted functions are given to kros.identify"
     known = ", ".join(f"{kind}/{m.name}" for kind, m in pairs)
-    raise ConfigError(f"Synthesize, method {method!r}: {reason}; known are {known}.")
+    raise ConfigError(f"Synthesize: there is no method {method!r} for these models; known are {known}.")
 
 
 def tasks_of(
@@ -219,28 +208,18 @@ def measurement_noise(identified: IdentifiedModels, models: ModelSet, sensor: Se
     if any(one.jitter_samples for one in sensor.values()):
         states = TrainingSet.of(identified, models).read().states[..., list(models.measured)]
         steps = np.sqrt(np.mean(np.diff(states, axis=0) ** 2, axis=(0, 1)))
-    variances = []
-    for name, step in zip(names, steps, strict=True):
-        one = sensor.get(name, Sensor())
-        resolution = max(one.resolution or 0.0, identified.facts.resolution[name])
-        variances.append(one.model_copy(update={"resolution": resolution}).variance(step))
-    return np.sqrt(variances)
+    sensors = (sensor.get(name, Sensor()).no_finer_than(identified.facts.resolution[name]) for name in names)
+    return np.sqrt([one.variance(step) for one, step in zip(sensors, steps, strict=True)])
 
 
 def _designed(tasks: Sequence[DesignTask], work: Work) -> tuple[dict[str, Design], dict[str, str]]:
     """Return designs, and reasons of those that failed; the last methods start first, since they take longest."""
-    designs: dict[str, Design] = {}
-    failed: dict[str, str] = {}
     places = {method.name: place for place, method in enumerate(METHODS)}
     order = sorted(tasks, key=lambda task: -places.get(task.method.name, len(places)))
     results = dict(zip((task.name for task in order), work.map("synthesize", _design, order), strict=True))
-    for task in tasks:
-        result = results[task.name]
-        if isinstance(result, Design):
-            designs[task.name] = result
-        else:
-            failed[task.name] = result
-    return designs, failed
+    results = {task.name: results[task.name] for task in tasks}
+    designs = {name: result for name, result in results.items() if isinstance(result, Design)}
+    return designs, {name: result for name, result in results.items() if isinstance(result, str)}
 
 
 def _design(task: DesignTask) -> Design | str:
@@ -254,40 +233,64 @@ def _design(task: DesignTask) -> Design | str:
 def certified(
     tasks: Sequence[DesignTask], designs: Mapping[str, Design], identified: IdentifiedModels, work: Work
 ) -> dict[str, Design]:
-    """Certify observers on every member of the uncertain set and as nonlinear ones, a lifting side by side."""
+    """Certify observers as nonlinear ones, a lifting side by side, and on the set with disturbances a method chose."""
     pairs = [(task, designs[task.name]) for task in tasks if task.name in designs]
     groups: dict[tuple[str, Lifting], list[tuple[DesignTask, Design]]] = {}
     for task, design in pairs:
         groups.setdefault((task.models.name, design.observer.lifting), []).append((task, design))
     nonlinear = [partial(certify, group[0][0], [design for _, design in group]) for group in groups.values()]
-    linear = [partial(certificate, task, design, _assumed(task, pairs)) for task, design in pairs]
+    chosen = {task.models.name: design.problem for task, design in reversed(pairs) if design.problem is not None}
+    linear = [partial(certificate, task, design, chosen.get(task.models.name, task.problem)) for task, design in pairs]
     results: list[Any] = work.run("certify", [*nonlinear, *linear])  # the first ones take longest
     by_name = {design.name: design for design in chain(*results[: len(nonlinear)])}
     final = {}
     for (task, _), facts in zip(pairs, results[len(nonlinear) :], strict=True):
-        design = in_recorded_units(by_name[task.name])
-        design = replace(design, facts={**design.facts, **facts})
-        observer = replace(design.observer, about=about(task, identified, design))
-        final[task.name] = replace(design, observer=observer)
+        design = by_name[task.name]
+        observer = in_sizes(design.observer, {})  # in the recordings' units
+        solved = replace(design.synthesis, controller=observer.controller)
+        design = replace(design, observer=observer, synthesis=solved, facts={**design.facts, **facts})
+        final[task.name] = replace(design, observer=replace(observer, about=about(task, identified, design)))
     return final
 
 
-def _assumed(task: DesignTask, pairs: Iterable[tuple[DesignTask, Design]]) -> ObserverProblem | None:
-    """Return the set that all observers of a kind of model are certified for, with disturbances that a method chose."""
-    chosen = (d.problem for other, d in pairs if other.models.name == task.models.name and d.problem is not None)
-    return next(chosen, task.problem)
-
-
-def choose_deployed(designs: Sequence[Design], settings: DeploymentSettings | None = None) -> str:
+def choose_deployed(designs: Sequence[Design], rule: DeploymentSettings | None = None) -> str:
     """Return the most accurate observer with all certificates that tolerates dropouts."""
-    settings = settings or DeploymentSettings()
-    errors = {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
+    rule, errors = rule or DeploymentSettings(), {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
     bounded = [d for d in designs if d.certificate and d.certificate.certified and np.isfinite(errors[d.name])]
     safe = [d for d in bounded if d.certified] or bounded
-    candidates = [d for d in safe if d.facts["loss_error_percent"] < settings.diverged] or safe
+    candidates = [d for d in safe if d.facts["loss_error_percent"] < rule.diverged] or safe
     least = min((errors[d.name] for d in candidates), default=np.inf)
-    good = [d.name for d in candidates if errors[d.name] <= settings.as_good * least]
+    good = [d.name for d in candidates if errors[d.name] <= rule.as_good * least]
     best = preferred(good or [d.name for d in designs])
     if best is None:
         raise SynthesisError("No observer could be designed; see the reasons above.")
     return best
+
+
+def about(task: DesignTask, identified: IdentifiedModels, design: Design) -> dict[str, Any]:
+    """Return the object ``about`` of an observer's file, in the recordings' units."""
+    population, known, calibration = identified.population, identified.facts, identified.calibration
+    observer, certificate, facts = design.observer, design.certificate, design.facts
+    assert certificate is not None
+    proof = {name: getattr(certificate, name) for name in ("certified", "reason", "gain", "assumptions")}
+    trained = {"units": len(set(known.pooled) & set(task.models.unit_ids)), "conditions": identified.conditions}
+    channels = (*population.states, *population.inputs)
+    content: dict[str, Any] = {
+        "kros": version("kros"),
+        "units_of_measure": {c.name: c.unit for c in population.channels if c.name in identified.sizes},
+        "largest_in_training": identified.sizes,
+        "columns": {name: asdict(scaling_of(population.scaling, name)) for name in channels},
+        "sensor": {
+            name: observer.sensor.get(name, Sensor()).no_finer_than(known.resolution[name]).model_dump()
+            for name in population.measured
+        },
+        "trained_on": {**trained, "identify_on": known.identify_on},
+        "as_it_runs": {**proof, "operating_box": certificate.box},
+        "uncertain_set": {"worst_case_h2": facts.get("worst_case_h2"), "reason": facts.get("reason") or ""},
+    }
+    if calibration is not None and calibration.spec.parameter in observer.lifting.parameters:
+        values = {name: getattr(calibration.spec, name) for name in ("angle", "ratio", "reference", "measured")}
+        content["parameters"] = {calibration.spec.parameter: {**values, "lag_rad": calibration.lag_rad}}
+    names = (name for name in ("certified", "reason", "bound_percent", "outside") if f"set_{name}" in facts)
+    signals = {name: facts[f"set_{name}"] for name in names}
+    return dict(plain(content | ({"recorded_signals": signals} if signals else {})))

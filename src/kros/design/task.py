@@ -22,7 +22,6 @@ from ..synthesis import Injection, ObserverProblem, Status, Synthesis
 from .validation import TrainingSet, percent_of, rank
 
 Array = npt.NDArray[np.float64]
-FITTED = "the observer runs rows fitted to single steps, not the nominal model that the uncertain set surrounds"
 
 
 @dataclass(frozen=True)
@@ -176,9 +175,8 @@ class DesignTask:
 
     def open_loop(self) -> Synthesis:
         """Return the synthesis that corrects nothing."""
-        models = self.models
-        controller = gain(np.zeros((models.lifting.n_lifted, len(models.measured))), models.sample_period_s)
-        return Synthesis("open_loop", controller, Status.OPTIMAL, Injection.STATE)
+        nothing = np.zeros((self.models.lifting.n_lifted, len(self.models.measured)))
+        return Synthesis("open_loop", gain(nothing, self.models.sample_period_s), Status.OPTIMAL, Injection.STATE)
 
     def best(self, observers: Sequence[Observer]) -> tuple[int, float]:
         """Return which observer ranks first on training episodes (`validation.rank`), and its error to open loop."""

@@ -63,10 +63,10 @@ class TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
         units = [u for u in facts.pooled if u in models.unit_ids]
-        groups = [
-            facts.keys("train", u, c) for u in units for c in dict.fromkeys(k.condition for k in facts.keys("train", u))
-        ]
-        keys = [k for turn in zip_longest(*groups) for k in turn if k is not None]
+        groups: dict[tuple[str, str], list[EpisodeKey]] = {}
+        for key in (key for unit in units for key in facts.keys("train", unit)):
+            groups.setdefault((key.unit, key.condition), []).append(key)
+        keys = [k for turn in zip_longest(*groups.values()) for k in turn if k is not None]
         return cls._of(identified, models, units, keys, sensor)
 
     @classmethod
@@ -120,11 +120,8 @@ class TrainingSet:
 def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     """Return the errors of observers of one model of every recorded state, shape (observer, n), see `compare`."""
     values, y = observers[0].own(batch.parameters), batch.measurements(observers[0].measured)
-    errors: list[Array] = []
-    for start in range(0, len(observers), SIDE_BY_SIDE):
-        some = observers[start : start + SIDE_BY_SIDE]
-        errors += list(compare(run_observers(some, y, batch.inputs, values), batch))
-    return np.array(errors)
+    parts = (observers[start : start + SIDE_BY_SIDE] for start in range(0, len(observers), SIDE_BY_SIDE))
+    return np.concatenate([compare(run_observers(some, y, batch.inputs, values), batch) for some in parts])
 
 
 def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:
@@ -132,10 +129,8 @@ def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:
     x, lengths = batch.states, batch.lengths
     inside = np.arange(len(x))[:, None, None] < lengths[:, None]
     size = np.max(np.abs(x), axis=0, where=inside, initial=0.0)
-    groups = [(key.unit, key.condition) for key in batch.keys]  # an episode without motion has no size
-    largest = {group: size[[i for i, g in enumerate(groups) if g == group]].max(axis=0) for group in set(groups)}
-    size = np.array([largest[group] for group in groups])
-    x = np.ascontiguousarray(x.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
+    groups = np.array([f"{key.unit}\n{key.condition}" for key in batch.keys])  # an episode without motion has no size
+    size = np.array([size[groups == group].max(axis=0) for group in groups])
     with np.errstate(divide="ignore", invalid="ignore"):
         errors = [(100 * error_rms(e[..., : x.shape[-1]], x, lengths) / size).mean(axis=0) for e in estimates]
     return np.where(np.isfinite(errors), errors, np.inf)
@@ -149,9 +144,7 @@ def seen_by(identified: IdentifiedModels, measured: Sequence[int]) -> Seen:
 
 def spread(keys: Sequence[T], count: int) -> list[T]:
     """Return `count` keys, evenly spaced from the first to the last."""
-    if len(keys) <= count:
-        return list(keys)
-    return [keys[i] for i in np.linspace(0, len(keys) - 1, count).round().astype(int)]
+    return [keys[i] for i in np.linspace(0, len(keys) - 1, min(count, len(keys))).round().astype(int)]
 
 
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
@@ -164,6 +157,4 @@ def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, f
     """Order candidates: those that exceed the open loop in no state first, by the error of hidden states over its."""
     ratio = percent / np.maximum(limit, np.finfo(float).tiny)
     worst = float(ratio.max())
-    if not worst <= 1:
-        return True, worst
-    return False, float(hidden_mean(ratio, measured))
+    return (False, float(hidden_mean(ratio, measured))) if worst <= 1 else (True, worst)

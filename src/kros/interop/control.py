@@ -199,13 +199,10 @@ def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> Uncer
         nominal = to_control(model.nominal_system, name="nominal")
         scaled = to_control(model.scaled_nominal(), name="scaled_nominal")
         certificate = "for the systems on the unit circle, checked between the points of the grid and at its ends"
-        if model.sample_period_s == 0:
-            axis = f"for the systems on the imaginary axis up to {model.freqs_hz[-1]:.6g} Hz, through the bilinear map"
-            certificate = f"{axis}, checked between the points of the grid; from there on residuals count as constant"
     else:
         G, certificate = model.nominal_response, model.certificate
         nominal, scaled = (
-            control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, model.sample_period_s or 0)
+            control.FRD(np.moveaxis(g, 0, -1), 2 * np.pi * model.freqs_hz, model.sample_period_s)
             for g in (G, G / model.output_scale[:, None] * model.input_scale)
         )
     extra = model.remainder

@@ -9,8 +9,8 @@ Examples
 """
 
 from ..core.removed import refusing
-from .families import delays, fourier_features, harmonics, kmeans_centres, polynomials, radial
+from .families import delays, harmonics, kmeans_centres, polynomials, radial
 from .lifting import Lifting
 
-__all__ = ["Lifting", "delays", "fourier_features", "harmonics", "kmeans_centres", "polynomials", "radial"]
+__all__ = ["Lifting", "delays", "harmonics", "kmeans_centres", "polynomials", "radial"]
 __getattr__ = refusing(__name__)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from functools import wraps
 from inspect import signature
 from itertools import combinations_with_replacement
@@ -77,8 +76,7 @@ def harmonics(
     >>> harmonics("position", 100, [1], "phase")
     ('sin(100*position + phase)', 'cos(100*position + phase)')
     """
-    inner = wrapped(angle) if ratio == 1 else f"{number(ratio)}*{wrapped(angle)}"
-    inner = inner if phase is None else f"{inner} + {wrapped(phase)}"
+    inner = (f"{number(ratio)}*" if ratio != 1 else "") + wrapped(angle) + (f" + {wrapped(phase)}" if phase else "")
     texts = [inner if k == 1 else f"{k}*({inner})" for k in orders]
     return tuple(f"{function}({text})" for text in texts for function in ("sin", "cos"))
 
@@ -103,10 +101,9 @@ def delays(names: Names, depth: Annotated[int, Field(ge=1, le=MAX_DELAY)]) -> Fo
     >>> delays(["position", "voltage"], 2)
     ('position[-1]', 'voltage[-1]', 'position[-2]', 'voltage[-2]')
     """
-    others = [name for name in names if not name.isidentifier()]
-    if others:
-        remedy = "write the delay inside the formula"
-        raise ConfigError(f"delays: only states and inputs have earlier values, found {others}; {remedy}.")
+    if others := [name for name in names if not name.isidentifier()]:
+        problem = f"only states and inputs have earlier values, found {others}"
+        raise ConfigError(f"delays: {problem}; write the delay inside the formula.")
     _require_count("delays", depth * len(names))
     return tuple(delayed_name(name, d) for d in range(1, depth + 1) for name in names)
 
@@ -120,30 +117,13 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     >>> radial(["position", "velocity"], [[0.5, 0]], [0.1, 2])
     ('exp(-(((position - 0.5)/0.1)**2 + (velocity/2)**2)/2)',)
     """
-    lengths, centres = _scales("radial", length, len(names)), _finite("radial: centres", centres)
+    lengths, centres = np.asarray(length, dtype=float), _finite("radial: centres", centres)
+    if lengths.shape not in ((), (len(names),)):
+        raise ConfigError(f"radial: length = {length} should be one number, or {len(names)}, one for each quantity.")
     if centres.shape[1] != len(names) or not len(centres):
         raise ConfigError(f"radial: centres should have the shape (n, {len(names)}), found shape {centres.shape}.")
+    lengths = np.broadcast_to(lengths, (len(names),))
     return tuple(f"exp(-({_squared_distance(names, centre, lengths)})/2)" for centre in centres)
-
-
-@checked
-def fourier_features(names: Names, n: Count, length: Lengths, seed: int) -> Formulas:
-    """Return random Fourier features ``sqrt(2/n)*cos(w*q + b)``, whose inner product tends to the Gaussian kernel.
-
-    The kernel is ``exp(-s**2/2)`` with the scaled distance s, as in `radial`, whose other parameters it has too.
-
-    Source: A. Rahimi and B. Recht, "Random features for large-scale kernel machines", NeurIPS 20, 2007.
-
-    >>> from kros.lifting import fourier_features
-    >>> len(fourier_features(["angle", "rate"], n=20, length=[0.5, 2.0], seed=0))
-    20
-    """
-    rng = np.random.default_rng(seed)
-    frequencies = rng.standard_normal(size=(n, len(names))) / _scales("fourier_features", length, len(names))
-    shifts = rng.uniform(0, 2 * np.pi, size=n)
-    size, inner = number(np.sqrt(2 / n)), [wrapped(name) for name in names]
-    angles = (" + ".join(f"({number(w)})*{q}" for w, q in zip(row, inner, strict=True)) for row in frequencies)
-    return tuple(f"{size}*cos({angle} + {number(b)})" for angle, b in zip(angles, shifts, strict=True))
 
 
 @checked
@@ -156,28 +136,20 @@ def kmeans_centres(data: Any, n: Count, seed: int, starts: Count = 8) -> Array:
     >>> sorted(kmeans_centres([[0.0], [0.2], [9.0], [9.2]], n=2, seed=0).round(9).ravel().tolist())
     [0.1, 9.1]
     """
-    from scipy.cluster.vq import ClusterError, kmeans2
+    from scipy.cluster.vq import kmeans
 
     data = _finite("kmeans_centres: data", data)
-    distinct = len(np.unique(data, axis=0))
-    if distinct < n:
-        raise ConfigError(f"kmeans_centres: {n} clusters need as many different samples, found {distinct}.")
     spread = np.where(np.ptp(data, axis=0) > 0, data.std(axis=0), 1.0)
-    rng, scaled, best = np.random.default_rng(seed), data / spread, (np.inf, data[:0])
-    for _ in range(starts):
-        with suppress(ClusterError):  # this start has an empty cluster
-            means, label = kmeans2(scaled, n, iter=100, minit="++", missing="raise", rng=rng)
-            best = min(best, (float(np.sum((scaled - means[label]) ** 2)), means * spread), key=lambda end: end[0])
-    if not len(best[1]):
-        raise ConfigError(f"kmeans_centres: in {starts} starts one of {n} clusters was empty; ask for fewer.")
-    return np.asarray(best[1])
+    means, _ = kmeans(data / spread, n, iter=starts, rng=np.random.default_rng(seed))
+    if len(means) < n:
+        raise ConfigError(f"kmeans_centres: the data have {len(means)} clusters, not {n}; ask for fewer.")
+    return np.asarray(means * spread)
 
 
 KINDS: dict[str, Callable[..., Any]] = {
     "harmonics": harmonics,
     "polynomials": polynomials,
     "radial": radial,
-    "fourier": fourier_features,
     "delays": delays,
 }
 
@@ -228,13 +200,6 @@ def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> st
         offset = wrapped(name) if c == 0 else f"({wrapped(name)} {'-' if c > 0 else '+'} {number(abs(c))})"
         terms.append(f"({offset}/{number(scale)})**2" if scale != 1 else f"{offset}**2")
     return " + ".join(terms)
-
-
-def _scales(kind: str, length: float | Sequence[float], n: int) -> Array:
-    lengths = np.asarray(length, dtype=float)
-    if lengths.shape not in ((), (n,)):
-        raise ConfigError(f"{kind}: length = {length} should be one number, or {n}, one for each quantity.")
-    return np.broadcast_to(lengths, (n,))
 
 
 def _finite(what: str, values: Any) -> Array:

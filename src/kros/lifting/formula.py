@@ -207,18 +207,17 @@ class TooCostlyError(ConfigError):
 
 def require_size(tree: ast.AST) -> None:
     """Refuse a tree with too many nodes, or too deep; without recursion, which it may be too deep for."""
-    todo: list[tuple[ast.AST, int, Any]] = [(tree, 0, None)]
-    count = 0
+    todo, count = list[tuple[ast.AST, int, Any]]([(tree, 0, None)]), 0
     while todo:
         node, depth, chain = todo.pop()
         if isinstance(node, ast.expr):
             count += 1
             kind = next((c for c in _CHAINS if isinstance(node, ast.BinOp) and isinstance(node.op, c)), None)
             depth += not (isinstance(node, ast.Name | ast.Constant) or (kind is not None and kind is chain))
-            if count > MAX_NODES or depth > MAX_DEPTH:
-                many = f"more than {MAX_NODES} numbers, names and operators"
-                problem = f"has {many}" if count > MAX_NODES else f"is nested more than {MAX_DEPTH} deep"
-                raise TooCostlyError(f"{problem}; split it into several functions.")
+            if count > MAX_NODES:
+                raise TooCostlyError(f"has more than {MAX_NODES} numbers, names and operators; split it.")
+            if depth > MAX_DEPTH:
+                raise TooCostlyError(f"is nested more than {MAX_DEPTH} deep; split it into several functions.")
             chain = kind
         todo += [(child, depth, chain) for child in ast.iter_child_nodes(node)]
 

@@ -24,8 +24,7 @@ from ..core.errors import ConfigError, DimensionError
 from .formula import Formula, base_and_delay, require_text
 from .intervals import Box, slope_bounds_of
 from .program import Program
-from .separation import FormulaSeparation
-from .window import Window
+from .window import FormulaSeparation, Window
 
 Array = npt.NDArray[np.float64]
 Parameters = Mapping[str, npt.ArrayLike]
@@ -57,14 +56,12 @@ class Lifting:
     def __post_init__(self) -> None:
         """Refuse what cannot be lifted."""
         everything = (*self.states, *self.parameters, *self.inputs)
-        clash = {name for name in everything if everything.count(name) > 1}
-        if clash:
+        if clash := {name for name in everything if everything.count(name) > 1}:
             raise ConfigError(f"Lifting: names of states, parameters and inputs must differ; rename {clash}.")
         _refuse_repeated(self.formulas, self.states)
         _refuse_repeated(self.input_formulas, self.inputs)
         for formula in self.formulas:
-            present = sorted(formula.used & set(self.inputs))
-            if present:
+            if present := sorted(formula.used & set(self.inputs)):
                 problem = f"{formula.text!r} reads the present input {', '.join(present)}"
                 raise ConfigError(f"Lifting: {problem}; make it an input function, or read {present[0]}[-1].")
             if not formula.used - set(self.parameters):
@@ -82,14 +79,10 @@ class Lifting:
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Lifting:
         """Rebuild a lifting from ``states``, ``lifting``, ``parameters`` and what `extension` gave."""
-        return cls(
-            tuple(content["states"]),
-            tuple(content["lifting"]),
-            tuple(content["parameters"]),
-            tuple(content.get("lifting_inputs", ())),
-            tuple(content.get("input_functions", ())),
-            tuple((name, float(size)) for name, size in content.get("sizes", ())),
-        )
+        names = ("states", "lifting", "parameters", "lifting_inputs", "input_functions")
+        sizes = tuple((name, float(size)) for name, size in content.get("sizes", ()))
+        states, functions, parameters, inputs, input_functions = (tuple(content.get(name, ())) for name in names)
+        return cls(states, functions, parameters, inputs, input_functions, sizes)
 
     def extension(self) -> dict[str, Any]:
         """Return what an artifact has to hold besides states, functions and parameters; nothing for a plain lifting."""
@@ -191,37 +184,33 @@ class Lifting:
     def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
         """Return the values of all parameters, refusing to go on where one is missing."""
         given = parameters if parameters is not None else {}
-        missing = [name for name in self.parameters if name not in given]
-        if missing:
+        if missing := [name for name in self.parameters if name not in given]:
             problem = f"parameter values for {missing} are missing, found {sorted(given)}"
             raise DimensionError(f"Lifting: {problem}; calibrate the unit first.")
         return {name: np.asarray(given[name], dtype=float) for name in self.parameters}
 
-    def slopes(self, x: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the lifted functions by every entry of the window, shape (..., p, n_window)."""
-        return self._slopes(self.window.names, x, parameters)
-
-    def parameter_slopes(self, x: npt.ArrayLike, parameters: Parameters, name: str) -> Array:
-        """Return the derivative of the lifted functions by one of the parameters, shape (..., p)."""
-        return self._slopes((name,), x, parameters)[..., 0]
-
-    def input_slopes(self, u: npt.ArrayLike, window: npt.ArrayLike, parameters: Parameters | None = None) -> Array:
-        """Return the derivative of the input functions by every entry of the window, shape (..., r, n_window)."""
-        u = np.asarray(u, dtype=float)
-        self.window.require_inputs(u)
-        return self._slopes(self.window.names, window, parameters, u)
-
-    def _slopes(
-        self, names: tuple[str, ...], x: npt.ArrayLike, parameters: Parameters | None, u: Array | None = None
+    def slopes(
+        self,
+        x: npt.ArrayLike,
+        parameters: Parameters | None = None,
+        names: tuple[str, ...] | None = None,
+        u: npt.ArrayLike | None = None,
     ) -> Array:
-        """Return derivatives by some names of the lifted functions, or with inputs of the input functions."""
-        x, formulas = self._windows(x), self.formulas if u is None else self.input_formulas
+        """Return the derivative of the lifted functions, with inputs that of the input functions, on windows.
+
+        The shape is (..., p, n), by the entries of the window or by the names of some of them and of parameters.
+        """
+        x, names, inputs = (
+            self._windows(x),
+            names or self.window.names,
+            None if u is None else np.asarray(u, dtype=float),
+        )
+        formulas = self.formulas if inputs is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
-        if (names, u is None) not in self._derivatives:
+        if (names, formulas) not in self._derivatives:
             trees = [formula.derivative(name) for formula in formulas for name in names]
-            self._derivatives[names, u is None] = Program.of(trees)
-        values = self._values(parameters, x, x[..., self.n_states :], u)
-        self._derivatives[names, u is None].fill(slopes, values)
+            self._derivatives[names, formulas] = Program.of(trees)
+        self._derivatives[names, formulas].fill(slopes, self._values(parameters, x, x[..., self.n_states :], inputs))
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:
@@ -252,7 +241,7 @@ class Lifting:
         return Program.of(functions), Program.of(gamma)
 
     @cached_property
-    def _derivatives(self) -> dict[tuple[tuple[str, ...], bool], Program]:
+    def _derivatives(self) -> dict[tuple[tuple[str, ...], tuple[Formula, ...]], Program]:
         return {}
 
     @cached_property
@@ -260,8 +249,7 @@ class Lifting:
         return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
 
     def _windows(self, x: npt.ArrayLike) -> Array:
-        x = np.asarray(x, dtype=float)
-        names = self.window.names
+        x, names = np.asarray(x, dtype=float), self.window.names
         if x.shape[-1:] != (len(names),):
             raise DimensionError(f"Lifting: expected {len(names)} entries {names} last, found shape {x.shape}.")
         return x
@@ -273,8 +261,7 @@ class Lifting:
         values = self.parameter_values(parameters)
         values |= {name: x[..., i] for i, name in enumerate(self.states) if name in self._read}
         if earlier is None and self.window.depths:
-            problem = f"the earlier values {self.window.earlier} are missing"
-            raise DimensionError(f"Lifting: {problem}; pass them, or lift windows.")
+            raise DimensionError(f"Lifting: {self.window.earlier} are missing; pass earlier values, or lift windows.")
         for names, columns in ((self.window.earlier, earlier), (self.inputs, u)):
             if columns is not None:
                 values |= {name: columns[..., i] for i, name in enumerate(names)}
@@ -286,11 +273,11 @@ def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) 
 
     names, known = {sp.Symbol(name, real=True): name for name in originals}, dict[Any, str]()
     for formula in formulas:
-        if formula.written in names:
-            original = names[formula.written]
-            raise ConfigError(f"Lifting: {formula.text!r} is {original!r} itself, which is there already; remove it.")
-        if formula.written in known:
-            other = known[formula.written]
-            problem = f"functions repeat one of them, {formula.text!r} is {other!r}"
-            raise ConfigError(f"Lifting: {problem}; list every function once.")
-        known[formula.written] = formula.text
+        text = formula.text
+        if original := names.get(formula.written):
+            raise ConfigError(f"Lifting: {text!r} is {original!r} itself, which is there already; remove it.")
+        if other := known.get(formula.written):
+            raise ConfigError(
+                f"Lifting: functions repeat one of them, {text!r} is {other!r}; list every function once."
+            )
+        known[formula.written] = text

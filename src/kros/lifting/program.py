@@ -181,6 +181,11 @@ class Precision:
         """What the names of functions in ``math.h`` end with."""
         return "f" if self.type == "float" else ""
 
+    @property
+    def largest(self) -> float:
+        """Largest number."""
+        return float(np.finfo(np.float32 if self.type == "float" else np.float64).max)
+
     def literal(self, value: float) -> str:
         """Return a literal that is read as the same number of this precision."""
         text = f"{np.float32(value):.9g}" if self.type == "float" else f"{float(value):.17g}"

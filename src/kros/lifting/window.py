@@ -1,23 +1,26 @@
-"""Delays: which earlier values a lifting reads, and how they move on from sample to sample.
+"""What a lifting reads of recordings: earlier values, and functions that hold no parameter of a unit.
 
 A window is what a lifting is evaluated on: the present states, then the earlier values that its formulas name,
 
     w_k = [x_k, q_{k-1}, ..., q_{k-d}, ...]        for every delayed quantity q, a state or an input, to its depth d
 
-At the next sample each earlier value takes the place behind it; the shift is exact, no model is asked.
+At the next sample each earlier value takes the place behind it; the shift is exact, no model is asked. Formulas are
+combinations of parameter-free ones, ``sigma(w; q) = M(q) g(w)``, so that data are read once for all values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
-from .formula import base_and_delay, delayed_name
+from ..core.errors import ConfigError, DataError, DimensionError
+from .formula import MAX_TERMS, Formula, base_and_delay, count_terms, delayed_name
+from .program import Program
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -90,28 +93,112 @@ class Window:
         if not self.depths:
             return x
         self.require(x.shape[-2])
-        columns = {name: x[..., i] for i, name in enumerate(self.states)}
-        columns |= {name: u[..., i] for i, name in enumerate(self.inputs)}
+        columns, names = np.concatenate([x, u], axis=-1), (*self.states, *self.inputs)
         h, end = self.history, x.shape[-2]
-        earlier = [columns[q][..., h - d : end - d] for q, d in self.delayed]
+        earlier = [columns[..., h - d : end - d, names.index(q)] for q, d in self.delayed]
         return np.concatenate([x[..., h:, :], np.stack(earlier, axis=-1)], axis=-1)
 
     def require(self, n_samples: int, beyond: int = 0) -> None:
         """Refuse a recording that is shorter than the history and `beyond` samples after its first window."""
         needed = self.history + 1 + beyond
         if n_samples < needed:
-            name, depth = max(self.depths, key=lambda item: item[1], default=("", 0))
-            reason = f" for the delay of {depth} in {name!r}" if self.depths else ""
-            problem = f"needs at least {needed} samples{reason}, found {n_samples}"
+            delays = "".join(f" for the delay of {d} in {q!r}" for q, d in self.depths if d == self.history)
+            problem = f"needs at least {needed} samples{delays}, found {n_samples}"
             raise DataError(f"Lifting a recording: {problem}; leave the episode out or use shorter delays.")
 
     def require_inputs(self, u: Array) -> None:
         """Refuse inputs that are not those the formulas were written for."""
         if self.inputs and u.shape[-1] != len(self.inputs):
-            needed = f"{len(self.inputs)} inputs {self.inputs} on the last axis"
-            raise DimensionError(f"Lifting: expected {needed}, found shape {u.shape}.")
+            raise DimensionError(f"Lifting: expected {len(self.inputs)} inputs {self.inputs} last, found {u.shape}.")
 
     def values(self, window: Array, u: Array | None = None) -> Mapping[str, Array]:
         """Return the columns by name, the present inputs with them where they are given."""
         named = {name: window[..., i] for i, name in enumerate(self.names)}
         return named if u is None else named | {name: u[..., i] for i, name in enumerate(self.inputs)}
+
+
+@dataclass(frozen=True)
+class FormulaSeparation:
+    """Lifted functions written as ``sigma(w; q) = M(q) g(w)``."""
+
+    window: Window  # what ``w`` holds
+    parameters: tuple[str, ...]
+    basis: tuple[Any, ...]  # SymPy trees of ``g``
+    terms: tuple[tuple[tuple[int, Any], ...], ...]  # of each function: columns of ``g`` and coefficients' trees
+
+    @classmethod
+    def of(cls, formulas: Sequence[Formula], window: Window, parameters: tuple[str, ...]) -> FormulaSeparation:
+        """Separate every formula; one that does not separate raises ConfigError."""
+        import sympy as sp
+
+        symbols = {sp.Symbol(name, real=True) for name in parameters}
+        basis: dict[Any, int] = {}
+        pairs = [_terms(formula, symbols) for formula in formulas]
+        rows = tuple(tuple((basis.setdefault(g, len(basis)), coefficient) for coefficient, g in row) for row in pairs)
+        return cls(window, parameters, tuple(basis), rows)
+
+    @cached_property
+    def _program(self) -> Program:
+        return Program.of(self.basis)
+
+    def evaluate(self, window: Array, u: Array | None = None) -> Array:
+        """Return the parameter-free functions at windows (..., n_window), and inputs if given; (..., n_basis)."""
+        out = np.moveaxis(np.empty((len(self.basis), *window.shape[:-1])), 0, -1)  # a function's values side by side
+        self._program.fill(out, self.window.values(window, u))
+        return out
+
+    def matrix(self, parameters: Mapping[str, npt.ArrayLike]) -> Array:
+        """Return M(q) for parameter values of any common shape, shape (..., p, n_basis)."""
+        values = {name: np.asarray(parameters[name], dtype=float) for name in self.parameters}
+        shape = np.broadcast_shapes(*(v.shape for v in values.values()))
+        matrix = np.zeros((*shape, len(self.terms), len(self.basis)))
+        for i, row in enumerate(self.terms):
+            for j, coefficient in row:
+                matrix[..., i, j] += Program.of([coefficient]).run(values)[0]
+        return matrix
+
+
+def _terms(formula: Formula, parameters: set[Any]) -> list[tuple[Any, Any]]:
+    """Pairs of a coefficient of parameters and a function without them."""
+    import sympy as sp
+
+    if not formula.expression.free_symbols & parameters:
+        return [(sp.Integer(1), formula.expression)]
+    _require_short(formula, formula.expression)
+    apart = _split_angles(formula.expression, parameters)
+    _require_short(formula, apart)
+    pairs = []
+    for term in sp.Add.make_args(sp.expand(apart, trig=False)):
+        coefficient, function = term.as_independent(*(term.free_symbols - parameters), as_Add=False)
+        if function.free_symbols & parameters:
+            problem = f"parameters {tuple(sorted(p.name for p in parameters))} must enter as factors or as phases"
+            raise ConfigError(f"Lifting function {formula.text!r}: {problem} of sin and cos.")
+        pairs.append((coefficient, function))
+    return pairs
+
+
+def _require_short(formula: Formula, expression: Any) -> None:
+    count = count_terms(expression)
+    if count > MAX_TERMS:
+        problem = f"multiplied out to separate its parameters it has up to {count:.3g} terms"
+        raise ConfigError(f"Lifting function {formula.text!r}: {problem}, at most {MAX_TERMS} are kept.")
+
+
+def _split_angles(expression: Any, parameters: set[Any]) -> Any:
+    """Apply the angle sum formulas to ``sin(data + parameter)`` and ``cos(data + parameter)`` only."""
+    import sympy as sp
+
+    def split(argument: Any) -> tuple[Any, Any]:
+        terms = sp.Add.make_args(sp.expand(argument) if argument.free_symbols & parameters else argument)
+        phase = [term for term in terms if term.free_symbols and term.free_symbols <= parameters]
+        return sp.Add(*(term for term in terms if term not in phase)), sp.Add(*phase)
+
+    def sine(argument: Any) -> Any:
+        data, phase = split(argument)
+        return sp.sin(data) * sp.cos(phase) + sp.cos(data) * sp.sin(phase)
+
+    def cosine(argument: Any) -> Any:
+        data, phase = split(argument)
+        return sp.cos(data) * sp.cos(phase) - sp.sin(data) * sp.sin(phase)
+
+    return expression.replace(sp.sin, sine).replace(sp.cos, cosine)

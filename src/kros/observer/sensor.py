@@ -51,6 +51,10 @@ class Sensor(Settings):
         """Return the variance of noise, rounding, and jitter of a signal of RMS `step` from sample to sample."""
         return self.noise**2 + (self.resolution or 0.0) ** 2 / 12 + (self.jitter_samples * step) ** 2
 
+    def no_finer_than(self, resolution: float) -> Sensor:
+        """Return the same with at least the resolution that recordings show."""
+        return self.model_copy(update={"resolution": max(self.resolution or 0.0, resolution)})
+
     def in_unit(self, size: float) -> Sensor:
         """Return the same for a channel that is divided by a size."""
         resolution = None if self.resolution is None else self.resolution / size

@@ -72,7 +72,7 @@ class PhaseLockedLoop:
         nu = np.where(np.isfinite(y), steps.innovation(y), 0.0)
         slopes, by_value = (
             steps.lifting.slopes(x, values)[..., :n],
-            steps.lifting.parameter_slopes(x, values, self.name),
+            steps.lifting.slopes(x, values, (self.name,))[..., 0],
         )
         steps.step(y, u)
         if self.observer.bank is not None:  # measurements take the place of estimates

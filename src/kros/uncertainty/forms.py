@@ -21,21 +21,16 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from enum import Enum
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
+from ..core.errors import DataError, DimensionError
 from ..core.settings import member
-from ..core.small_matrices import (
-    entries_first,
-    entries_last,
-    multiply,
-    pseudo_inverse_first,
-    sigma_max,
-)
+from ..core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
 from .settings import SET
 
 Array = npt.NDArray[Any]
@@ -177,13 +172,26 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     return E, Gp - rebuild(form, G, E), regular
 
 
-def check_responses(responses: npt.ArrayLike) -> Array:
-    """Return responses as an array, or say which axes are missing."""
-    G = np.asarray(responses)
-    if G.ndim != 4 or 0 in G.shape:
-        raise DimensionError(
-            f"Responses: needs axes (unit, frequency, output, input), none empty; found shape {G.shape}."
-        )
+def check_responses(responses: Any, ids: Sequence[str] | None = None, freqs_hz: Array | None = None) -> Array:
+    """Return responses (unit, frequency, p, m), or say which one is not like the first, or not finite."""
+    arrays = [np.asarray(one) for one in responses]
+    names = ids or [str(k) for k in range(len(arrays))]
+    for name, one in zip(names, arrays, strict=False):
+        if one.shape != arrays[0].shape:
+            both = f"{name!r} has the shape {one.shape}, that of {names[0]!r} {arrays[0].shape}"
+            raise DimensionError(f"Responses: that of {both}; bring all to the same frequencies and channels.")
+    G = np.asarray(arrays)
+    if G.ndim != 4 or 0 in G.shape or len(names) != len(G):
+        problem = "needs axes (unit, frequency, output, input), none empty, and a name for each unit"
+        raise DimensionError(f"Responses: {problem}; found shape {G.shape} and {len(names)} names.")
+    if freqs_hz is not None and len(freqs_hz) != G.shape[1]:
+        raise DimensionError(f"Responses: {G.shape[1]} frequencies need as many freqs_hz, found {len(freqs_hz)}.")
+    finite = np.isfinite(G).all(axis=(2, 3))
+    if not finite.all():
+        unit, row = np.argwhere(~finite)[0]
+        place = f"row {row}" if freqs_hz is None else f"{freqs_hz[row]:.6g} Hz"
+        problem = f"that of unit {names[unit]!r} has NaN or infinity at {place}, {int((~finite).sum())} in all"
+        raise DataError(f"Responses: {problem}; leave the unit out, or look at its model.")
     return G
 
 
@@ -198,9 +206,5 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
 
 def _inverse(matrices: Array) -> Array:
     """Inverses, NaN where a matrix is singular."""
-    try:
-        return np.linalg.inv(matrices)
-    except np.linalg.LinAlgError:
-        regular = np.linalg.cond(matrices) < 1 / np.finfo(float).eps
-        safe = np.where(regular[..., None, None], matrices, np.eye(matrices.shape[-1]))
-        return np.where(regular[..., None, None], np.linalg.inv(safe), np.nan)
+    regular = (np.linalg.cond(matrices) < 1 / np.finfo(float).eps)[..., None, None]
+    return np.where(regular, np.linalg.inv(np.where(regular, matrices, np.eye(matrices.shape[-1]))), np.nan)

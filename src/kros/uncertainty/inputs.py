@@ -3,43 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import Field
 
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
+from ..core.settings import Settings
+from .forms import check_responses
 
 Array = npt.NDArray[Any]
 
 
-@dataclass(frozen=True, kw_only=True)
-class Options:
+class Options(Settings):
     """Options of `quantify` for systems and responses, described there."""
 
-    unit_ids: Sequence[str] | None = None
-    output_scale: npt.ArrayLike | None = None
-    input_scale: npt.ArrayLike | None = None
+    unit_ids: tuple[str, ...] | None = None
+    output_scale: Any = None
+    input_scale: Any = None
     nominal: Any = None
-    max_order: int = 4
-    tolerance_db: float = 1.0
-    sample_period_s: float = 0.0
-
-    @classmethod
-    def of(cls, options: dict[str, Any]) -> Options:
-        """Check options by name, order and tolerance."""
-        unknown = sorted(set(options) - set(cls.__dataclass_fields__))
-        if unknown:
-            raise ConfigError(f"Quantify: unknown {', '.join(unknown)}; known: {', '.join(cls.__dataclass_fields__)}.")
-        read = cls(**options)
-        if not (isinstance(read.max_order, int | np.integer) and read.max_order >= 0 and read.tolerance_db >= 0):
-            raise ConfigError(
-                f"Quantify: max_order = {read.max_order!r} should be a whole number from 0, tolerance_db = "
-                f"{read.tolerance_db} not negative."
-            )
-        return read
+    max_order: int = Field(4, ge=0)
+    tolerance_db: float = Field(1.0, ge=0)
+    sample_period_s: float | None = None
 
     def scales(self, shape: tuple[int, ...]) -> tuple[Array, Array]:
         """Return the ranges of outputs and inputs."""
@@ -72,9 +59,11 @@ def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
     if hasattr(models, "systems") and hasattr(models, "unit_ids"):
         names = ("output_scale", "input_scale", "unit_ids")
         known = {name: getattr(models, name) for name in names if getattr(options, name) is None}
-        options = replace(options, **known)
+        options = options.model_copy(update=known)
         models = models.systems(tuple(options.unit_ids or ()))
     system = stack_systems(models)
+    if not system.dt > 0:
+        raise ConfigError("Quantify: continuous systems have no weights; sample them, control.sample_system does it.")
     require_stable(system, tuple(f"unit {name}" for name in options.ids(system.batch_shape[0])))
     return system, options
 
@@ -83,34 +72,29 @@ def stack_systems(models: Any) -> StateSpace:
     """Return a batch from a batch, or from a sequence of systems with the same outputs, inputs and sampling period."""
     if not isinstance(models, StateSpace):
         if isinstance(models, str) or not isinstance(models, Iterable):
+            remedy = "give a list of systems, an array of responses, or the result of kros.identify"
             raise DimensionError(
-                f"Quantify: needs the models of at least two units, found {type(models).__name__}; give a list of "
-                "systems, an array of responses, or the result of kros.identify."
+                f"Quantify: needs models of at least two units, found {type(models).__name__}; {remedy}."
             )
         systems = [StateSpace.of(system) for system in models]
         kinds = {(s.n_outputs, s.n_inputs, s.dt) for s in systems}
         if len(kinds) != 1:
             problem = f"Quantify: units differ in (outputs, inputs, sampling period): {sorted(kinds)}"
             raise DimensionError(f"{problem}; identify them alike, and give at least two.")
-        n_states = max(s.n_states for s in systems)
-        systems = [_padded(s, n_states) for s in systems]
-        A, B, C, D = (np.stack([getattr(s, x) for s in systems]) for x in "ABCD")
-        models = StateSpace(A, B, C, D, systems[0].dt)
+        largest, dt = max(s.n_states for s in systems), systems[0].dt
+        padded = [_padded(s, largest - s.n_states) for s in systems]
+        A, B, C, D = (np.stack(matrices) for matrices in zip(*padded, strict=True))
+        models = StateSpace(A, B, C, D, dt)
     if len(models.batch_shape) != 1:
         problem = f"Quantify: needs a batch of models with one unit axis, found the batch shape {models.batch_shape}"
         raise DimensionError(f"{problem}; stack the units.")
     return models
 
 
-def _padded(system: StateSpace, n_states: int) -> StateSpace:
-    """Add states without input and output, at rest after a sample or as slow as the slowest."""
-    more = n_states - system.n_states
-    A = np.pad(system.A, (0, more))
-    if system.dt == 0 and more:
-        slowest = np.abs(system.poles().real).min() if system.n_states else 1.0
-        A[system.n_states :, system.n_states :] = -max(slowest, np.finfo(float).tiny) * np.eye(more)
+def _padded(system: StateSpace, more: int) -> tuple[Array, Array, Array, Array]:
+    """Return A, B, C, D with further states without input and output, at rest after a sample."""
     B, C = np.pad(system.B, ((0, more), (0, 0))), np.pad(system.C, ((0, 0), (0, more)))
-    return StateSpace(A, B, C, system.D, system.dt)
+    return np.pad(system.A, (0, more)), B, C, system.D
 
 
 def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
@@ -132,55 +116,28 @@ def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
 
 def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
-    count = (len(names),)
-    matrices = (system.A, system.B, system.C, system.D)
-    finite = np.all([np.broadcast_to(np.isfinite(M).all(axis=(-2, -1)), count) for M in matrices], axis=0)
-    if not finite.all():
-        name = names[int(np.argmin(finite))]
-        raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
-    stable = np.broadcast_to(system.is_stable(), count)
-    if stable.all():
-        return
-    first = int(np.argmin(stable))
-    poles = np.broadcast_to(system.poles(), (*count, system.n_states))[first]
-    worst = f"largest real part of a pole {poles.real.max():.6g}"
-    if system.dt > 0:
-        worst = f"spectral radius {np.abs(poles).max():.6f}"
-    problem = f"Quantify: the model of {names[first]} is unstable ({worst}, {int((~stable).sum())} in all)"
-    raise DataError(f"{problem}; identify with more regularisation or leave it out.")
-
-
-def check_response(name: str, response: Array, shape: tuple[int, ...], freqs: Array) -> None:
-    """Raise a `DimensionError` or `DataError` when a response is not like the others, or not finite."""
-    if response.shape != shape:
-        raise DimensionError(f"Quantify: the response of {name!r} should have shape {shape}, found {response.shape}.")
-    finite = np.isfinite(response).all(axis=(1, 2))
-    if not finite.all():
-        at = freqs[int(np.argmin(finite))]
-        raise DataError(
-            f"Quantify: the response of {name!r} has NaN or infinity at {at:.6g} Hz; leave one of both out."
-        )
+    for k, name in enumerate(names):
+        if not all(np.isfinite(M).all() for M in (system[k].A, system[k].B, system[k].C, system[k].D)):
+            raise DataError(f"Quantify: the model of {name} has NaN or infinity; leave it out or identify it again.")
+        if not system[k].is_stable():
+            problem = f"the model of {name} is unstable (spectral radius {system[k].spectral_radius():.6f})"
+            raise DataError(f"Quantify: {problem}; identify with more regularisation or leave it out.")
 
 
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
-    """Return responses (unit, frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
+    """Return responses (frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
     first, nominal = data[0], options.get("nominal")
-    everything = [*data, nominal] if hasattr(nominal, "frdata") else [*data]
-    for k, other in enumerate(everything):
-        name = f"response {k}" if k < len(data) else "the nominal"
+    named = {f"response {k}": one for k, one in enumerate(data)}
+    named |= {"the nominal": nominal} if hasattr(nominal, "frdata") else {}
+    for name, other in named.items():
         if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
-            raise DimensionError(
-                f"Quantify: {name} has other frequencies than the first response; interpolate to one grid."
-            )
-        if other.dt != first.dt or other.frdata.shape != first.frdata.shape:
-            raise DimensionError(
-                f"Quantify: {name} has the shape {other.frdata.shape} and dt = {other.dt}, the first response "
-                f"{first.frdata.shape} and {first.dt}; bring them to one."
-            )
-    if first.dt is True:
-        raise DimensionError("Quantify: the responses have no sampling period (dt = True); give it in seconds.")
-    options["sample_period_s"] = float(first.dt or 0.0)
-    responses = np.array([np.moveaxis(np.asarray(one.frdata), -1, 0) for one in everything])
-    if len(everything) > len(data):
-        options["nominal"] = responses[-1]
-    return responses[: len(data)], np.asarray(first.omega, float) / (2 * np.pi)
+            problem = f"{name} has other frequencies than the first response"
+            raise DimensionError(f"Quantify: {problem}; interpolate to one grid.")
+        if other.dt != first.dt:
+            raise DimensionError(f"Quantify: {name} has dt = {other.dt}, the first response {first.dt}.")
+    if first.dt and first.dt is not True:
+        options["sample_period_s"] = float(first.dt)
+    responses = [np.moveaxis(np.asarray(one.frdata), -1, 0) for one in named.values()]
+    if len(responses) > len(data):
+        options["nominal"] = responses.pop()
+    return check_responses(responses), np.asarray(first.omega, float) / (2 * np.pi)

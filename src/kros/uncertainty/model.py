@@ -18,9 +18,8 @@ import numpy.typing as npt
 from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
-from .weights.cover import Cover
+from .weights.cover import Cover, Weight
 from .weights.proof import Method
-from .weights.weight import Weight
 
 Array = npt.NDArray[Any]
 
@@ -76,7 +75,6 @@ class ResponseUncertainty(Uncertainty):
     nominal_response : ndarray, shape (frequency, p, m), complex
         In physical units.
     sample_period_s : float, s
-        Zero for continuous time.
     certificate : str
         Where the bound holds.
 
@@ -142,18 +140,16 @@ class UncertainModel(Uncertainty):
     def save(self, folder: Path) -> None:
         """Write ``arrays.npz`` and ``uncertain_model.json``."""
         arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
+        arrays |= _packed("nominal", self.nominal_system)
         arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
-        arrays |= {f"nominal_{x}": getattr(self.nominal_system, x) for x in "ABCD"}
-        arrays |= _pack_weight("weight", self.weight) | {"cover_left": self.cover.left, "cover_right": self.cover.right}
-        content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS} | {
-            "sample_period_s": self.sample_period_s,
-            "nominals": {form.value: unit for form, unit in self.nominals.items()},
-            "weight": {name: getattr(self.weight, name) for name in _OF_WEIGHT},
-            "remainder": None,
-        }
-        if self.remainder is not None:
-            arrays |= _pack_weight("remainder", self.remainder)
-            content["remainder"] = {name: getattr(self.remainder, name) for name in _OF_WEIGHT}
+        arrays |= {"cover_left": self.cover.left, "cover_right": self.cover.right}
+        content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS}
+        content |= {"sample_period_s": self.sample_period_s, "nominals": {f.value: u for f, u in self.nominals.items()}}
+        for name in _WEIGHTS:
+            weight = getattr(self, name)
+            content[name] = None if weight is None else {fact: getattr(weight, fact) for fact in _OF_WEIGHT}
+            if weight is not None:
+                arrays |= _packed(f"{name}_left", weight.left) | _packed(f"{name}_right", weight.right)
         save_artifact(Path(folder), "uncertain_model", content, arrays)
 
     @classmethod
@@ -164,24 +160,22 @@ class UncertainModel(Uncertainty):
         axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
         check_shapes(arrays, axes, {}, Path(folder))
         dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
-        weight, cover = (
-            _unpack_weight("weight", content["weight"], arrays, dt),
-            Cover(arrays["cover_left"], arrays["cover_right"]),
-        )
+
+        def system(name: str) -> StateSpace:
+            return StateSpace(**{x: arrays[f"{name}_{x}"] for x in "ABCD"}, dt=dt)
+
         facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
-        if content["remainder"] is not None:
-            facts["remainder"] = _unpack_weight("remainder", content["remainder"], arrays, dt)
         facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
-        return cls(
-            nominal_system=_unpack_system("nominal", arrays, dt),
-            cover=cover,
-            weight=weight,
-            **facts,
-        )
+        for name in (name for name in _WEIGHTS if content[name] is not None):
+            own = content[name] | {"method": Method(content[name]["method"])}
+            own |= {side: tuple(own[side]) for side in ("left_orders", "right_orders")}
+            facts[name] = Weight(system(f"{name}_left"), system(f"{name}_right"), **own)
+        return cls(nominal_system=system("nominal"), cover=Cover(arrays["cover_left"], arrays["cover_right"]), **facts)
 
 
 _ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
+_WEIGHTS = ("weight", "remainder")
 _FACTS = ("form", "unit_ids", "nominal", "nominal_id")
 _OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "method")
 
@@ -195,17 +189,5 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
 
 
-def _unpack_system(name: str, arrays: dict[str, Array], dt: float) -> StateSpace:
-    A, B, C, D = (arrays[f"{name}_{x}"] for x in "ABCD")
-    return StateSpace(A, B, C, D, dt)
-
-
-def _pack_weight(name: str, weight: Weight) -> dict[str, Array]:
-    sides = (("left", weight.left), ("right", weight.right))
-    return {f"{name}_{side}_{x}": getattr(system, x) for side, system in sides for x in "ABCD"}
-
-
-def _unpack_weight(name: str, facts: dict[str, Any], arrays: dict[str, Array], dt: float) -> Weight:
-    orders = {side: tuple(facts[side]) for side in ("left_orders", "right_orders")}
-    left, right = (_unpack_system(f"{name}_{side}", arrays, dt) for side in ("left", "right"))
-    return Weight(left, right, **facts | orders | {"method": Method(facts["method"])})
+def _packed(name: str, system: StateSpace) -> dict[str, Array]:
+    return {f"{name}_{x}": getattr(system, x) for x in "ABCD"}

@@ -28,7 +28,7 @@ from ..core.errors import DataError
 from ..core.small_matrices import sigma_max, squared
 from ..identify import ModelSamples
 from .forms import Form, residual
-from .settings import OUTLIER, SET
+from .settings import OUTLIER
 
 Array = npt.NDArray[Any]
 
@@ -65,17 +65,17 @@ def noise_share(
     if units < 2 or draws < 2:
         raise DataError(f"Noise share: needs at least two units and two draws of each, found {units} and {draws}.")
     parts = (models.estimate.A, models.estimate.B, models.samples.A, models.samples.B)
-    finite = np.all([np.isfinite(part).reshape(units, -1).all(axis=1) for part in parts], axis=0)
-    if not finite.all():
-        unit = f"unit {models.unit_ids[int(finite.argmin())]} has a model or a draw that is not finite"
-        raise DataError(f"Noise share: {unit}; leave the unit out, or raise alpha.")
+    for unit, *matrices in zip(models.unit_ids, *parts, strict=True):
+        if not all(np.isfinite(M).all() for M in matrices):
+            problem = f"unit {unit} has a model or a draw that is not finite"
+            raise DataError(f"Noise share: {problem}; leave the unit out, or raise alpha.")
     G = models.estimate.responses(freqs_hz, sample_period_s) / scale  # (unit, frequency, n, m)
     noise, step = np.zeros(len(freqs_hz)), max(1, OUTLIER.at_once // (draws * n * max(n, m)))
     for row in range(units):
         for part in (slice(start, start + step) for start in range(0, len(freqs_hz), step)):
             drawn = models.responses(row, freqs_hz[part], sample_period_s) / scale  # (draw, frequency, n, m)
             noise[part] += _mean_square(residual(form, drawn, np.roll(drawn, 1, axis=0))) / units
-    nominals = np.unique(np.linspace(0, units - 1, min(units, SET.nominals)).round().astype(int))
+    nominals = np.unique(np.linspace(0, units - 1, min(units, OUTLIER.nominals)).round().astype(int))
     between = np.mean([_mean_square(residual(form, G[k], G)) for k in nominals], axis=0)
     largest = sigma_max(residual(form, G[nominal], G)).max(axis=0)
     return NoiseShare(freqs_hz, between * units / (units - 1), noise, largest)

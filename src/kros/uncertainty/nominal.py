@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
 from ..core.small_matrices import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
@@ -44,7 +43,9 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     ConfigError
         When the form is unknown.
     DimensionError
-        When responses do not have these axes, or have NaN.
+        When responses do not have these axes.
+    DataError
+        When one is not finite.
 
     Examples
     --------
@@ -56,9 +57,6 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
     (1, [7.0])
     """
     form, G = as_form(form), check_responses(responses)
-    broken = ~np.isfinite(G).all(axis=(1, 2, 3))
-    if broken.any():
-        raise DimensionError(f"Nominal: units {np.flatnonzero(broken)[:5]} have NaN or infinity; leave them out.")
     n_units, n_freqs = G.shape[:2]
     step = max(1, SET.at_once // n_freqs)
 
@@ -73,12 +71,5 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
         sizes = np.concatenate([sigma_max(residual(form, G[row], part)) for part in parts])
         return sizes.max(axis=0), sizes.argmax(axis=0)
 
-    search = (n_units, n_freqs), _central(G), bound, against
-    return NominalChoice(*smallest_largest(*search, lambda sizes: sizes.max(axis=-1))[:2])
-
-
-def _central(G: Array) -> int:
-    """Return the unit closest to the mean at a few frequencies, to begin with."""
-    some = G[:, np.linspace(0, G.shape[1] - 1, 8).astype(int)]
-    distance = np.abs(some - some.mean(axis=0)).max(axis=(2, 3))
-    return int(np.argmin((distance / np.maximum(distance.max(axis=0), np.finfo(float).tiny)).max(axis=1)))
+    search = smallest_largest((n_units, n_freqs), 0, bound, against, lambda sizes: sizes.max(axis=-1))
+    return NominalChoice(*search[:2])

@@ -108,24 +108,22 @@ def quantify(
     Parameters
     ----------
     models : IdentifiedModels, ModelSet, systems or responses
-        Of `kros.identify`; or a batch, list or mapping by name of stable systems with `A, B, C, D, dt`, discrete or
-        continuous (``dt = 0``), with as many states as they like; or frequency responses, complex, of shape (unit,
-        frequency, p, m), or objects with `frdata, omega, dt` as python-control has them.
+        Of `kros.identify`; or a batch, list or mapping by name of stable discrete systems with `A, B, C, D, dt`, with
+        as many states as they like; or frequency responses, complex, of shape (unit, frequency, p, m), or objects with
+        `frdata, omega, dt` as python-control has them.
     form : Form or str
         Uncertainty form of the weights; the bounds of all six are reported.
     freqs_hz : array_like, shape (frequency,), Hz, optional
         By default 1000 logarithmic points over the six decades below Nyquist, not below what the longest episode of
-        recordings resolves; of continuous systems from a hundredth of the slowest to ten times the fastest pole. To the
-        grid of continuous systems points up to ten times its end are added; beyond these, residuals count as constant.
-        Arrays of responses need it.
+        recordings resolves. Arrays of responses need it.
     work : Work, optional
         Where models of `kros.identify` are quantified.
     **options
         Of models of `kros.identify`: those of `QuantifySettings`. Of all others: ``unit_ids`` (names),
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
         row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
-        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of arrays of
-        responses; zero for continuous time).
+        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of responses
+        that have none: of measured ones at most half the inverse of the highest frequency).
 
     Returns
     -------
@@ -166,7 +164,7 @@ def quantify(
             raise ConfigError("Quantify: response data bring their own frequencies; drop freqs_hz.")
         models, freqs_hz = read_response_data(models, options)
     bound = bound_responses if isinstance(models, np.ndarray) else bound_systems
-    return bound(models, as_form(form), freqs_hz, Options.of(options))
+    return bound(models, as_form(form), freqs_hz, Options.of(options, "Quantify"))
 
 
 def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, work: Work | None) -> UncertainModels:
@@ -178,18 +176,13 @@ def _quantify_population(models: IdentifiedModels, settings: QuantifySettings, w
         problem = f"Uncertainty: {len(units)} units of {len(models.facts.pooled)} have models, at least two are needed"
         raise IdentificationError(f"{problem}; record more units in the condition that feeds synthesis.")
     nominal = choose_unit(first, units, settings)
-    options = Options(unit_ids=units, nominal=nominal, max_order=settings.max_order, tolerance_db=settings.tolerance_db)
+    same = {"max_order": settings.max_order, "tolerance_db": settings.tolerance_db}
+    options = Options(unit_ids=tuple(units), nominal=nominal, **same)
     every = [(one, Form(settings.form), one.frequencies(settings.n_freqs)) for one in map(models.models, models.kinds)]
     tasks = [partial(bound_systems, *one, options) for one in every]
     sets = dict(zip(models.kinds, (work or Work()).run("quantify", tasks), strict=True))
-    return UncertainModels(
-        models=models,
-        nominal=nominal,
-        worst_off_nominal=worst_off_nominal(first, sets[models.kinds[0]]),
-        sets=sets,
-        scores=tuple(scores),
-        outliers=outliers,
-    )
+    worst_off = worst_off_nominal(first, sets[models.kinds[0]])
+    return UncertainModels(models, nominal, worst_off, sets, tuple(scores), outliers)
 
 
 def choose_unit(models: ModelSet, units: list[str], settings: QuantifySettings) -> str:

@@ -54,7 +54,6 @@ class FitRule:
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
     rounds: int = 5  # fits, each with the frequencies and units missed by the one before
     deficit: float = 1.02  # ratio up to which a weight is lifted; beyond it is fitted again
-    block: int = 200  # units at once: of more, those that decide are fitted, all are checked
 
 
 @dataclass(frozen=True)
@@ -89,21 +88,6 @@ class ProofRule:
 
 
 @dataclass(frozen=True)
-class BandRule:
-    """Energies in bands and their cover, which holds in any case: only its size depends on these numbers."""
-
-    bands: int = 96
-    rounding: float = 1e-13  # of a channel's energy: correlations by FFT and their sums with weights below 2 / lag
-    at_once: int = 2_000_000  # lags of signals in memory
-    block: int = 2048  # lags whose weights are in memory
-    iterations: int = 60  # at most
-    turns: int = 10  # between looks at whether all bands are done
-    enough: float = 1.002  # ratio to the least multiple that covers, which ends the iteration
-    regular: float = 1e-14  # of the largest eigenvalue: smaller ones are rounding
-    ridge: float = 1e-6  # of the largest energy, in every direction: the iteration needs its square above rounding
-
-
-@dataclass(frozen=True)
 class OutlierRule:
     """Outlier scores: distances, the search for outliers, and when a score decides nothing."""
 
@@ -125,22 +109,15 @@ class OutlierRule:
 
 @dataclass(frozen=True)
 class SetRule:
-    """From systems or responses to a set: what a form leaves over, grids of continuous systems, and what is shown."""
+    """From systems or responses to a set: what a form leaves over, and what is shown."""
 
     condition: float = 1e12  # beyond it an inverse form does not rebuild a plant
     exact: float = 1e-9  # relative misfit that is rounding
     warned: float = 0.01  # misfit from which on another form is worth a thought
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
-    points_beyond: int = 15  # from the end of the grid of continuous systems to ten times as far
-    points: int = 1000  # of the default grid of continuous systems
-    units: int = 200  # that are stored for a picture
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing
     singular: float = 1e10  # condition beyond which the paper's weights have no inverse
-    nominals: int = 64  # at most, of the mean over pairs of units
     at_once: int = 10_000  # units times frequencies in a piece of a computation, which stays in a processor's cache
 
 
-FIT, MAGNITUDE, PROOF, BANDS, OUTLIER, SET = (
-    *(FitRule(), MagnitudeRule(), ProofRule()),
-    *(BandRule(), OutlierRule(), SetRule()),
-)
+FIT, MAGNITUDE, PROOF, OUTLIER, SET = FitRule(), MagnitudeRule(), ProofRule(), OutlierRule(), SetRule()

@@ -8,8 +8,7 @@ from collections.abc import Collection, Iterable
 from ...observer import EstimatorSettings
 from ..task import Method, split_name
 from .estimator import Estimator
-from .gains import KalmanTuned, OpenLoop
-from .residual import ResidualH2
+from .gains import KalmanTuned, OpenLoop, ResidualH2
 from .robust import Mixed, Published, WorstCaseH2
 
 log = logging.getLogger(__name__)
@@ -44,6 +43,6 @@ def suitable(methods: Iterable[Method], kind: str, kinds: Collection[str]) -> li
 
 def preferred(observers: Iterable[str]) -> str | None:
     """Return the observer ``<kind of model>/<method>`` whose method is preferred; None where there is none."""
-    order = {method.name: -place for place, method in enumerate(METHODS)}
-    ranks = {name: order[method] for name in observers if (method := split_name(name)[1]) in order}
-    return min(ranks, key=lambda name: ranks[name], default=None)
+    names = [method.name for method in METHODS]
+    known = [name for name in observers if split_name(name)[1] in names]
+    return max(known, key=lambda name: names.index(split_name(name)[1]), default=None)

@@ -33,16 +33,10 @@ class Estimator(Method):
         began, models, training = time.perf_counter(), task.models, task.recordings
         nominal = {name: float(values[models.index(task.unit)]) for name, values in models.parameters.items()}
         bias = np.array([task.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
-        identified = identify_estimator(
-            task.name,
-            models.lifting,
-            models.measured,
-            models.recorded_inputs,
-            Recordings.of(training.keys, training.read_one, bias),
-            models.sample_period_s,
-            nominal,
-            self.settings,
-        )
+        recordings = Recordings.of(training.keys, training.read_one, bias)
+        channels = models.lifting, models.measured, models.recorded_inputs
+        settings = models.sample_period_s, nominal, self.settings
+        identified = identify_estimator(task.name, *channels, recordings, *settings)
         runtime = identified.observer.runtime
         if task.limits is not None and runtime.lower is not None and runtime.upper is not None:
             n = len(task.limits[0])

@@ -1,22 +1,25 @@
-"""Constant gains: the model alone, and the Kalman filter that does best on training episodes."""
+"""Constant gains: the model alone, the Kalman filter that does best on training episodes, and the residual-shaped one.
+
+The residual-shaped observer may run rows fitted to single steps, where these promise smaller errors.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
+from ... import synthesis  # solvers load when they are used
 from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.baselines.kalman import kalman_candidates
-from ...observer.residual.models import Refitted, refitted_models
+from ...observer.residual.models import Refitted, ResidualModel, refitted_models, residual_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
 from ...synthesis import Synthesis
 from ..task import Design, DesignTask, Method
 from ..validation import hidden_mean, percent_of
-
-EQUAL, RESIDUAL = "equal share of every range", "one-step residuals"
 
 
 @dataclass(frozen=True)
@@ -32,57 +35,85 @@ class OpenLoop(Method):
 
 @dataclass(frozen=True)
 class KalmanTuned(Method):
-    """Kalman gains for the white process noise that does best on training episodes."""
+    """Kalman gains for process noise like the one-step residuals, of the size that does best on training episodes."""
 
     name: ClassVar[str] = "kalman_tuned"
 
     def design(self, task: DesignTask) -> Design:
         """Return the candidate of least error of the hidden states; the model alone where none is better."""
-        tried = [Candidate(task.open_loop(), {"process_noise_level": 0.0}), *candidates(task)]
-        models = [(None, None) if t.model is None else (t.model.A, t.model.B) for t in tried]
-        observers = [task.observer(t.synthesis, *model) for t, model in zip(tried, models, strict=True)]
+        tried = [(0.0, task.open_loop(), None), *candidates(task)]
+        observers = [task.observer(gains, *((model.A, model.B) if model else ())) for _, gains, model in tried]
         errors = hidden_mean(percent_of(observers, task.training.read()), task.models.measured)
         first = int(np.argmin(errors))
         if not np.isfinite(errors[first]):
             diverges = "every candidate diverges on the training episodes, and so does the model alone"
             raise SynthesisError(f"Kalman filter: {diverges}; look at the models first.")
-        best = tried[first]
-        rows = best.model.rows if best.model else ()
-        facts = {**best.facts, "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in rows]}
-        facts["correction_off"] = first == 0
+        level, gains, model = tried[first]
+        facts: dict[str, Any] = {"process_noise_level": level, "correction_off": first == 0}
+        facts["rows_fitted_to_single_steps"] = [task.models.lifting.states[i] for i in (model.rows if model else ())]
         if np.isfinite(errors[0]):
             facts["training_error_to_open_loop"] = float(errors[first] / errors[0])
-        return Design(task.name, observers[first], best.synthesis, facts)
+        return Design(task.name, observers[first], gains, facts)
 
 
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """Gains, the settings behind them, and the model where it is not the nominal unit's."""
-
-    synthesis: Synthesis
-    facts: dict[str, Any]
-    model: Refitted | None = None
-
-
-def candidates(task: DesignTask) -> list[Candidate]:
-    """Return gains for process noise of two shapes and many sizes, for the nominal model and models with new rows."""
+def candidates(task: DesignTask) -> Iterator[tuple[float, Synthesis, Refitted | None]]:
+    """Yield sizes of process noise, gains and, where it is not the nominal one, the model with new rows."""
     models, batch, n = task.models, task.training.read(), task.models.lifting.n_states
     lifting, R, nominal = models.lifting, np.diag(task.noise**2), models.index(task.unit)
     refitted, residual = refitted_models(lifting, models.A[nominal], models.B[nominal], models.measured, batch)
     covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    slopes, tried = mean_slopes(lifting, batch.states, batch.inputs, batch.parameters), []
+    slopes = mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
     for model in refitted:
-        dynamics = mean_error_dynamics(model.A, slopes)
-        shapes = {RESIDUAL: covariance[np.ix_(model.columns, model.columns)]}
-        shapes |= {} if model.rows else {EQUAL: models.output_scale[:n]}
-        for name, shape in shapes.items():
-            for level, gains in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):
-                facts = {"process_noise_level": level, "process_noise_shape": name}
-                tried.append(Candidate(_padded(gains, lifting.n_lifted), facts, model if model.rows else None))
-    return tried
+        dynamics, shape = mean_error_dynamics(model.A, slopes), covariance[np.ix_(model.columns, model.columns)]
+        for level, gains in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):
+            yield level, _padded(gains, lifting.n_lifted), model if model.rows else None
 
 
 def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:
     """Add rows of zeros for the lifted functions."""
     K = synthesis.controller
     return replace(synthesis, controller=gain(np.vstack([K.D, np.zeros((n_lifted - len(K.D), K.n_inputs))]), K.dt))
+
+
+@dataclass(frozen=True)
+class ResidualH2(Method):
+    """Kalman gains for the one-step residuals that a model leaves on the training episodes of all units."""
+
+    name: ClassVar[str] = "residual_h2"
+    max_order: int = 12  # of the observer beside the model
+    compared: int = 3  # most promising models that are tried on training episodes
+
+    def design(self, task: DesignTask) -> Design:
+        """Return the best of the models that promise the smallest errors."""
+        models, n = promising(task)[: self.compared], task.models.lifting.n_states
+        C, scale, dt = task.selector[:, :n], task.models.output_scale[:n], task.models.sample_period_s
+        problems = [synthesis.ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
+        lifted, order = task.models.lifting.n_lifted, self.max_order
+        syntheses = [synthesis.residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
+        observers = [
+            task.observer(one, model.A, model.B) if model.refitted else task.observer(one)
+            for model, one in zip(models, syntheses, strict=True)
+        ]
+        best, error = task.best(observers)
+        if not np.isfinite(error):
+            raise SynthesisError("Residual-shaped observer: the nonlinear observer diverges on the training episodes.")
+        facts = {
+            "training_error_to_open_loop": error,
+            "order_reduction_percent": syntheses[best].gap_percent,
+            "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in models[best].refitted],
+        }
+        return Design(task.name, observers[best], syntheses[best], facts)
+
+
+def promising(task: DesignTask) -> list[ResidualModel]:
+    """Return models with bounded promised errors, the smallest first."""
+    models, row = task.models, task.models.index(task.unit)
+    nominal = models.lifting, models.A[row], models.B[row], models.measured
+    scale = models.output_scale[: models.lifting.n_states]
+    tried = residual_models(*nominal, task.training.read(), task.noise, scale)
+    usable = [model for model in tried if np.isfinite(model.promised).all()]
+    if not usable:
+        raise SynthesisError(
+            "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
+        )
+    return usable

@@ -16,7 +16,7 @@ from ...core.lti import StateSpace, block_diagonal, gain
 from ...identify.model_set import kind_of
 from ...synthesis import Injection, ObserverProblem, Synthesis
 from ...uncertainty import residual
-from ...uncertainty.weights.entries import EntryWeights, fit_entries
+from ...uncertainty.unit_residuals import EntryWeights, fit_entries
 from ..task import Design, DesignTask, Method
 
 
@@ -49,11 +49,10 @@ class Published(Mixed):
         """Solve the published problem; its weights bound entries, not a full perturbation, so nothing is certified."""
         weights = self.weights(task)
         solved = synthesis.mixed(as_published(task.require_problem(), weights.system), time_limit_s=self.time_limit_s)
-        excess = weights.excess
-        note = f"The weights bound entries: they are exceeded {excess:.3g} times in front of a full perturbation."
-        notes = (*solved.notes, note)
-        published = replace(solved, method=self.name, worst_case_h2=None, quadrature_error=None, notes=notes)
-        return task.designed(published, unstructured_excess=excess)
+        note = f"The weights bound entries: a full perturbation exceeds them {weights.excess:.3g} times."
+        nothing: dict[str, Any] = {"worst_case_h2": None, "quadrature_error": None}
+        published = replace(solved, method=self.name, notes=(*solved.notes, note), **nothing)
+        return task.designed(published, unstructured_excess=weights.excess)
 
     def weights(self, task: DesignTask) -> EntryWeights:
         """Return bounds of all entries of the residuals of the units that the study's own set covers."""
@@ -91,8 +90,7 @@ class Disturbances:
     def facts(self, dt: float) -> dict[str, Any]:
         """Return them for the metrics."""
         hz = None if self.corner is None else self.corner / dt
-        noises = {"process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
-        return {"input_weight_hz": hz, **noises}
+        return {"input_weight_hz": hz, "process_noise": self.process_noise, "measurement_noise": self.measurement_noise}
 
 
 @dataclass(frozen=True)
@@ -121,8 +119,7 @@ class WorstCaseH2(Method):
 
 def best_design(task: DesignTask, designs: Sequence[Callable[[], Synthesis]]) -> tuple[int, Synthesis]:
     """Return which design does best on training episodes, and its synthesis."""
-    solved: dict[int, Synthesis] = {}
-    reason = ""
+    solved, reason = dict[int, Synthesis](), ""
     for number, design in enumerate(designs):
         try:
             solved[number] = design()

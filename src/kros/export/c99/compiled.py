@@ -16,6 +16,7 @@ from ...core.errors import ConfigError, DimensionError
 from ...loops.compiler import COMPILERS, compile_library, find_compiler
 
 Array = npt.NDArray[np.float64]
+Machine = npt.NDArray[np.uint8]  # the state of one machine, as the C source keeps it
 FLAGS = ("-std=c99", "-O2", "-fPIC", "-shared", "-fno-math-errno", "-ffp-contract=off")
 # The loop over time, compiled beside the observer: what arrives and leaves lies sample after sample.
 _LOOP = """
@@ -93,11 +94,7 @@ class CompiledObserver:
         return int(self._c[f"{self.name}_selftest"]())
 
     def run(
-        self,
-        y: Array,
-        u: Array,
-        parameters: Mapping[str, float] | None = None,
-        machine: npt.NDArray[np.uint8] | None = None,
+        self, y: Array, u: Array, parameters: Mapping[str, float] | None = None, machine: Machine | None = None
     ) -> tuple[Array, npt.NDArray[Any]]:
         """Estimate one recording, sample by sample.
 
@@ -123,7 +120,7 @@ class CompiledObserver:
         self._run(_at(machine), ctypes.c_long(len(y)), *(_at(array) for array in (y, u, x_hat, status)))
         return x_hat, status
 
-    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> npt.NDArray[np.uint8]:
+    def start(self, y: Array, parameters: Mapping[str, float] | None = None) -> Machine:
         """Return the state of a machine that starts at a measurement, shape (q,), as the C source keeps it."""
         machine = np.zeros(self.state_bytes, dtype=np.uint8)
         real = ctypes.c_float if self._real is np.float32 else ctypes.c_double

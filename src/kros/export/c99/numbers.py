@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,7 @@ from .origin import OriginShift, find_shift
 from .realise import RULE, Realised
 
 Array = npt.NDArray[np.float64]
+DOUBLE, SINGLE = Precision(), Precision("float")
 
 
 @dataclass(frozen=True)
@@ -68,8 +69,7 @@ class Source:
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
         realised = Realised.of(observer)
-        observer = realised.observer
-        loop = None if track is None else PhaseLockedLoop(observer, track, 1)
+        loop = None if track is None else PhaseLockedLoop(realised.observer, track, 1)
         shift = find_shift(realised.observer) if precision == "float" else None
         return cls(realised, name, Precision(precision), shift, loop, load)
 
@@ -80,66 +80,48 @@ class Source:
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
-        formulas, write = self.observer.lifting.formulas, Precision().literal
-        return (
-            self.names()
-            | self.sizes()
-            | self.linear()
-            | self.limits()
-            | self.origin()
-            | {
-                "sigma": [c_code(f.expression, self.symbol, self.precision) for f in formulas],
-                "gamma": [
-                    c_code(f.expression, self.symbol, self.precision) for f in self.observer.lifting.input_formulas
-                ],
-                "sigma_uses_parameters": any(set(f.used) & set(self.observer.lifting.parameters) for f in formulas),
-                "monitor": self.monitor(),
-                "guard": self.guard(),
-                "bank": self.bank(),
-                "tracked": self.tracked(),
-                "load": self.load_torque(),
-                "sample_period_s": write(self.observer.sample_period_s),
-            }
-        )
+        lifting = self.observer.lifting
+        parts = {"monitor": self.monitor(), "guard": self.guard(), "bank": self.bank(), "tracked": self.tracked()}
+        parts |= self.layout() | self.linear() | self.limits() | self.origin()
+        return parts | {
+            "sigma": [self.code(f.expression) for f in lifting.formulas],
+            "gamma": [self.code(f.expression) for f in lifting.input_formulas],
+            "sigma_uses_parameters": any(set(f.used) & set(lifting.parameters) for f in lifting.formulas),
+            "load": self.load_torque(),
+            "sample_period_s": DOUBLE.literal(self.observer.sample_period_s),
+        }
 
-    def names(self) -> dict[str, Any]:
-        """Return names and units of measure."""
-        o, factors, measured = self.observer, self.factors(), self.measured
+    def layout(self) -> dict[str, Any]:
+        """Return names, units of measure, and numbers of states, channels and samples."""
+        o, factors, measured, lifting = self.observer, self.factors(), self.measured, self.observer.lifting
         return {
             "name": self.name,
             "NAME": self.name.upper(),
             "observer_name": plain(o.name),
             "real": self.precision.type,
             "suffix": self.precision.suffix,
-            "zero": self.precision.literal(0.0),
+            **{name: self.precision.literal(value) for name, value in (("zero", 0.0), ("one", 1.0))},
             "single": self.precision.type == "float",
             "states": plain_names(o.recorded),
             "measured": plain_names(measured),
             "inputs": plain_names(o.inputs),
-            "parameters": o.lifting.parameters,
+            "parameters": lifting.parameters,
             "signals": self.signals(),
             "x_factor": self.literals([1 / factors[s] for s in o.recorded]),
-            "y_factor": self.literals([factors[s] for s in measured]),
-            "u_factor": self.literals([factors[s] for s in o.inputs]),
-        }
-
-    def sizes(self) -> dict[str, Any]:
-        """Return numbers of states, channels and samples."""
-        o, lifting, window = self.observer, self.observer.lifting, self.observer.lifting.window
-        return {
+            **{f"{k}_factor": self.literals([factors[s] for s in v]) for k, v in (("y", measured), ("u", o.inputs))},
             "at": o.measured,
             "n": lifting.n_states,
             "recorded": len(o.recorded),
-            "q": len(o.measured),
+            "q": len(measured),
             "m": len(o.inputs),
             "functions": lifting.n_lifted - lifting.n_states,
             "widened": o.B.shape[1],
             "order": o.controller.n_states,
             "delay": o.runtime.delay,
             "longest": LONGEST,
-            "history": len(window.earlier),
-            "window_shift": [int(i) for i in window.shift] if lifting.history else [],
-            "window_present": [int(i) for i in window.present] if lifting.history else [],
+            "history": len(lifting.window.earlier),
+            "window_shift": lifting.window.shift.tolist(),
+            "window_present": lifting.window.present.tolist(),
         }
 
     def linear(self) -> dict[str, Any]:
@@ -157,16 +139,15 @@ class Source:
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
         o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
-        none, wide = np.full(o.lifting.n_states, np.inf), replace(self, precision=Precision())
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
             "clips_estimate": bool(limits),
-            "lower": wide.numbers(limits.get("lower", -none)),
-            "upper": wide.numbers(limits.get("upper", none)),
+            "lower": row(limits.get("lower", np.full(o.lifting.n_states, -np.inf))),
+            "upper": row(limits.get("upper", np.full(o.lifting.n_states, np.inf))),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": bounds[:q],
             "u_bounds": bounds[q:],
-            "default_parameters": self.numbers(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
+            "default_parameters": self.row(np.array([o.parameters.get(p, 0.0) for p in o.lifting.parameters])),
         }
 
     @property
@@ -176,19 +157,18 @@ class Source:
 
     def origin(self) -> dict[str, Any]:
         """Return how the origin moves; nothing where it cannot."""
-        keys = ("shift_states", "shift_whole", "shift_rest", "far", "period", "recorded_period")
-        shift, o, write = self.shift, self.observer, Precision().literal
+        shift, o = self.shift, self.observer
         if shift is None:
-            return dict.fromkeys(keys) | {"shift": None, "relative_inputs": [], "shift_others": []}
+            return {"shift": None, "relative_inputs": [], "shift_others": []}
         return {
             "shift": shift,
-            "shift_states": self.wide(shift.states),
-            "shift_whole": self.wide(shift.whole),
-            "shift_rest": self.wide(shift.rest),
+            "shift_states": row(shift.states),
+            "shift_whole": row(shift.whole),
+            "shift_rest": row(shift.rest),
             "relative_inputs": [self.relative_input(j) for j in range(len(o.inputs))],
             "shift_others": [i for i in range(len(o.recorded)) if i != o.measured[0] and shift.states[i] != 0],
             "far": self.precision.literal(RULE.far * shift.period),
-            "period": write(shift.period),
+            "period": DOUBLE.literal(shift.period),
             "recorded_period": abs(shift.period / self.factors()[self.measured[0]]),
         }
 
@@ -197,7 +177,7 @@ class Source:
         assert self.shift is not None
         whole, text = float(self.shift.whole[j]), f"s->held[{j}]"
         if whole != 0:
-            text += " - s->origin" if whole == 1 else f" - ({Precision().literal(whole)} * s->origin)"
+            text += " - s->origin" if whole == 1 else f" - ({DOUBLE.literal(whole)} * s->origin)"
         return text if self.shift.rest[j] == 0 else f"({text}) - s->moved_u[{j}]"
 
     def factors(self) -> dict[str, float]:
@@ -218,7 +198,7 @@ class Source:
 
     def literals(self, factors: Sequence[float]) -> list[str]:
         """Return the literals of factors in double precision; none where all are one."""
-        return [] if all(factor == 1 for factor in factors) else [Precision().literal(factor) for factor in factors]
+        return [] if all(factor == 1 for factor in factors) else row(np.array(factors))
 
     def tracked(self) -> dict[str, Any] | None:
         """Return the parts of a phase-locked loop: the linear part, and slopes of functions."""
@@ -227,14 +207,11 @@ class Source:
         o, K, name, write = self.observer, self.observer.controller, self.loop.name, self.precision.literal
         n, states = o.lifting.n_states, o.lifting.states
 
-        def code(slope: Any) -> str:
-            return f"({c_code(slope, self.symbol, self.precision)})"
-
         slopes, given = [], () if o.bank is None else o.measured  # measurements take the place of estimates
         for f in o.lifting.formulas:
             by_state = {j: f.derivative(s) for j, s in enumerate(states) if s in f.used and j not in given}
-            lines = [(j, code(d)) for j, d in by_state.items() if d != 0]
-            slopes.append({"by_value": code(f.derivative(name)), "by_state": lines})
+            lines = [(j, f"({self.code(d)})") for j, d in by_state.items() if d != 0]
+            slopes.append({"by_value": f"({self.code(f.derivative(name))})", "by_state": lines})
         return {
             "name": name,
             "place": o.lifting.parameters.index(name),
@@ -245,7 +222,6 @@ class Source:
             "shares": [write(float(v) ** -2) for v in measurement_sizes(o)],
             "settle_s": f"{o.sample_period_s / self.loop.forget:g}",
             "forget": write(self.loop.forget),
-            "one": write(1.0),
             "most": write(MOST),
         }
 
@@ -253,7 +229,7 @@ class Source:
         """Return the numbers of `AngleLoad`, in double precision: it sums up without end."""
         if self.load is None:
             return None
-        level, places, write = self.load.level, self.observer.recorded, Precision().literal
+        level, places, write = self.load.level, self.observer.recorded, DOUBLE.literal
         return {
             "load_name": plain(self.load.load),
             "current_name": plain(self.load.current),
@@ -274,24 +250,19 @@ class Source:
 
     def bank(self) -> dict[str, Any] | None:
         """Return what a filter bank starts with and does in gaps; None where the observer is none."""
-        own, o = self.observer.bank, self.observer
+        own, o, first = self.observer.bank, self.observer, len(self.observer.recorded)
         if own is None:
             return None
-        first = len(o.recorded)
         z = slice(first, first + own.filters)
         return {
             "filters": own.filters,
             "first": first,
             "fallback": o.lifting.n_states - first,
             "start": self.sums(self.realised.start),
-            "forget": self.numbers(own.forget),
-            "reach": self.numbers(own.reach),
-            "half": self.numbers(own.half),
-            "recovery": self.numbers(own.recovery),
-            "longest": self.numbers(longest_age(own.half)),
+            **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
+            "longest": self.row(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
             "into": self.matrix(self.realised.into),
-            "one": self.precision.literal(1.0),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 
@@ -300,17 +271,14 @@ class Source:
         own = self.observer.monitor
         if own is None:
             return None
+        numbers = {"quiet": QUIET, "forget": own.forget, "first": max(own.first, own.forget), "largest": LARGEST}
         return {
             "bands": len(own.filters),
             "filters": self.matrix(own.filters),
-            "inverse_size": self.numbers(1 / own.size),
+            "inverse_size": self.row(1 / own.size),
             "inverse_limit": self.matrix(1 / own.limits),
             "weights": own.weights.astype(int).tolist(),
-            "quiet": self.precision.literal(QUIET),
-            "forget": self.precision.literal(own.forget),
-            "first": self.precision.literal(max(own.first, own.forget)),
-            "largest": self.precision.literal(LARGEST),
-            "one": self.precision.literal(1.0),
+            **{name: self.precision.literal(value) for name, value in numbers.items()},
             "settle": own.settle,
             "recovery": RECOVERY,
             "percent": f"{100 * own.false_alarm_rate:g}",
@@ -319,19 +287,16 @@ class Source:
 
     def guard(self) -> dict[str, Any]:
         """Return the bounds of states and of the correction, and how long a start takes."""
-        own, n, order = self.observer.guard, self.observer.lifting.n_states, self.observer.controller.n_states
-        low, high = (np.clip(side, -self.most, self.most) for side in bounds(own, n, order))
-        settle = 0 if own is None else own.settle
-        correction = self.numbers(high[n:])
-        return {"lower": self.wide(low[:n]), "upper": self.wide(high[:n]), "correction": correction, "settle": settle}
+        own, n, most = self.observer.guard, self.observer.lifting.n_states, self.precision.largest
+        low, high = np.clip(bounds(own, n, self.observer.controller.n_states), -most, most)
+        sides = {"lower": row(low[:n]), "upper": row(high[:n]), "settle": own.settle if own else 0}
+        return sides | {"correction": self.row(high[n:])}
 
     def symbol(self, name: str) -> str:
         """Return the C expression of a quantity of a formula: window w, parameters p, inputs u."""
         lifting = self.observer.lifting
-        for names, array in ((lifting.window.names, "w"), (lifting.parameters, "p"), (self.observer.inputs, "u")):
-            if name in names:
-                return f"{array}[{names.index(name)}]"
-        raise KeyError(name)
+        places = {"w": lifting.window.names, "p": lifting.parameters, "u": self.observer.inputs}
+        return next(f"{array}[{names.index(name)}]" for array, names in places.items() if name in names)
 
     def sums(self, values: Array) -> list[list[tuple[int, str]]]:
         """Return what is multiplied by which entry of a column, row by row; zeros are left out."""
@@ -339,30 +304,29 @@ class Source:
 
     def matrix(self, values: Array) -> list[list[str]]:
         """Return the literals of a matrix, row by row."""
-        return [[self.precision.literal(float(v)) for v in row] for row in values]
+        return [self.row(numbers) for numbers in values]
 
-    def numbers(self, values: Array) -> list[str]:
-        """Return the literals of a row; infinity as the largest number."""
-        return [self.precision.literal(float(np.clip(v, -self.most, self.most))) for v in values]
+    def row(self, values: Array) -> list[str]:
+        """Return the literals of a row."""
+        return row(values, self.precision)
 
-    @property
-    def most(self) -> float:
-        """Largest number of this precision."""
-        return float(np.finfo(np.float32 if self.precision.type == "float" else np.float64).max)
-
-    def wide(self, values: Array) -> list[str]:
-        """Return literals in double precision."""
-        return [Precision().literal(float(v)) for v in values]
+    def code(self, expression: Any) -> str:
+        """Return the C expression of a formula's tree."""
+        return c_code(expression, self.symbol, self.precision)
 
     def bounds(self) -> list[dict[str, str]]:
         """Return the bounds of measurements and inputs in double precision, and those of good samples in single."""
-        screen, single = Screen.of(self.observer), float(np.finfo(np.float32).max)
+        screen = Screen.of(self.observer)
         wide = {name: getattr(screen, name) for name in ("lower", "upper", "least", "most")}
         inner = {"low": np.maximum(screen.lower, screen.least), "high": np.minimum(screen.upper, screen.most)}
-        texts = {name: replace(self, precision=Precision()).numbers(values) for name, values in wide.items()}
-        narrow = replace(self, precision=Precision("float"))
-        texts |= {name: narrow.numbers(np.clip(values, -single, single)) for name, values in inner.items()}
+        texts = {name: row(values) for name, values in wide.items()}
+        texts |= {name: row(values, SINGLE) for name, values in inner.items()}
         return [dict(zip(texts, row, strict=True)) for row in zip(*texts.values(), strict=True)]
+
+
+def row(values: Array, precision: Precision = DOUBLE) -> list[str]:
+    """Return the literals of a row; infinity as the largest number."""
+    return [precision.literal(v) for v in np.clip(values, -precision.largest, precision.largest).tolist()]
 
 
 def _uncorrected(observer: Observer) -> Array:

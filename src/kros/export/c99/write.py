@@ -1,14 +1,16 @@
-"""The files of an exported observer: written whole, into a folder of their own."""
+"""The files of an exported observer: written whole, into a folder of their own, golden vectors among them."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ...core.artifacts import json_bytes, with_checksum
 from ...core.errors import ConfigError
@@ -16,7 +18,6 @@ from ...core.files import whole_folder, write_bytes
 from ...observer import Observer
 from ...observer.file import observer_content
 from ..text import rendered, require_identifier
-from .golden import Golden
 from .numbers import LoadOutput, Source
 
 _TOLERANCE = {"double": 1e-9, "float": 1e-3}
@@ -85,11 +86,7 @@ def export_c(
 
 
 def c_files(
-    observer: Observer,
-    name: str,
-    precision: str,
-    track: str | None = None,
-    load: LoadOutput | None = None,
+    observer: Observer, name: str, precision: str, track: str | None = None, load: LoadOutput | None = None
 ) -> dict[str, str]:
     """Return the text of every file by its name; the same observer gives the same bytes."""
     for parameter in observer.lifting.parameters:
@@ -160,3 +157,51 @@ def _state_bytes(context: Mapping[str, Any]) -> int:
     words = of("m") + bool(of("delay")) + bool(monitor) + 2
     align = 8 if doubles or real == 8 else 4
     return -(-(8 * doubles + real * reals + 4 * words) // align) * align
+
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Golden:
+    """Samples and what becomes of them."""
+
+    y: Array  # (n_samples, q)
+    u: Array  # (n_samples, m)
+    x_hat: Array  # (n_samples, n_recorded)
+    status: npt.NDArray[Any]  # (n_samples,)
+    size: Array  # (n_recorded,)
+    passes: int
+    last_status: npt.NDArray[Any]  # (n_samples,)
+    # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
+    sure: npt.NDArray[Any]
+
+    @classmethod
+    def of(cls, observer: Observer, track: str | None = None, count: int = 64, tolerance: float = 0.0) -> Golden:
+        """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
+        q, m = len(observer.measured), len(observer.inputs)
+        seen = observer.seen
+        y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)
+        k = np.arange(count)[:, None]
+        y = y_size * 0.5 * np.sin(0.05 * k + np.arange(q))
+        u = u_size * 0.5 * np.sin(0.05 * (k + 1) + np.arange(m))
+        y[count // 3 : count // 3 + 3] = np.nan
+        u[count // 2] = np.inf
+        if seen is not None:
+            y[2 * count // 3] = 40 * y_size
+        passes = 1 if observer.monitor is None else 2 + observer.monitor.settle // (count // 2)
+
+        def run(factor: float) -> tuple[Array, npt.NDArray[np.uint32]]:
+            running = observer.start(factor * y[0])
+            if track is not None:
+                running.track(track)
+            samples = [*zip(factor * y, factor * u, strict=True)] * passes
+            steps = [(np.asarray(running.step(*sample)), int(running.status)) for sample in samples]
+            x_hat = np.array([x for x, _ in steps[:count]])[:, : len(observer.recorded)]
+            return x_hat, np.array([s for _, s in steps], np.uint32)
+
+        x_hat, status = run(1.0)
+        turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
+        sure = ~np.stack([turned[:count], turned[-count:]])
+        size = np.maximum(np.abs(x_hat).max(axis=0), np.finfo(float).tiny)
+        return cls(y, u, x_hat, status[:count], size, passes, status[-count:], sure)

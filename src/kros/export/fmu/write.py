@@ -97,9 +97,9 @@ def export_fmu(
 def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
     """Return the files that make C source an FMU."""
     observer, name = source.observer, source.name
-    units = {c: plain(recorded_channel(observer, c).unit or "") for c in (*observer.recorded, *observer.inputs)}
+    declared = {c: recorded_channel(observer, c).unit for c in (*observer.recorded, *observer.inputs)}
+    units = {c: plain(unit) for c, unit in declared.items() if unit}
     estimates = [*observer.recorded, *([] if source.loop is None else [source.loop.name])]
-    units = {c: unit for c, unit in units.items() if recorded_channel(observer, c).unit}
     context = source.context() | {
         "version": version("kros"),
         "fmi": fmi,
@@ -117,25 +117,20 @@ def fmu_files(source: Source, fmi: int, guid: str) -> dict[str, str]:
 
 def variables(observer: Observer, units: Mapping[str, str], estimates: Sequence[str]) -> list[dict[str, Any]]:
     """Return the variables in the order of their references, measurements first."""
-    found: list[dict[str, Any]] = []
-
-    def add(name: str, causality: str, text: str, start: str | None, suffix: str = "", kind: str = "real") -> None:
-        shown, variability = plain(name), "tunable" if causality == "parameter" else "discrete"
-        row = {"name": shown + suffix, "causality": causality, "variability": variability, "kind": kind}
-        row |= {"description": text.format(shown), "unit": units.get(name, "")}
-        found.append(row | {"start": start, "index": len(found)})
-
-    for i in observer.measured:
-        add(observer.lifting.states[i], "input", "measured {}", "0.0")
-    for name in observer.inputs:
-        add(name, "input", "input {}", "0.0")
-    for name in observer.lifting.parameters:
-        add(name, "parameter", "this machine's {}", f"{observer.parameters.get(name, 0.0):.17g}")
-    for name in estimates:
-        add(name, "output", "estimate of {} at the end of the step", None, "_hat")
     bits = "1 missing measurement, 2 invalid input, 4 limit, 8 outside the certificate, 16 restarted"
-    add("status", "output", bits, None, kind="bits")
-    return found
+    of_parameters = {name: f"{observer.parameters.get(name, 0.0):.17g}" for name in observer.lifting.parameters}
+    every = [(observer.lifting.states[i], "input", "measured {}", "0.0") for i in observer.measured]
+    every += [(name, "input", "input {}", "0.0") for name in observer.inputs]
+    every += [(name, "parameter", "this machine's {}", start) for name, start in of_parameters.items()]
+    outputs = [(name, "output", "estimate of {} at the end of the step", None) for name in estimates]
+    rows: list[dict[str, Any]] = []
+    for index, (name, causality, text, start) in enumerate([*every, *outputs, ("status", "output", bits, None)]):
+        shown = plain(name)
+        row = {"name": f"{shown}_hat" if text.startswith("estimate") else shown, "causality": causality, "start": start}
+        row |= {"variability": "tunable" if causality == "parameter" else "discrete", "description": text.format(shown)}
+        row |= {"kind": "bits" if text == bits else "real", "unit": units.get(name, "")}
+        rows.append(row | {"index": index})
+    return rows
 
 
 def compiled(files: Mapping[str, bytes], name: str, fmi: int) -> dict[str, bytes]:

@@ -156,7 +156,7 @@ class _Run:
             slopes = lifting.slopes(window.T, self.parameters)[..., moving]  # (batch, function, n + q)
             F += np.einsum("afb,bfj->ajb", W[:, n:nl], slopes)
         if lifting.input_functions:
-            slopes = lifting.input_slopes(u.T, window.T, self.parameters)[..., moving]
+            slopes = lifting.slopes(window.T, self.parameters, u=u.T)[..., moving]
             F += np.einsum("afb,bfj->ajb", W[:, nl + len(u) :], slopes)
         return F
 

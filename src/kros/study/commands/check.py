@@ -26,8 +26,7 @@ from ...observer.monitor import Monitor
 from ...observer.screen import screened
 from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
-from ...uncertainty.outliers.population import score_row
-from ...uncertainty.outliers.recorded import Evidence, Recorded
+from ...uncertainty.outliers.population import Evidence, Recorded, score_row
 from ...uncertainty.outliers.score import FEWEST_UNITS, Status
 from ..config import Stage, StudyConfig
 from ..engine.executors import open_executor

@@ -36,7 +36,7 @@ class LiftingProposal:
 
     lifting: dict[str, Any] = field(default_factory=dict)
     calibrate: dict[str, Any] = field(default_factory=dict)
-    why: str = "no periodic term of an angle stands out in what a linear model leaves"
+    why: str = "no periodic nonlinearity was found"
 
 
 def study_text(
@@ -47,7 +47,7 @@ def study_text(
     findings: Sequence[str],
 ) -> str:
     """Return a study as TOML."""
-    written = f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; edit any line."
+    written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
     lines = _comment(written)
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]
@@ -143,7 +143,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
     unloaded = _unloaded(population)
     data |= {} if unloaded is None else {"identify_on": unloaded}
-    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not looked for")
+    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not searched for")
     try:
         check_population(population, allow_single=True)
         population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
@@ -177,7 +177,7 @@ def _unloaded(population: Population) -> str | None:
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
     """Return lifted functions where recordings ask for them: the periodic term of an angle, with a phase per unit."""
     if population.metadata.get("plant") == HARMONIC_DRIVE:
-        return LiftingProposal(why="these recordings say which plant they are of, and its own lifting is taken")
+        return LiftingProposal(why="the recordings name their plant, which has a known lifting")
     measured = [c for c in population.channels if c.role is Role.STATE and c.measured]
     angles = [c.name for c in measured if c.unit == "rad" or (not c.unit and kind_of(c.name) in ("angle", "position"))]
     keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]
@@ -186,17 +186,17 @@ def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingPro
         return LiftingProposal()
     share = f"{100 * term.share:.2g} % of"
     if term.ratio == 1:
-        why = f"sin({term.angle}), as of gravity, explains {share} what a linear model of one step leaves"
+        why = f"sin({term.angle}), as of gravity, explains {share} the one-step residual of a linear model"
         functions = [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]
         return LiftingProposal({"functions": functions}, {}, why)
-    above = f"{term.above:.0f} times what is left at ratios around; {share} the residual"
-    why = f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({above})"
+    above = f"{term.above:.0f} times the residual at neighbouring ratios; {share} the whole residual"
+    why = f"the residual of a linear model repeats {term.ratio:g} times per turn of {term.angle!r} ({above})"
     spec = _phase_spec(population, term)
     if spec is not None and _calibrates(population, facts, spec):
         names = ("angle", "ratio", "reference", "measured")
         function = f"sin({term.ratio:g}*{term.angle} + phase)"
         table = {name: getattr(spec, name) for name in names}
-        return LiftingProposal({"functions": [function]}, table, f"{why}; every unit has a phase of its own")
+        return LiftingProposal({"functions": [function]}, table, f"{why}; the phase differs from unit to unit")
     return LiftingProposal({"functions": [f"{f}({term.ratio:g}*{term.angle})" for f in ("sin", "cos")]}, {}, why)
 
 
@@ -233,7 +233,7 @@ def _lines(
     lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
     lines += [f"looks wrong: {text}" for text in findings]
     until = " --until identify" if len(units) < FEWEST else ""
-    return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
+    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
 
 
 def column_lines(columns: Sequence[TableColumn]) -> list[str]:

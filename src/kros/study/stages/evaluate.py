@@ -14,8 +14,7 @@ import numpy.typing as npt
 from ...core.artifacts import save_artifact
 from ...core.errors import KrosError
 from ...data.population import EpisodeKey
-from ...design.baselines import Baseline, make_difference, make_extended, make_learned
-from ...design.mean_profile import make_mean_profile
+from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile
 from ...design.synthesize import measurement_noise
 from ...design.task import split_name
 from ...design.validation import TrainingSet
@@ -159,7 +158,7 @@ def facts_of(name: str, result: Outcome | str) -> Mapping[str, Any]:
     """Return what the records say about a baseline that was made here."""
     if isinstance(result, Outcome):
         return result.facts
-    log.info("%s could not be made: %s", name, result)
+    log.info("%s could not be computed: %s", name, result)
     return {"status": "failed", "reason": result}
 
 

@@ -47,7 +47,8 @@ def distances(form: Form, responses: Array, freqs_hz: Array) -> Distances:
     sigma, left, right = zip(*(_scaled(form, part, nominals, itself) for part in parts), strict=True)
     level = _smooth(20 * np.log10(np.maximum(np.concatenate(sigma, axis=2), OUTLIER.least)), freqs_hz)
     level[itself] = np.nan
-    return Distances(nominals, level.max(axis=2), _median(level, itself), np.concatenate(left), np.concatenate(right))
+    median = np.nanmedian(level, axis=0)
+    return Distances(nominals, level.max(axis=2), median, np.concatenate(left), np.concatenate(right))
 
 
 def _scaled(form: Form, G: Array, nominals: Array, itself: Array) -> tuple[Array, Array, Array]:
@@ -101,18 +102,8 @@ def _nominals(G: Array) -> Array:
 def _same(G: Array, nominals: Array) -> npt.NDArray[np.bool_]:
     """Tell where nominal and unit are equal but for rounding, shape (nominal, unit, frequency)."""
     size = np.abs(G).max(axis=(2, 3))
-    return np.stack(
-        [np.abs(G - G[k]).max(axis=(2, 3)) <= OUTLIER.smallest * np.maximum(size, size[k]) for k in nominals]
-    )
-
-
-def _median(values: Array, itself: Array) -> Array:
-    """Median over the nominals, shape (unit, ...), the unit itself left out."""
-    ordered = np.where(itself[..., None], np.inf, values)
-    ordered.sort(axis=0)
-    last = len(itself) - itself.sum(axis=0)  # number of nominals of each unit
-    units = np.arange(itself.shape[1])
-    return np.asarray((ordered[(last - 1) // 2, units] + ordered[last // 2, units]) / 2)
+    apart = np.stack([np.abs(G - G[k]).max(axis=(2, 3)) for k in nominals])
+    return apart <= OUTLIER.smallest * np.maximum(size, size[nominals][:, None])
 
 
 def _smooth(level: Array, freqs: Array) -> Array:

@@ -15,7 +15,7 @@ Some unit always exceeds the others, and without a model no threshold can hold a
 rests on an exponential tail of the levels whose scale the others show, the mean over frequency (`tail`): an
 extrapolation, and labelled as such. Units are taken out one at a time while they are beyond, up to a third of the
 units. Fewer than eight units decide nothing. All this compares estimates that are equally good: units that were
-recorded for too little are left open before (`recorded`). What a score would have shown stands beside it (`score`).
+recorded for too little are left open before (`population`). What a score would have shown stands beside it (`score`).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
-from ...core.errors import ConfigError, DataError, DimensionError
+from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
 from ..settings import OUTLIER
@@ -41,7 +41,7 @@ from .tail import LEAST_SCORES, margins, separate
 Array = npt.NDArray[Any]
 
 _ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
-_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate", "extrapolated")
+_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,6 @@ class OutlierModel:
         Infinity where there are too few units.
     false_alarm_rate : float
         Nominal rate per unit.
-    extrapolated : bool
-        Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone.
 
     Examples
     --------
@@ -85,7 +83,6 @@ class OutlierModel:
     scores: tuple[OutlierScore, ...]
     threshold_db: float
     false_alarm_rate: float
-    extrapolated: bool
 
     def score(
         self, unit: str, response: npt.ArrayLike, without: Collection[str] = (), motion_db: Array | None = None
@@ -101,13 +98,7 @@ class OutlierModel:
         rows = np.array([k for k, other in enumerate(self.unit_ids) if other not in without], dtype=int)
         if len(rows) < 2:
             raise DataError(f"Scoring unit {unit}: {len(rows)} others are left, two are needed; record more units.")
-        G = np.asarray(response)
-        if G.shape != self.responses.shape[1:]:
-            raise DimensionError(
-                f"Scoring unit {unit}: needs a response of shape {self.responses.shape[1:]} at the stored "
-                f"frequencies, found {G.shape}."
-            )
-        _require_finite(G[None], (unit,), self.freqs_hz)
+        G = check_responses([*self.responses[:1], response], ("those scored", unit), self.freqs_hz)[1]
         comparison = self._comparison(rows, G / self.output_scale[:, None] * self.input_scale)
         margin = -np.inf
         if self.n_units >= OUTLIER.fewest:
@@ -138,6 +129,11 @@ class OutlierModel:
         first, second = (G / self.output_scale[:, None] * self.input_scale for G in (one, other))
         levels = scaled_levels(self.form, first, second, self._known, self.freqs_hz)
         return np.asarray(np.median(levels, axis=0) - 10 * np.log10(2.0))
+
+    @property
+    def extrapolated(self) -> bool:
+        """Whether the rate is below 1 / (N + 1), so that it rests on the tail model alone."""
+        return self.false_alarm_rate < 1 / (len(self.unit_ids) + 1)
 
     @property
     def n_units(self) -> int:
@@ -231,18 +227,9 @@ def score_outliers(
     parts = separate(found.levels, rate)
     comparison = Comparison(form, G, freqs, found, parts.inliers)
     inliers = np.flatnonzero(parts.inliers)
-    return OutlierModel(
-        form=form,
-        unit_ids=tuple(ids[k] for k in inliers),
-        freqs_hz=freqs,
-        responses=G[inliers],
-        output_scale=scales[0],
-        input_scale=scales[1],
-        scores=comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist()))),
-        threshold_db=parts.threshold_db,
-        false_alarm_rate=rate,
-        extrapolated=rate < 1 / (len(inliers) + 1),
-    )
+    scores = comparison.scores(ids, parts.threshold_db, dict(enumerate(parts.margin_db.tolist())))
+    names = tuple(ids[k] for k in inliers)
+    return OutlierModel(form, names, freqs, G[inliers], *scales, scores, parts.threshold_db, rate)
 
 
 def scored_rows(count: int) -> Array:
@@ -254,29 +241,10 @@ def _population(
     responses: Any, unit_ids: tuple[str, ...] | None, freqs_hz: Any
 ) -> tuple[Array, tuple[str, ...], Array]:
     """Checked responses, names and frequencies."""
-    listed, freqs = [np.asarray(one) for one in responses], np.asarray(freqs_hz, float)
-    ids = tuple(str(k) for k in range(len(listed))) if unit_ids is None else tuple(unit_ids)
-    for unit, one in zip(ids, listed, strict=False):
-        if one.shape != listed[0].shape:
-            raise DimensionError(
-                f"Outlier scores: unit {unit} has a response of shape {one.shape}, unit {ids[0]} one of shape "
-                f"{listed[0].shape}; bring all units to the same frequencies and channels."
-            )
-    G = check_responses(np.asarray(listed))
-    if len(G) < LEAST_SCORES or len(ids) != len(G) or freqs.shape != G.shape[1:2]:
-        problem = "Outlier scores: need at least three units, one id each, and one frequency for each response"
-        raise DataError(f"{problem}; found {len(G)} units, {len(ids)} ids, {freqs.size} frequencies for {G.shape[1]}.")
+    freqs = np.asarray(freqs_hz, float)
+    G = check_responses(responses, unit_ids, freqs)
+    if len(G) < LEAST_SCORES:
+        raise DataError(f"Outlier scores: need at least {LEAST_SCORES} units, found {len(G)}.")
     if not np.isfinite(freqs).all() or np.any(np.diff(freqs) <= 0) or freqs[0] <= 0:
         raise ConfigError(f"Outlier scores: need increasing positive frequencies, found {freqs[:3]}.")
-    _require_finite(G, ids, freqs)
-    return G, ids, freqs
-
-
-def _require_finite(G: Array, ids: tuple[str, ...], freqs: Array) -> None:
-    bad = np.argwhere(~np.isfinite(G))
-    if len(bad):
-        unit, row, i, j = bad[0]
-        raise DataError(
-            f"Outlier scores: the response of unit {ids[unit]} is {G[unit, row, i, j]} at {freqs[row]:.4g} Hz, entry "
-            f"({i}, {j}), and not finite at {len(bad)} places in all; leave the unit out, or look at its model."
-        )
+    return G, tuple(unit_ids or map(str, range(len(G)))), freqs

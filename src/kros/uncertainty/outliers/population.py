@@ -1,19 +1,30 @@
-"""Outlier scores of a population: every unit against the others, in every condition."""
+"""Outlier scores of a population: every unit against the others, in every condition.
+
+    factors of episodes --brought to one number of samples--> EDMD --> response of a unit
+
+At one alpha of Tikhonov a unit that was recorded less is drawn further towards zero, which looks like another machine.
+For scores every unit counts as recorded as long as the middle one of the study; of a unit recorded for less than half
+as long nothing is said, because shorter recordings scatter more.
+"""
 
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
-from functools import partial
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from ...core.work import Work
-from ...identify import ModelSet
+from ...identify import Factor, ModelSet, combine
+from ...identify.factors import lifted_factor
 from ...identify.identified import EpisodeFactors, IdentifiedModels
-from ..settings import QuantifySettings
+from ..settings import OUTLIER, QuantifySettings
 from .model import OutlierModel, score_outliers, scored_rows
-from .recorded import Recorded
-from .score import OutlierScore
+from .score import OutlierScore, Status
 from .tail import LEAST_SCORES
 
 log = logging.getLogger(__name__)
@@ -25,14 +36,11 @@ def score_population(
     """Score every unit in every condition, whatever its group."""
     places = {condition: models.place(models.edmd_kinds[0], condition) for condition in models.population.conditions}
     known = {condition: models.sets[place] for condition, place in places.items() if place in models.sets}
-    scored = {
-        condition: identified for condition, identified in known.items() if len(identified.unit_ids) >= LEAST_SCORES
-    }
+    scored = {condition: one for condition, one in known.items() if len(one.unit_ids) >= LEAST_SCORES}
     for condition in sorted(known.keys() - scored.keys()):
         log.info("%s: outlier scores need at least three units", condition)
     tasks = [partial(score_condition, models.factors[c], identified, settings) for c, identified in scored.items()]
-    rows: list[dict[str, Any]] = []
-    found: dict[str, OutlierModel] = {}
+    rows, found = list[dict[str, Any]](), dict[str, OutlierModel]()
     for condition, (outliers, samples) in zip(scored, (work or Work()).run("score outliers", tasks), strict=True):
         found[places[condition]] = outliers
         for score, n_samples in zip(outliers.scores, samples, strict=True):
@@ -75,3 +83,96 @@ def score_row(score: OutlierScore, condition: str, episodes: int, recorded_s: fl
     row = {"unit": score.unit, "condition": condition, "score": score.score_db, "threshold": score.threshold_db}
     row |= {key: getattr(score, key) for key in same} | {"detectable": score.detectable_percent}
     return row | {"episodes": episodes, "recorded_s": recorded_s, "needed_s": recorded_s * score.more_data}
+
+
+Array = npt.NDArray[Any]
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Episodes that a unit is identified from."""
+
+    factor: Factor  # parameter-free, batch (episode,)
+    lifted: Array  # (episode, q, q): factors of ``[Psi | Theta_plus]``
+
+    @classmethod
+    def of(cls, factor: Factor, models: ModelSet, parameters: Mapping[str, float]) -> Evidence:
+        """Lift the factors of one unit's episodes."""
+        values = {name: np.full(len(factor.R), parameters[name]) for name in models.lifting.parameters}
+        return cls(factor, lifted_factor(factor, models.lifting, values, models.lifting).R)
+
+    @property
+    def n_samples(self) -> int:
+        """Samples of all episodes."""
+        return int(self.factor.n_samples.sum())
+
+    def part(self, episodes: Sequence[int]) -> Evidence:
+        """Return some of the episodes."""
+        rows, f = list(episodes), self.factor
+        return Evidence(Factor(f.R[rows], f.peak[rows], f.n_samples[rows]), self.lifted[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """What a study recorded in one condition."""
+
+    models: ModelSet  # of the kind that is scored
+    units: Mapping[str, Evidence]  # training episodes of every unit of `models`
+    freqs_hz: Array  # (frequency,), Hz
+
+    @classmethod
+    def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:
+        """Take the units of models from the factors of all training episodes of a condition."""
+        f, units = factors.factor, {}
+        for unit in models.unit_ids:
+            rows, at = factors.rows_of(unit), models.index(unit)
+            factor = Factor(f.R[rows], f.peak[rows], f.n_samples[rows])
+            units[unit] = Evidence.of(factor, models, {k: float(v[at]) for k, v in models.parameters.items()})
+        return cls(models, units, freqs_hz)
+
+    @cached_property
+    def usual(self) -> float:
+        """Samples of the middle unit."""
+        return float(np.median([e.n_samples for e in self.units.values()]))
+
+    def response(self, evidence: Sequence[Evidence]) -> Array:
+        """Return responses of estimates, shape (estimate, frequency, n, m)."""
+        factors = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R for e in evidence]
+        sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
+        fitted = self.models.fit(np.stack(factors) * sizes[:, None, None])
+        names = tuple(map(str, range(len(factors))))
+        return replace(self.models, unit_ids=names, A=fitted.A, B=fitted.B).responses(self.freqs_hz)
+
+    def halves(self) -> tuple[Array, Array] | None:
+        """Return the responses of all units from every second episode, and from the others."""
+        several = [e for e in self.units.values() if len(e.lifted) > 1]
+        one, other = ([e.part(range(k, len(e.lifted), 2)) for e in several] for k in (0, 1))
+        return (self.response(one), self.response(other)) if several else None
+
+    def same_motions(self, factor: Factor) -> bool:
+        """Tell whether a unit was moved by inputs of the study alone."""
+        first = self.models.lifting.n_states + len(self.models.lifting.separation.basis)
+        inputs = slice(first, first + len(self.models.input_scale))
+        return _marks(factor, inputs) <= set().union(*(_marks(e.factor, inputs) for e in self.units.values()))
+
+    def same_recordings(self, factor: Factor) -> set[str]:
+        """Return units of the study that have an episode in common with some, by their factors."""
+        marks = _marks(factor)
+        return {unit for unit, e in self.units.items() if marks & _marks(e.factor)}
+
+    def suffices(self, evidence: Evidence) -> bool:
+        """Tell whether a unit was recorded for long enough to be compared with those of the study."""
+        return evidence.n_samples >= OUTLIER.recorded * self.usual
+
+    def qualified(self, score: OutlierScore, evidence: Evidence) -> OutlierScore:
+        """Return what can be said about a unit: nothing where it was recorded for too little."""
+        if self.suffices(evidence):
+            return score
+        score_db, more = min(score.score_db, score.threshold_db), OUTLIER.recorded * self.usual / evidence.n_samples
+        return replace(score, score_db=score_db, outlier=False, status=Status.NOT_ENOUGH_DATA, more_data=more)
+
+
+def _marks(factor: Factor, columns: slice = slice(None)) -> set[tuple[float, ...]]:
+    """Return the number of samples and the norms of some columns, to eight digits, of every episode."""
+    norms = np.linalg.norm(factor.R[..., columns], axis=-2)
+    return {(int(n), *(float(f"{v:.8g}") for v in row)) for n, row in zip(factor.n_samples, norms, strict=True)}

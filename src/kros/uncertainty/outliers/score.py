@@ -7,7 +7,7 @@ nothing is said about the unit instead of "ok".
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from typing import Any
@@ -67,11 +67,9 @@ class OutlierScore:
     @classmethod
     def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
         """Return a score as it was before it became JSON, which has neither infinity nor tuples."""
-        values: dict[str, Any] = {f.name: content[f.name] for f in fields(cls)}
-        if values["detectable_percent"] is None:
-            values["detectable_percent"] = float("inf")
-        entry, status = tuple(values["detectable_entry"]), Status(values["status"])
-        return cls(**values | {"threshold_db": threshold_db, "status": status, "detectable_entry": entry})
+        percent, entry = content["detectable_percent"], tuple(content["detectable_entry"])
+        values = {"threshold_db": threshold_db, "status": Status(content["status"]), "detectable_entry": entry}
+        return cls(**{**content, **values, "detectable_percent": float("inf") if percent is None else percent})
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,16 +96,9 @@ class Comparison:
         for unit, name in zip(units, ids, strict=True):
             value, margin = float(excess[unit]), margin_db[int(unit)]
             known = bool(np.isfinite(threshold) and np.isfinite(margin))
-            score = OutlierScore(
-                unit=name,
-                score_db=threshold + margin if known else value,
-                threshold_db=threshold,
-                outlier=known and margin > 0,
-                freq_hz=float(freqs[unit]),
-                excess_db=value,
-                lowest_db=float(lowest[unit]),
-                highest_db=float(highest[unit]),
-            )
+            levels_db = value, float(lowest[unit]), float(highest[unit])
+            score_db = threshold + margin if known else value
+            score = OutlierScore(name, score_db, threshold, known and margin > 0, float(freqs[unit]), *levels_db)
             scores.append(self._detectable(score, int(unit), value - margin) if known else score)
         return tuple(scores)
 
@@ -116,18 +107,11 @@ class Comparison:
         cover = float(self.distances.levels[unit].max()) - score.excess_db
         percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
         i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
-        smallest, status = float(percent[i, j, row]), Status.CANNOT_TELL
-        if score.outlier:
-            status = Status.OUTLIER
-        elif bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent:
-            status = Status.OK
-        return replace(
-            score,
-            status=status,
-            detectable_percent=smallest,
-            detectable_hz=float(self.freqs_hz[row]),
-            detectable_entry=(i, j),
-        )
+        smallest, hz = float(percent[i, j, row]), float(self.freqs_hz[row])
+        shows = bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent
+        inlier = Status.OK if shows else Status.CANNOT_TELL
+        status = Status.OUTLIER if score.outlier else inlier
+        return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz, detectable_entry=(i, j))
 
     @cached_property
     def _changes(self) -> Array:

@@ -13,18 +13,22 @@ maximum over units and singular values is smoothed by a Schatten norm of order 2
 whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at
 once with q rising to 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the
 optimum finite where residuals are triangular, and picks the smooth one where it is not unique.
+
+Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with `||Delta_k|| <= 1` at every frequency.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ...core.lti import StateSpace
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 from ..settings import FIT, PROOF
+from .proof import Method
 
 Array = npt.NDArray[Any]
 
@@ -43,10 +47,6 @@ class Cover:
         """Return the cover at some frequencies."""
         return Cover(self.left[rows], self.right[rows])
 
-    def entries(self) -> Array:
-        """Return `left_i right_j`, what the cover allows entry by entry, shape (frequency, p', m')."""
-        return self.left[:, :, None] * self.right[:, None, :]
-
     def cost_db(self) -> Array:
         """Return mean log left plus mean log right, in dB, shape (frequency,)."""
         return 20 * (np.log10(self.left).mean(axis=1) + np.log10(self.right).mean(axis=1))
@@ -55,6 +55,35 @@ class Cover:
         """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
         left, right = (1 / np.maximum(v.T, _TINY) for v in (self.left, self.right))
         return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
+
+
+@dataclass(frozen=True, eq=False)
+class Weight:
+    """Stable, minimum-phase diagonal weights that cover a set of residuals."""
+
+    left: StateSpace  # W_L, p' inputs and outputs
+    right: StateSpace  # W_R, m' inputs and outputs
+    left_orders: tuple[int, ...]  # of every diagonal entry
+    right_orders: tuple[int, ...]
+    cover_max: float  # largest `sigma_max(W_L^-1 E_k W_R^-1)` over units and the dense grid, as used; at most one
+    overbound_db_max: float  # dB: largest excess of `Cover.cost_db` over the optimal cover
+    method: Method = Method.GRID  # how the bound between grid points is known, see `proof`
+
+    def magnitudes(self, freqs_hz: npt.ArrayLike) -> Cover:
+        """Return the magnitudes of the diagonals at some frequencies."""
+        left, right = (side.frequency_response(freqs_hz) for side in (self.left, self.right))
+        return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
+
+    def scaled(self, factor: float) -> Weight:
+        """Return the weight with its left part multiplied."""
+        left = self.left
+        return replace(self, left=StateSpace(left.A, left.B, left.C * factor, left.D * factor, left.dt))
+
+    def measured(self, freqs_hz: Array, best: Cover) -> Weight:
+        """Return the weight with its overbound over the optimal cover at some frequencies."""
+        used, some = self.magnitudes(freqs_hz), best.left.min(axis=1) > 0
+        excess = (used.at(some).cost_db() - best.at(some).cost_db()).max(initial=0.0) if some.any() else 0.0
+        return replace(self, overbound_db_max=float(excess))
 
 
 def optimal_cover(E: Array) -> Cover:

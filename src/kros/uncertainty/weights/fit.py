@@ -1,12 +1,13 @@
 r"""Weights from residuals: a fit at few frequencies, a check at many, a proof at all.
 
 All magnitudes of a diagonal weight are fitted together (`joint`). The fit is checked on a grid ten times denser, with
-DC, Nyquist and the modes of units and weights; frequencies and units that it misses join it. What counts is the proof
+DC, Nyquist and the modes of units and weights; frequencies that it misses join it. What counts is the proof
 for the systems as returned (`proof`); at last the left weight is scaled until it touches.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -15,45 +16,39 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.frequency import bilinear_squared, dense_grid
-from ...core.lti import block_diagonal, gain
-from ..settings import FIT, PROOF
-from .cover import Cover, optimal_cover
-from .joint import JointFit, JointProblem, fit_jointly, refit
-from .proof import Method, certify
-from .residuals import Residuals
-from .weight import Weight
+from ...core.lti import StateSpace, block_diagonal, gain
+from ..forms import Form, completion, residual
+from ..settings import FIT, PROOF, SET
+from .cover import Cover, Weight, optimal_cover
+from .joint import JointProblem, fit_jointly, refit
+from .proof import Certificate, ResidualSystems, certify
 
 Array = npt.NDArray[Any]
 
 
-@dataclass(frozen=True)
-class Target:
-    """What a weight should be like: time of its systems, largest order of an entry, overbound that is good enough."""
+def fit_weight(
+    residuals: Residuals, freqs_hz: Array, sample_period_s: float, max_order: int = 4, tolerance_db: float = 1.0
+) -> tuple[Weight, Cover]:
+    """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`.
 
-    sample_period_s: float
-    max_order: int = 4
-    tolerance_db: float = 1.0
-
-
-def fit_weight(residuals: Residuals, freqs_hz: Array, target: Target) -> tuple[Weight, Cover]:
-    """Return diagonal weights that cover all units at all frequencies, and the optimal cover at `freqs_hz`."""
-    few, grid = residuals.deciding(freqs_hz), checking_grid(freqs_hz, target.sample_period_s)
-    fit = _Fit(few, residuals, freqs_hz, few.modes_hz(grid), target)
-    weight = fit.start()
-    proof = _proven(residuals, weight, fit.checked_hz)
+    The tolerance is the overbound at which a lower order of the entries is good enough.
+    """
+    fit = _Fit(residuals, freqs_hz, sample_period_s)
+    weight = fit.start(max_order, tolerance_db)
+    proof, ratio = fit.proven(weight)
     for _ in range(FIT.rounds):
         missed = fit.costly(weight)
         if proof.bound > FIT.deficit:
-            missed = np.append(missed, proof.missed_hz)
+            missed = np.concatenate([missed, fit.checked_hz[_peaks(ratio)], [proof.freq_hz]])
         if not missed.size:
             break
         weight = fit.again(missed)
-        proof = _proven(residuals, weight, fit.checked_hz)
+        proof, ratio = fit.proven(weight)
     if proof.bound > FIT.deficit:
         weight = weight.scaled(proof.bound)
-        proof = _proven(residuals, weight, fit.checked_hz)
-    cover = _raised(fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz)), residuals, freqs_hz)
-    return _lifted(weight, proof).measured(freqs_hz, cover), cover
+        proof, ratio = fit.proven(weight)
+    cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
+    return _lifted(weight, proof, float(ratio.max())).measured(freqs_hz, cover), cover
 
 
 def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
@@ -77,31 +72,27 @@ def joined(freqs_hz: Array, others_hz: Array) -> Array:
 
 
 class _Fit:
-    """One fit of the units that decide, and again with frequencies and units that it missed."""
+    """One fit, and again with frequencies that it missed."""
 
-    def __init__(
-        self, residuals: Residuals, everyone: Residuals, freqs_hz: Array, modes_hz: Array, target: Target
-    ) -> None:
-        self.residuals, self.everyone, self.target, self.band = residuals, everyone, target, freqs_hz[[0, -1]]
-        self.checked_hz = joined(checking_grid(freqs_hz, target.sample_period_s), modes_hz)
-        self.freqs_hz = joined(freqs_hz, modes_hz[(modes_hz >= self.band[0]) & (modes_hz <= self.band[1])])
-        self.shape = residuals.at(freqs_hz).shape[2:]
+    def __init__(self, residuals: Residuals, freqs_hz: Array, dt: float) -> None:
+        self.residuals, self.dt, self.band = residuals, dt, freqs_hz[[0, -1]]
+        grid, realised = checking_grid(freqs_hz, dt), residuals.realised
+        modes = np.zeros(0) if realised is None else realised.modes_hz(grid)
+        self.checked_hz = joined(grid, modes)
+        self.freqs_hz = joined(freqs_hz, modes[(modes >= self.band[0]) & (modes <= self.band[1])])
+        self.known = residuals.at(self.freqs_hz)
+        self.optimal = optimal_cover(self.known)
 
-    @cached_property
-    def optimal(self) -> Cover:
-        """The optimal cover that the weight follows."""
-        return optimal_cover(self.residuals.at(self.freqs_hz))
-
-    def start(self) -> Weight:
+    def start(self, max_order: int, tolerance_db: float) -> Weight:
         """Fit at evenly chosen frequencies, and at fewer beyond the band."""
-        dt, (p, m) = self.target.sample_period_s, self.shape
-        if not self.residuals.at(self.freqs_hz).any():
+        dt, (p, m) = self.dt, self.known.shape[2:]
+        if not self.known.any():
             return Weight(gain(np.zeros((p, p)), dt), gain(np.eye(m), dt), (0,) * p, (0,) * m, np.nan, np.nan)
         even = np.unique(np.linspace(0, len(self.freqs_hz) - 1, FIT.points).round().astype(int))
         beyond = self.checked_hz[(self.checked_hz < self.band[0]) | (self.checked_hz > self.band[1])][::4]
-        self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)), self.residuals)
-        self.fitted = fit_jointly(self.problem, near, self.target.max_order, self.target.tolerance_db)
-        return self._weight(self.fitted)
+        self.problem, near = self._problem(np.sort(np.append(self.freqs_hz[even], beyond)))
+        self.fitted = fit_jointly(self.problem, near, max_order, tolerance_db)
+        return self._weight()
 
     def costly(self, weight: Weight) -> Array:
         """Return the frequencies between those of the fit, Hz, at which the weight costs more than at them."""
@@ -111,19 +102,30 @@ class _Fit:
         return np.asarray(self.freqs_hz[_peaks(10 ** ((np.nan_to_num(cost, posinf=0.0) - FIT.missed_db) / 20))])
 
     def again(self, missed_hz: Array) -> Weight:
-        """Fit again, with the largest residuals of all units at further frequencies."""
-        self.problem = self.problem.joined(self._problem(np.unique(missed_hz), self.everyone)[0])
+        """Fit again, with the largest residuals at further frequencies."""
+        self.problem = self.problem.joined(self._problem(np.unique(missed_hz))[0])
         self.fitted = refit(self.problem, self.fitted.sections)
-        return self._weight(self.fitted)
+        return self._weight()
 
-    def _weight(self, fitted: JointFit) -> Weight:
-        systems, orders = fitted.sections.systems(self.target.sample_period_s), tuple(fitted.sections.orders.tolist())
-        p = self.shape[0]
+    def proven(self, weight: Weight) -> tuple[Certificate, Array]:
+        """Certify a weight for all units; return its largest ratios on the checked grid, too."""
+
+        def ratio(freqs_hz: Array) -> Array:
+            return self.residuals.ratio(weight.magnitudes(freqs_hz), freqs_hz)
+
+        known, realised = ratio(self.checked_hz), self.residuals.realised
+        sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
+        pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
+        return certify(ratio, self.checked_hz, known, pencils, weight.left.dt), known.max(axis=0)
+
+    def _weight(self) -> Weight:
+        sections, p = self.fitted.sections, self.known.shape[2]
+        systems, orders = sections.systems(self.dt), tuple(sections.orders.tolist())
         return Weight(block_diagonal(systems[:p]), block_diagonal(systems[p:]), orders[:p], orders[p:], np.nan, np.nan)
 
-    def _problem(self, freqs_hz: Array, residuals: Residuals) -> tuple[JointProblem, Cover]:
+    def _problem(self, freqs_hz: Array) -> tuple[JointProblem, Cover]:
         """Return the largest residuals by the optimal cover, with its cost within the band, and the cover."""
-        best, E = self.optimal, residuals.at(freqs_hz)
+        best, E = self.optimal, self.residuals.at(freqs_hz)
         known = np.flatnonzero(best.left.min(axis=1) > 0)
         cover = best.at(known[np.searchsorted(self.freqs_hz[known], freqs_hz).clip(0, len(known) - 1)])
         leading = np.argsort(-cover.ratio(E), axis=0)[: FIT.units]
@@ -131,53 +133,16 @@ class _Fit:
         cost = np.log(best.left[known]).mean(axis=1) + np.log(best.right[known]).mean(axis=1)
         inside = (freqs_hz >= self.band[0]) & (freqs_hz <= self.band[1])
         optimal = np.where(inside, np.interp(freqs_hz, self.freqs_hz[known], cost), np.inf)
-        tau = bilinear_squared(freqs_hz, self.target.sample_period_s)
+        tau = bilinear_squared(freqs_hz, self.dt)
         return JointProblem.of(tau[some], optimal[some], E[leading[:, some], some]), cover.at(some)
 
 
-@dataclass(frozen=True)
-class _Proof:
-    """What all blocks of units are within."""
-
-    method: Method
-    bound: float  # largest ratio
-    on_grid: float  # of those, largest one on the grids
-    missed_hz: Array  # where units are beyond the weight
-
-
-def _proven(residuals: Residuals, weight: Weight, grid: Array) -> _Proof:
-    """Certify a weight for all units, in blocks, so that memory does not grow with their number."""
-    proofs, on_grid, missed = [], [], []
-    for some in map(residuals.of, residuals.blocks()):
-        claimed, realised = joined(grid, some.modes_hz(grid)), some.realised if some.proven else None
-
-        def ratio(freqs_hz: Array, some: Residuals = some) -> Array:
-            return weight.magnitudes(freqs_hz).ratio(some.at(freqs_hz))
-
-        known = ratio(claimed)
-        sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
-        pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
-        proofs.append(certify(ratio, claimed, known, pencils, weight.left.dt))
-        on_grid.append(float(known.max()))
-        missed.append(np.append(claimed[_peaks(known.max(axis=0))], proofs[-1].freq_hz))
-    method = Method.GRID if any(proof.method is Method.GRID for proof in proofs) else Method.LEVEL_SETS
-    return _Proof(method, max(*(p.bound for p in proofs), *on_grid), max(on_grid), np.concatenate(missed))
-
-
-def _raised(cover: Cover, residuals: Residuals, freqs_hz: Array) -> Cover:
-    """Return a cover raised at the frequencies at which units of a large population are beyond it."""
-    if len(residuals) <= FIT.block:
-        return cover
-    largest = np.max([cover.ratio(residuals.of(rows).at(freqs_hz)).max(axis=0) for rows in residuals.blocks()], axis=0)
-    return Cover(cover.left * np.maximum(largest, 1.0)[:, None], cover.right)
-
-
-def _lifted(weight: Weight, proof: _Proof) -> Weight:
+def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift = proof.bound * (1 + PROOF.rounding)
+    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding)
     if not lift > 0:
         return replace(weight, cover_max=0.0, method=proof.method)
-    return replace(weight.scaled(lift), cover_max=proof.on_grid / lift, method=proof.method)
+    return replace(weight.scaled(lift), cover_max=on_grid / lift, method=proof.method)
 
 
 def _peaks(ratio: Array) -> Array:
@@ -185,3 +150,35 @@ def _peaks(ratio: Array) -> Array:
     inner = np.concatenate([[-np.inf], ratio, [-np.inf]])
     tops = np.flatnonzero((ratio >= inner[:-2]) & (ratio >= inner[2:]) & (ratio > 1))
     return np.sort(tops[np.argsort(-ratio[tops])[: PROOF.worst]])
+
+
+@dataclass(frozen=True, eq=False)
+class Residuals:
+    """Residuals of scaled units against a nominal, or remainders of the form, as functions of frequency, Hz."""
+
+    form: Form
+    nominal: Callable[[Array], Array]  # response (frequency, p, m)
+    units: Callable[[Array, slice], Array]  # responses (unit, frequency, p, m) of some units
+    count: int  # of units
+    systems: tuple[StateSpace, StateSpace] | None = None  # nominal and units, whose modes and pencils are looked at
+    remainder: bool = False
+
+    def pieces(self, freqs_hz: Array) -> Iterator[tuple[Array, Array]]:
+        """Yield responses and residuals, a few units at a time: memory does not grow with their number."""
+        G, step = self.nominal(freqs_hz), max(1, SET.at_once // max(1, len(freqs_hz)))
+        for start in range(0, self.count, step):
+            Gp = self.units(freqs_hz, slice(start, start + step))
+            yield Gp, completion(self.form, G, Gp)[1] if self.remainder else residual(self.form, G, Gp)
+
+    def at(self, freqs_hz: Array) -> Array:
+        """Return residuals, shape (unit, frequency, p', m')."""
+        return np.concatenate([E for _, E in self.pieces(freqs_hz)])
+
+    def ratio(self, cover: Cover, freqs_hz: Array) -> Array:
+        """Return the ratios of all units to a cover at the same frequencies, shape (unit, frequency)."""
+        return np.concatenate([cover.ratio(E) for _, E in self.pieces(freqs_hz)])
+
+    @cached_property
+    def realised(self) -> ResidualSystems | None:
+        """The systems behind these residuals."""
+        return None if self.systems is None else ResidualSystems(self.form, *self.systems, self.remainder)

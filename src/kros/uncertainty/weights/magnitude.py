@@ -1,14 +1,25 @@
 r"""Log-Chebyshev fit of one magnitude by a stable, minimum-phase system from above.
 
 Of all squared magnitudes `n / d` of one order with `m^2 <= n / d <= gamma m^2` on the grid, the one with the smallest
-`gamma` is found: a quasi-convex problem in the coefficients a and b of n and d (`rational`). Dinkelbach's iteration
-solves it by linear programs, with `e` the denominator of the step before and mean(d / e) = 1:
+`gamma` is found: a quasi-convex problem in the coefficients a and b of n and d. Dinkelbach's iteration solves it by
+linear programs, with `e` the denominator of the step before and mean(d / e) = 1:
 
     minimise t  s.t.  d_i <= n_i / f_i,  n_i / (gamma f_i) - d_i <= t e_i
 
 It converges superlinearly to the global optimum, from any denominator. Rows are relative to the denominator, columns to
 their largest entry, because programs are solved to absolute tolerances. After every program the true ratios are
 recomputed, `n` is lifted by the deficit, and both are proven positive on the whole axis by the location of their roots.
+
+Squared magnitudes are rational in tau:
+
+    n(tau) = sum_k a_k phi_k(tau),   d(tau) = sum_k b_k phi_k(tau),   k = 0 ... order
+    phi_k(tau) = prod_(j <= k) tau / (tau + tau_j)  prod_(j > k) tau_j / (tau + tau_j)
+
+`phi_k` is the power `tau^k` over the common denominator `prod (tau + tau_j)`, of size one between two knots and small
+elsewhere: real poles and zeros give positive coefficients, and nothing cancels over any number of decades. With
+`w = (z - 1) / (z + 1)`, `w^2 = -tau` on the unit circle: a root `t` off the half-line `[0, inf)` gives the zero or pole
+`w = -sqrt(-t)` in the open left half-plane, inside the unit circle of `z`. Roots come from arithmetic of 30 digits,
+because they spread over twice as many decades as the frequencies.
 
 References
 ----------
@@ -18,7 +29,7 @@ W. Dinkelbach, "On nonlinear fractional programming", Management Science 13 (196
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -30,7 +41,6 @@ from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
 from ..settings import MAGNITUDE
-from .rational import RationalMagnitude, basis
 from .sections import Sections
 
 Array = npt.NDArray[Any]
@@ -213,11 +223,8 @@ class _Grid:
             spread = float(ratio.max() / ratio.min())
             if spread >= gamma * MAGNITUDE.settled:
                 break
-            best, settled = (
-                RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots),
-                spread < MAGNITUDE.exact,
-            )
-            gamma, scale = spread, d
+            best = RationalMagnitude(solution[0] / ratio.min(), solution[1], self.knots)
+            gamma, scale, settled = spread, d, spread < MAGNITUDE.exact
         return best
 
     def _solved(self, scale: Array, gamma: float) -> tuple[Array, Array] | None:
@@ -228,12 +235,10 @@ class _Grid:
         n = d / self.targets[:, None]
         edge, size = self.edge / scale[self.nearest, None], self.phi.shape[1]
         one, none = np.ones((len(n), 1)), np.zeros_like(edge)
-        rows = [np.hstack([n / gamma, -d, -one]), np.hstack([-n, d, 0 * one])]
-        rows.append(np.hstack([edge / self.targets[self.nearest, None], none, none[:, :1]]))
-        rows.append(np.hstack([none, edge, none[:, :1]]))
+        ends = [edge / self.targets[self.nearest, None], none, none[:, :1]], [none, edge, none[:, :1]]
         with np.errstate(all="ignore"):
             unit = np.concatenate([1 / n.max(axis=0), 1 / d.max(axis=0), [1.0]])
-            table = np.vstack(rows) * unit
+            table = np.block([[n / gamma, -d, -one], [-n, d, 0 * one], *ends]) * unit
             table /= np.abs(table).max(axis=1, keepdims=True)
         if not np.isfinite(table).all():  # a basis function that is zero on the grid
             return None
@@ -248,12 +253,79 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     """Return magnitudes with a relative floor."""
     values = np.asarray(magnitude, float)
     if values.shape != freqs.shape:
-        raise DimensionError(
-            f"Magnitude fit: needs a magnitude at each of {len(freqs)} frequencies, found {values.shape}."
-        )
+        raise DimensionError(f"Magnitude fit: needs one at each of {len(freqs)} frequencies, found {values.shape}.")
     valid = np.isfinite(values) & (values >= 0)
     if not valid.all():
         where = int(np.argmin(valid))
         problem = "Magnitude fit: magnitudes should be finite and not negative"
         raise DataError(f"{problem}, found {values[where]} at {freqs[where]} Hz; look at the responses.")
     return np.maximum(values, MAGNITUDE.floor * values.max())
+
+
+_ROUNDING = 4096 * np.finfo(float).eps
+
+
+@dataclass(frozen=True, eq=False)
+class RationalMagnitude:
+    """Squared magnitude `n / d` in tau."""
+
+    numerator: Array  # (order + 1,): coefficients a
+    denominator: Array  # (order + 1,): coefficients b
+    knots: Array  # (order,): the tau_k
+
+    def __call__(self, tau: npt.ArrayLike) -> Array:
+        """Return the squared magnitude, shape of `tau`; infinity (Nyquist) is allowed."""
+        phi = basis(np.asarray(tau, float), self.knots)
+        return (phi @ self.numerator) / (phi @ self.denominator)
+
+    def not_positive(self) -> list[float]:
+        """Return the tau >= 0 at which numerator or denominator vanish."""
+        sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
+        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
+
+    def factor(self) -> Sections:
+        """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
+        bad = self.not_positive()
+        ends = self.numerator[[0, -1]] / self.denominator[[0, -1]]
+        if bad or not (np.isfinite(ends).all() and (ends > 0).all()):
+            problem = f"is {ends} at DC and Nyquist, and zero or infinite at tau = {bad}"
+            raise KrosError(f"Spectral factor: the squared magnitude {problem}; try another order.")
+        sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
+        zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in sides)
+        distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
+        if not (distance > _ROUNDING / 10).all():
+            problem = f"a pole or zero is {distance.min():.1e} from the unit circle, too near for double precision"
+            raise KrosError(f"Spectral factor: {problem}; try another order.")
+        return Sections.of_roots(float(np.log(ends[0]) / 2), zeros, poles)
+
+
+def basis(tau: Array, knots: Array) -> Array:
+    """Return phi, shape (..., order + 1)."""
+    with np.errstate(divide="ignore"):
+        up = 1.0 / (1.0 + knots / tau[..., None])
+    down = 1.0 / (1.0 + tau[..., None] / knots)
+    one = np.ones((*tau.shape, 1))
+    rising = np.concatenate([one, np.cumprod(up, axis=-1)], axis=-1)
+    falling = np.concatenate([np.cumprod(down[..., ::-1], axis=-1)[..., ::-1], one], axis=-1)
+    return rising * falling
+
+
+def roots(coefficients: Array, knots: Array) -> Sequence[complex]:
+    """Return the roots in tau of `sum a_k phi_k`, whose first and last coefficients are not zero."""
+    import mpmath
+
+    order = len(knots)
+    if not (np.isfinite(coefficients).all() and coefficients[0] and coefficients[-1]):
+        raise KrosError(f"Spectral factor: no {order} roots of coefficients {coefficients}; try another order.")
+    with mpmath.workdps(MAGNITUDE.digits):
+        unit = mpmath.mpf(float(np.exp(np.log(knots).mean()))) if order else mpmath.mpf(1)
+        powers, factor = [mpmath.mpf(0)] * (order + 1), mpmath.mpf(1)  # highest power first
+        for k in range(order, -1, -1):
+            powers[order - k] = mpmath.mpf(float(coefficients[k])) * factor
+            factor *= mpmath.mpf(float(knots[k - 1])) / unit if k else 1
+        try:
+            start = np.roots([float(c) for c in powers])
+            settled = mpmath.polyroots(powers, maxsteps=60, extraprec=200, roots_init=start.tolist())
+        except (mpmath.mp.NoConvergence, np.linalg.LinAlgError, ZeroDivisionError) as error:
+            raise KrosError(f"Spectral factor: roots of degree {order} did not settle; try another order.") from error
+        return [complex(r * unit) for r in settled]

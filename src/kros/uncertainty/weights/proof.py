@@ -4,7 +4,7 @@ r"""What a weight promises between grid points: the largest `sigma_max(W_L^-1 E_
 equals gamma exactly where a pencil is singular for an imaginary s. The gain is evaluated at and between its eigenvalues
 until no level higher by more than the margin is met by any unit. Eigenvalues are rounded: the pencil is tried first at
 a level below the peak, where the grid has all crossings, and when it misses one the proof is refused. **Grid**:
-responses alone, continuous systems and refused proofs have the peaks of a dense grid, which proves nothing between its
+responses alone and refused proofs have the peaks of a dense grid, which proves nothing between its
 points.
 
 Residuals, what forms leave out, and their ratios to weights are descriptor systems, `s F x = A x + B u, y = C x + D u`
@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Any
 
@@ -242,7 +242,8 @@ class ResidualSystems:
         """Return frequencies of modes of residuals and plants that a grid from DC to Nyquist passes over."""
         dt = self.nominal.dt
         plants = (self.nominal, *(self.units[k] for k in range(self.units.batch_shape[0])))
-        modes = np.concatenate([s.poles() for s in (*self, *map(Descriptor.of, plants))]).astype(complex)
+        parts = (*replace(self, remainder=False), *map(Descriptor.of, plants))
+        modes = np.concatenate([part.poles() for part in parts]).astype(complex)
         omega = modes.imag[modes.imag > 0]
         half = np.abs(modes.real[modes.imag > 0])
         at_hz, width_hz = np.arctan(omega) / (np.pi * dt), half / (1 + omega**2) / (np.pi * dt)

@@ -25,7 +25,7 @@ from ...data.prepare import parse_steps, prepare
 from ...data.survey import Copy, check_usable, survey
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve
-from ...identify import ModelSet
+from ...identify import ModelSamples, ModelSet
 from ...identify.calibration import calibrate
 from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
@@ -129,9 +129,9 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks: list[Task] = [
-        (folder / kind / "noise", partial(_noise, context, kind, sets[kind]))
+        (folder / kind / "noise", task)
         for kind in models.edmd_kinds
-        if kind in sets
+        if kind in sets and (task := _noise(context, kind, sets[kind])) is not None
     ]
     tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
@@ -149,15 +149,23 @@ def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
         return None
 
 
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> NoiseShare:
-    """Compare variation and noise over some units, the nominal one among them."""
+def _noise(context: Context, name: str, uncertain: UncertainModel) -> Callable[[], NoiseShare] | None:
+    """Return work that compares variation and noise over some units, the nominal one among them."""
     units, models = uncertain.unit_ids, context.identified.models(name)
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
-    samples = resampling(context, name, chosen)()
+    try:
+        samples = resampling(context, name, chosen)
+    except KrosError as error:  # single episodes
+        log.info("%s: variation and noise are not separated: %s", name, error)
+        return None
+    return partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
+
+
+def _compared(samples: Callable[[], ModelSamples], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
     scale = models.output_scale[:, None] / models.input_scale
-    freqs, nominal = models.frequencies(DEFAULT.noise_points), chosen.index(uncertain.nominal_id)
-    return noise_share(samples, scale, freqs, models.sample_period_s, uncertain.form, nominal)
+    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
+    return noise_share(samples(), scale, freqs, dt, form, nominal)
 
 
 def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:

@@ -3,7 +3,8 @@
 A flat top is a run of samples at a signal's extreme value, within its noise. It may be a smooth peak, a commanded
 plateau, the top level of a coarse signal, or a limit. It counts as a limit where
 
-- the signal is constant there and changes sharply before or after (a smooth peak falls with the square of the time),
+- the signal comes there from elsewhere (at the start of an episode, what rests or begins at ambient stands still, too),
+- it is constant there and changes sharply before or after (a smooth peak falls with the square of the time),
 - it is there several times, in more than one episode, at the same value, and nothing was recorded beyond,
 - every input took different values there: what an input holds at one value may be that input's doing.
 
@@ -97,7 +98,9 @@ def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: flo
     edges = np.flatnonzero(np.diff(np.concatenate([[False], signal >= top - width, [False]])))
     long = edges[1::2] - edges[::2] >= _RULE.shortest
     starts, stops = edges[::2][long], edges[1::2][long]
-    steep = _steep(signal, starts, stops, top - _RULE.far * width)
+    far = top - _RULE.far * width
+    arrived = np.minimum.accumulate(signal)[starts] < far
+    steep = arrived & _steep(signal, starts, stops, far)
     columns = [_means(signal, starts, stops), stops - starts, steep, *(_means(u, starts, stops) for u in inputs.T)]
     return FlatTops(unit, episode, top, width, np.column_stack(columns).astype(float))
 

@@ -58,6 +58,7 @@ NO_LIMITS = {
         held(np.random.default_rng(k).uniform(-1, 1, 10), 400),
     ),
     "one unit goes further": lambda k: (np.clip(swing(k), -1 - 0.2 * (k == 2), 1 + 0.2 * (k == 3)), swing(k)),
+    "a start at ambient": lambda k: (26 + np.maximum(0.0, (T - 0.2 - 0.01 * k)) * (1 + 0.1 * k), swing(k)),
     "another limit in every episode": lambda k: (np.clip(swing(k), -1 - 0.1 * k, 1 + 0.1 * k), swing(k)),
 }
 LIMITS = {

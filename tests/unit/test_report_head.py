@@ -196,5 +196,11 @@ def test_observers_are_ranked_by_their_errors() -> None:
 
 def test_the_bound_of_a_filter_bank_is_that_of_units_left_out() -> None:
     facts = Facts(metrics(observers={NAME: {**BOUND, "set_bound": {"velocity": 0.5}}}))
-    expected = "Measured on units left out of its regression: the RMS error is at most 0.500 rad/s in velocity."
-    assert judge(facts).certified[0] == expected
+    expected = "Measured on units left out of its regression: the RMS error is at most 0.500 rad/s in velocity; about "
+    assert judge(facts).certified[0] == f"{expected}one new unit in 4 exceeds it."
+
+
+def test_a_large_error_is_a_reason_to_check() -> None:
+    verdict = judge(Facts(metrics(evaluation=[row(NAME, 13.1), row("koopman/open_loop", 40.0)])))
+    assert verdict.status is Status.CHECK
+    assert [r.text for r in verdict.reasons] == ["The error is large: velocity (13.1 % of the largest value)."]

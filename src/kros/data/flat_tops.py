@@ -1,8 +1,9 @@
 """Limits that show in recordings: a state that is cut off at one and the same extreme value, whatever the inputs are.
 
-A flat top is a run of samples at a signal's extreme value, within its noise. It counts as a limit where the signal
-changes sharply before or after (a smooth peak falls with the square of the time), where it is there several times, in
-more than one episode, with nothing beyond, and where every input took different values.
+A flat top is a run of samples at a signal's extreme value, within its noise. It counts as a limit where the signal comes
+from elsewhere (what rests at the start of an episode stands still, too) and changes sharply before or after (a smooth
+peak falls with the square of the time), where it is there several times, in more than one episode, with nothing beyond,
+and where every input took different values.
 """
 
 from __future__ import annotations
@@ -89,7 +90,9 @@ def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: flo
     edges = np.flatnonzero(np.diff(np.concatenate([[False], signal >= top - width, [False]])))
     long = edges[1::2] - edges[::2] >= _RULE.shortest
     starts, stops = edges[::2][long], edges[1::2][long]
-    steep = _steep(signal, starts, stops, top - _RULE.far * width)
+    far = top - _RULE.far * width
+    arrived = np.minimum.accumulate(signal)[starts] < far
+    steep = arrived & _steep(signal, starts, stops, far)
     columns = [_means(signal, starts, stops), stops - starts, steep, *(_means(u, starts, stops) for u in inputs.T)]
     return FlatTops(unit, episode, top, width, np.column_stack(columns).astype(float))
 

@@ -25,6 +25,7 @@ class Thresholds:
 
     better: float = 0.05  # share by which all mean errors of another observer are smaller
     improved: float = 0.01  # share by which a correction must reduce the error of the model alone
+    large: float = 0.1  # mean error of a hidden channel, share of its largest value
     noise: float = 0.5  # share of estimation noise in the largest difference between units
 
 
@@ -202,6 +203,10 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
     if 0 < len(same) < len(hidden):
         text = f"The correction does not improve {channels(same)}: the model alone is as good."
         yield text, "Do not rely on the estimate more than on the model.", "errors"
+    errors = {c: table.cells[facts.deployed][c].mean for c in hidden}
+    if large := {c: e for c, e in errors.items() if e is not None and e > 100 * THRESHOLDS.large}:
+        each = joined([f"{words(c)} ({number(e)} % of the largest value)" for c, e in large.items()])
+        yield f"The error is large: {each}.", "Measure another signal, or use the estimate for trends alone.", "errors"
     for channel, bound in (facts.entry.get("set_bound") or {}).items():
         cell = table.cells[facts.deployed].get(channel)
         if cell is not None and cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
@@ -254,7 +259,8 @@ def certificates(facts: Facts) -> list[str]:
         parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
         bank = split(facts.deployed)[1] == "estimator"
         source = "Measured on units left out of its regression" if bank else "For recorded signals"
-        texts.append(f"{source}: the RMS error is at most {joined(parts)}.")
+        share = f"; about one new unit in {facts.study['units'] + 1} exceeds it" if bank else ""
+        texts.append(f"{source}: the RMS error is at most {joined(parts)}{share}.")
     if entry.get("relift_certified"):
         gain = number(entry.get("relift_gain"))
         texts.append(f"At run time: the gain from the model's one-step residual to the error is at most {gain}.")

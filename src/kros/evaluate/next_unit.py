@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
-_ROUNDING = 1e-9  # 0.9 / (1 - 0.9) is a little more than 9
 
 
 def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
@@ -31,7 +31,7 @@ def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]
 
 def fewest_units(confidence: float) -> int:
     """Return how many units bound the next one: ``1 / (1 - confidence) - 1``, rounded up."""
-    return ceil(confidence / (1 - confidence) - _ROUNDING)
+    return ceil(confidence / (1 - confidence) - ITERATED)  # 0.9 / (1 - 0.9) is a little more than 9
 
 
 def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: float = 0.95) -> Array | None:
@@ -76,5 +76,5 @@ def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: flo
     if len(errors) < fewest_units(confidence):
         return None
     scores = np.max(np.where(np.isfinite(errors), errors, np.inf) / scale, axis=1)
-    rank = ceil(confidence * (len(errors) + 1) - _ROUNDING)
+    rank = ceil(confidence * (len(errors) + 1) - ITERATED)
     return np.sort(scores)[rank - 1] * scale

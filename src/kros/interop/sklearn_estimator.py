@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
+from ..core.rounding import ROUNDING
 from ..identify import edmd, free_run
 from ..identify.edmd import relative_pivots
 from ..identify.factors import triangular
@@ -279,7 +280,7 @@ def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
     if n_pairs < len(names):
         problem = f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]"
         raise DataError(f"{problem}; record more, or use alpha > 0.")
-    dependent = np.flatnonzero(relative_pivots(R) <= 450 * np.finfo(float).eps)  # what rounding leaves of a sum
+    dependent = np.flatnonzero(relative_pivots(R) <= ROUNDING)
     if dependent.size:
         problem = f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified"
         reason = "it depends on the columns before it, or is zero"

@@ -29,9 +29,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
+from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
-_FORGOTTEN = 1e-9  # samples: an age whose square counts as nothing beside any half
+_FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 _ARRAYS = ("start", "forget", "half", "recovery", "reach")
 
 

@@ -25,15 +25,13 @@ from ...core.errors import DimensionError, SynthesisError
 from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
-from ...core.rounding import TINY
+from ...core.rounding import ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
 
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
-
-_NEGLIGIBLE = 1e-12
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +246,7 @@ class _Scaled:
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
         seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T, self.dt)[-shaping.n_states :]
-        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, _NEGLIGIBLE)
+        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, ROUNDING)
         allowed = (1 + tolerance_percent / 100) * best[self.hidden]
 
         def of_order(k: int) -> StateSpace:

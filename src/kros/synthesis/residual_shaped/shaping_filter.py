@@ -27,10 +27,10 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace
+from ...core.rounding import ITERATED, ROUNDING
 
 Array = npt.NDArray[Any]
-_FLOOR = 1e-12  # white noise of every channel, relative to the largest, which keeps the Gramian regular
-_PREDICTABLE = 1e-10
+_FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Basis:
 
     delays: int = 8
     # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
-    poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
+    poles: tuple[float, ...] = tuple(1 - b / 10.0**k for k, b in ((1, 1), (2, 3), (2, 1), (3, 3)))
 
     def __post_init__(self) -> None:
         if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):
@@ -101,7 +101,7 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     Theta = np.linalg.solve(G, cross.T).T if k else cross
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
-    if values.max() <= _PREDICTABLE * largest:
+    if values.max() <= ITERATED * largest:
         error = f"{np.sqrt(max(values.max(), 0) / largest):.1g} of its size"
         problem = f"the residual can be predicted to {error}, it is constant or a few tones"
         raise SynthesisError(f"Shaping filter: {problem}; record longer or richer episodes.")

@@ -17,7 +17,7 @@ from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
-from ...core.rounding import ITERATED, TINY
+from ...core.rounding import EPS, ITERATED, SINGULAR, TINY
 
 Array = npt.NDArray[Any]
 
@@ -82,7 +82,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
             Ak = Ak @ WA
             if not np.isfinite(H).all():
                 return None
-            if np.linalg.norm(step) <= 1e-16 * np.linalg.norm(H):
+            if np.linalg.norm(step) <= EPS * np.linalg.norm(H):
                 return H
     except np.linalg.LinAlgError:
         return None
@@ -94,7 +94,7 @@ def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
     if not np.any(D22):
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
-    if np.linalg.cond(loop) > 1e12:
+    if np.linalg.cond(loop) > SINGULAR:
         raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)

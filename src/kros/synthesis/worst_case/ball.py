@@ -38,10 +38,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
-from ...core.rounding import EPS, TINY
+from ...core.rounding import AGREED, EPS, TINY
 from ..problem.observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
+_SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +96,7 @@ class Ball:
             for k in range(iterations + 1):
                 error = certain + T @ (self.center + self.left @ theta @ self.right)
                 value = np.linalg.norm(error, axis=(-2, -1))
-                better = value > best_value * (1 + 1e-6) if k in (0, iterations) else np.zeros_like(value, bool)
+                better = value > best_value * (1 + AGREED) if k in (0, iterations) else np.zeros_like(value, bool)
                 best = np.where(better[..., None, None], theta, best)
                 best_value = np.where(better, value, best_value)
                 theta = polar(adjoint(P) @ error @ Qh)
@@ -148,7 +149,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     rounding = 4 * EPS
     g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
     slack = g[..., :, None] + multipliers[..., None, :] - d
-    rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
+    rest = np.where(c > 0, c / np.maximum(slack, _SMALL), 0.0).sum(axis=(-2, -1))
     squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
     return np.where(np.isfinite(squared), np.sqrt(squared), np.inf)
 
@@ -184,7 +185,7 @@ def _best_rows(c: Array, shift: Array, steps: int = 4) -> Array:
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
     for _ in range(steps):
-        inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
+        inverse = 1 / np.maximum(x[:, None] + gap, _SMALL)
         terms = c * inverse * inverse
         h = np.maximum(terms.sum(axis=1), TINY)
         slope = np.maximum((terms * inverse).sum(axis=1), TINY)

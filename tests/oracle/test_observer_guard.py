@@ -9,7 +9,8 @@ from batches import run_with_status
 from kros.core import StateSpace
 from kros.export import CompiledObserver, export_c
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Observer, Runtime, SampleStatus
+from kros.observer import Observer, Runtime, SampleStatus
+from kros.observer.filter_bank import FilterBank
 from kros.observer.runtime import Guard
 from kros.observer.simulate import Course
 from kros.synthesis import Injection

@@ -14,7 +14,7 @@ from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import error_rms
+from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops.filtering import recursion
 from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
@@ -60,10 +60,7 @@ def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSe
 
 
 def certified_on(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
-    """Return episodes whose signals make the certified set, and the same of every other condition.
-
-    They are the start of the first episode of every unit, or all of short ones.
-    """
+    """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
     others: dict[str, list[EpisodeKey]] = {}
     for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
-from ..evaluate import error_rms
+from ..evaluate.errors import error_rms
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels

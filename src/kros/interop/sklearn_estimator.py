@@ -171,18 +171,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         predicted = self._step(values[:, :n], values[:, n:])
         return predicted[:, 0] if self._one_dimensional else predicted
 
-    def predict_trajectory(self, X: Any) -> Array:
-        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states).
-
-        Parameters
-        ----------
-        X : array_like or DataFrame, shape (n_samples, n_columns)
-            Of the states only the first row of each episode is used; the state is retracted and lifted again at every
-            step.
-        """
-        check_is_fitted(self)
-        return self._free_run(*self._read(X, reset=False))
-
     def score(self, X: Any, y: Any = None) -> float:
         """Return R2 of the prediction `horizon` samples ahead, the mean over the states; -inf where it diverges.
 

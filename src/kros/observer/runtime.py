@@ -143,13 +143,7 @@ class Runtime:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Bounds of the states of an observer, and how long a start takes.
-
-    An observer is stable with the measurements that it was made for. Without some of them it runs on its own
-    predictions, which may grow. The step that would leave the bounds is not taken, the estimate stands still, and at
-    the next sample with a measurement and all inputs the observer starts as it did at first. `SampleStatus.RESTARTED`
-    is set from there on until the start has settled.
-    """
+    """Bounds of an observer's states: a step beyond them is not taken, the next good sample starts it again."""
 
     lower: Array  # (n,), of the estimate, internal states included
     upper: Array

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -122,18 +122,6 @@ class Stepped:
             getattr(self, name)[:, machines] = getattr(part, name)
 
 
-class Loop(Protocol):
-    """What changes a parameter of the lifting from sample to sample (`tracking`)."""
-
-    name: str
-
-    def begin(self, machines: Flags) -> None:
-        """Start some machines again."""
-
-    def step(self, steps: Steps, y: Array, u: Array) -> Array:
-        """Move the observer on by a sample, and return the parameter for the next one, shape (batch,)."""
-
-
 class Restarts:
     """Counts down, over a batch of machines, until their starts have settled."""
 
@@ -148,10 +136,14 @@ class Restarts:
 
 
 class Course:
-    """An observer on its way through recordings that come in blocks: all that a block leaves for the next one."""
+    """An observer on its way through blocks of recordings, where a `PhaseLockedLoop` may move a parameter."""
 
     def __init__(
-        self, observer: ObserverData, batch: int = 1, parameters: Parameters | None = None, loop: Loop | None = None
+        self,
+        observer: ObserverData,
+        batch: int = 1,
+        parameters: Parameters | None = None,
+        loop: Any = None,
     ) -> None:
         values: dict[str, Any] = observer.values(parameters, (batch,))
         if loop is not None:

@@ -106,10 +106,7 @@ def _rank(matrix: Array) -> int:
 
 
 def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
-    """Invariant zeros on the stability boundary.
-
-    D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C.
-    """
+    """Zeros on the stability boundary: D of full column rank, eigenvalues of A - B D^+ C that the rest of C sees."""
     pinv = np.linalg.pinv(D)
     inner, seen = _balanced((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T)
     zeros = []

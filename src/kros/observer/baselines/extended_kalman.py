@@ -44,14 +44,6 @@ class ExtendedKalman:
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
-    def __post_init__(self) -> None:
-        n, q = self.lifting.n_states, len(self.measured)
-        if self.Q.shape[-2:] != (n, n) or self.R.shape != (q, q) or self.P0.shape != (n, n):
-            raise DimensionError(
-                f"Extended Kalman filter: {n} states and {q} measurements need Q and P0 ({n}, {n}) and R ({q}, {q}), "
-                f"found {self.Q.shape}, {self.P0.shape} and {self.R.shape}."
-            )
-
     def run(
         self,
         y: Array,

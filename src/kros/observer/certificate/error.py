@@ -153,11 +153,7 @@ class ErrorSystem:
         return StateSpace(self.A, self.B, self.M, self.D, self.dt)
 
     def mismatch(self) -> ErrorSystem:
-        """Return the system from q' of the frozen response to the rest of the error.
-
-        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p`` with
-        ``p = d (M r + E p + q')``.
-        """
+        """Return the system from q' (frozen) to the rest: ``r+ = A r + L p``, ``p = d (M r + E p + q')``."""
         width = self.L.shape[1]
         return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
 

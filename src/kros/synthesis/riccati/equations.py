@@ -64,10 +64,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
-    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004).
-
-    Quadratic convergence, only additions of semidefinite matrices.
-    """
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, sums of semidefinites."""
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS

@@ -74,10 +74,7 @@ class Frame:
         return cls(given, scaled, p.D22, normal, left, right)
 
     def solve(self, gamma: float) -> tuple[StateSpace | None, bool]:
-        """Return the central controller of a level, if there is one, and whether its conditions clearly fail.
-
-        Equations without a solution decide nothing: where there is none, a frequency proves it (`parrott`).
-        """
+        """Return the central controller of a level, if there is one, and whether its conditions clearly fail."""
         p = self.normal
         try:
             X, F = _half(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, gamma)

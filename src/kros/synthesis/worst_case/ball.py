@@ -66,10 +66,7 @@ class Ball:
         return cls(X_c @ M, _with_gains(adjoint(Vh), radius), _with_gains(U, radius) @ M)
 
     def bound(self, T: Array, certain: Array | float = 0.0) -> Array:
-        """Upper bound of ``||certain + T X M||_F`` over the set, shape (f,); `certain` is (f, p, m).
-
-        The root of the H2 density that no member exceeds.
-        """
+        """Root of the H2 density of ``certain + T X M`` that no member exceeds, (f,); `certain` is (f, p, m)."""
         return dual_bound(certain + T @ self.center, T @ self.left, self.right)
 
     def average(self) -> Array:
@@ -166,10 +163,7 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
 
 
 def _descended(c: Array, d: Array, g: Array, multipliers: Array, sweeps: int = 10) -> tuple[Array, Array]:
-    """Return better multipliers of rows and columns, by turns.
-
-    With frequencies last, where sums over few entries are those of long vectors.
-    """
+    """Return better multipliers of rows and columns, by turns; sums run with frequencies last."""
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)

@@ -106,10 +106,7 @@ class Everywhere:
 
 
 def _share_left(root: Array, distance: Array) -> Array:
-    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance.
-
-    ``1 - distance / min_i root_i``.
-    """
+    """Share of a diagonal below a spectrum that is left at a distance: ``1 - distance / min_i root_i``."""
     least = root.min(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(least > distance, 1 - distance / least, 0.0)[:, None]

@@ -61,6 +61,6 @@ autodoc_default_options = {
     "exclude-members": "set_fit_request, set_score_request",
 }  # of scikit-learn, without docstrings of ours
 
-# The one-line docstring of a property may begin "Gain: ..."; what has a space in it is no class.
-nitpick_ignore_regex = [("py:class", ".* .*")]
+# The one-line docstring of a property may begin "Gain: ..."; what has a space in it is no class. Truths are internal.
+nitpick_ignore_regex = [("py:class", ".* .*"), ("py:class", r"kros\.plants\..*Truth")]
 nitpick_ignore = [("py:exc", "NonFiniteError")]  # internal; users catch DataError, which it is

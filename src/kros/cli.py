@@ -25,7 +25,7 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,  # markup would take [data] for a colour
 )
-export = typer.Typer(help="An observer for machines: source code.", no_args_is_help=True, rich_markup_mode=None)
+export = typer.Typer(help="Write an observer as C99 source or as an FMU.", no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(export, name="export")
 
 
@@ -37,7 +37,9 @@ def _option(text: str, *names: str, metavar: str | None = None, **rest: Any) -> 
 Text = str | None
 Names = list[str] | None
 Run = Annotated[Path, typer.Argument(metavar="RUN")]
-Data = Annotated[Path, typer.Argument(metavar="DATA", help="Folder in the run's own reader, or a TOML with [data].")]
+Data = Annotated[
+    Path, typer.Argument(metavar="DATA", help="Recordings in the format of the study, or a TOML file with [data].")
+]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
 Overrides = Annotated[list[str] | None, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
@@ -81,9 +83,7 @@ def _version(asked: bool) -> None:
 def main(
     verbose: Annotated[bool, _option("Log what happens to standard error.", "--verbose", "-v")] = False,
     debug: Annotated[bool, _option("Show the traceback of an error in place of a message.", "--debug")] = False,
-    version: Annotated[
-        bool, _option("Say the version and nothing else.", "--version", callback=_version, is_eager=True)
-    ] = False,
+    version: Annotated[bool, _option("Print the version.", "--version", callback=_version, is_eager=True)] = False,
 ) -> None:
     """Set up logging."""
     log_to_stderr(verbose)
@@ -266,7 +266,7 @@ def figures(run_folder: Run, out: Path) -> None:
 
 @app.command("list")
 def list_(run_folder: Run) -> None:
-    """Say what a run holds: stages, observers by name and how well they do."""
+    """List the observers of a run with their errors, the best first."""
     from .study.commands.summary import list_run
 
     _say(list_run(run_folder))
@@ -274,7 +274,7 @@ def list_(run_folder: Run) -> None:
 
 @app.command()
 def doctor() -> None:
-    """Tell versions, solvers and what is missing."""
+    """Print versions, solvers and what is missing."""
     from .study.commands.doctor import diagnose
 
     _say(diagnose())

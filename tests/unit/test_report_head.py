@@ -66,7 +66,7 @@ BOUND = {"set_certified": True, "set_bound": {"velocity": 0.003}, "relift_certif
             "certificates",
             "No certificate at run time",
         ),
-        ({"observers": {NAME: BOUND}}, Status.CHECK, "certificates", "0.00400 rad/s RMS, the bound is 0.00300 rad/s"),
+        ({"observers": {NAME: BOUND}}, Status.CHECK, "certificates", "0.00400 rad/s, expected were 0.00300 rad/s"),
         (
             {"evaluation": [row(NAME, 0.2), row("linear/mixed", 0.1)]},
             Status.CHECK,
@@ -144,8 +144,8 @@ def test_an_error_doubles_where_it_was_tried() -> None:
     rows = [{**shared, "disturbance": k, "severity": s, "error_percent": {"mean": e}} for k, s, e in tried]
     found = doublings(Facts(metrics(robustness=rows)))
     assert {kind.value: text for kind, text in found[NAME].items()} == {
-        "noise": "0.1",
-        "delay": "< 1",
+        "noise": "0.10",
+        "delay": "< 1.0",
         "dropped": "> 10",
     }
     assert doublings(Facts(metrics())) == {}
@@ -196,4 +196,5 @@ def test_observers_are_ranked_by_their_errors() -> None:
 
 def test_the_bound_of_a_filter_bank_is_that_of_units_left_out() -> None:
     facts = Facts(metrics(observers={NAME: {**BOUND, "set_bound": {"velocity": 0.5}}}))
-    assert judge(facts).certified[0] == "Largest RMS error on units left out: 0.500 rad/s in velocity."
+    expected = "Measured on units left out of its regression: the RMS error is at most 0.500 rad/s in velocity."
+    assert judge(facts).certified[0] == expected

@@ -67,11 +67,11 @@ def _open(path: Path, shared: bool) -> int:
         pass
     except OSError as error:
         if error.errno not in _BUSY:
-            log.warning("%s: no locks here (%s); do not run two studies in one folder at once", path, error)
+            log.warning("%s: no file locks here (%s); do not run two studies in one folder at once", path, error)
             return handle
         holder = os.read(handle, 200).decode(errors="replace") or "another process"
         os.close(handle)
         advice = "wait until it ends, or name another folder"
-        raise ConfigError(f"Folder {path.parent}: {holder} is at work in it; {advice}.") from error
+        raise ConfigError(f"Folder {path.parent}: {holder} is using it; {advice}.") from error
     os.close(handle)
     return _open(path, shared)

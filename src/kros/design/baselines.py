@@ -210,8 +210,8 @@ def make_mean_profile(
     means, closest, episodes = unit_means(training, list(motions.values()), estimated, same)
     for key, of_units, apart in zip(motions, means, closest, strict=True):
         if len(of_units) < 2:
-            reason = f"held-out episode {key} is no motion that training episodes of two units repeat"
-            distance = f"{100 * apart:.3g} % of the largest (RMS), {100 * same:g} % counts as the same"
+            reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
+            distance = f"{100 * apart:.3g} % of the largest (RMS), at most {100 * same:g} % is allowed"
             raise DataError(f"Mean profile: {reason}; the nearest inputs differ by {distance}.")
 
     def without(left_out: str) -> MeanProfile:

@@ -47,14 +47,14 @@ def settle(figure: Figure) -> None:
 
 
 def engineering(axis: Axis) -> None:
-    """Number a linear axis with SI prefixes where its values are small or large, without a factor in the corner."""
+    """Number a linear axis with SI prefixes below 0.001 and from 1000 on, without a factor in the corner."""
     from matplotlib.ticker import FuncFormatter
 
     def text(value: float, _: Any) -> str:
         largest = max(map(abs, axis.get_view_interval()))
         exponent = 3 * floor(log10(largest) / 3) if largest > 0 else 0
         place = exponent // 3 + 4
-        if 0.01 <= largest < 1e4 or not 0 <= place < len(_PREFIXES) or value == 0:
+        if place in (3, 4) or not 0 <= place < len(_PREFIXES) or value == 0:
             return minus(f"{value:.6g}")
         return minus(f"{value / 10.0**exponent:.4g} {_PREFIXES[place]}")
 

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..evaluate.disturb import Kind, severity_of_growth
 from .facts import Facts
+from .names import number
 
 Array = npt.NDArray[np.float64]
 
@@ -71,8 +72,8 @@ def _doubling(kind: Kind, by_channel: Mapping[str, Curve], measured: Sequence[st
     tried = AXES[kind].factor * hidden[0].severities
     severity = AXES[kind].factor * severity_of_growth(hidden[0].severities, errors)
     if not np.isfinite(severity):
-        return f"> {tried[-1]:.2g}"
-    return f"{'< ' if severity < tried[1] else ''}{max(severity, tried[1]):.2g}"
+        return f"> {number(tried[-1], 2)}"
+    return f"{'< ' if severity < tried[1] else ''}{number(max(severity, tried[1]), 2)}"
 
 
 def doublings(facts: Facts) -> dict[str, dict[Kind, str]]:

@@ -54,10 +54,12 @@ def page(run: RunFolder, metrics: Mapping[str, Any], mapped: Mapped = map) -> st
         if drawn["reason"]:
             log.info("figure %s: left out, %s", drawn["name"], drawn["reason"])
         figures[drawn["name"]] = {**drawn, "svg": Markup(drawn["svg"])}
+    aside = sum(row.get("group") == "outliers" for row in facts.get("units", []))
+    count = f"{facts.study['units']} units" + (f" and {aside} set aside" if aside else "")
     conditions = [label for c in facts.study["conditions"] if (label := condition_label(c))]
     return environment.get_template("report.html.jinja").render(
         name=run.study.get("name", run.folder.name),
-        subtitle=" · ".join([f"{facts.study['units']} units", *conditions]),
+        subtitle=" · ".join([count, *conditions]),
         head=judge(facts),
         sections=parts[0],
         evidence=parts[1],

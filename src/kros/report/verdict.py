@@ -206,9 +206,9 @@ def _of_errors(facts: Facts) -> Iterator[tuple[str, str, str]]:
         cell = table.cells[facts.deployed].get(channel)
         if cell is not None and cell.worst_rms is not None and bound is not None and cell.worst_rms > bound:
             unit = facts.unit(channel)
-            text = f"A held-out episode exceeds the bound for recorded signals: {words(channel)} of unit "
-            text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit} RMS, the bound is {number(bound)} {unit}."
-            yield text, "Do not rely on this bound; record more kinds of episodes.", "certificates"
+            text = f"A held-out episode exceeds the largest RMS error expected: {words(channel)} of unit "
+            text += f"{cell.worst_unit} has {number(cell.worst_rms)} {unit}, expected were {number(bound)} {unit}."
+            yield text, "Do not rely on this number; record more kinds of episodes.", "certificates"
 
 
 def _of_certificates(facts: Facts) -> Iterator[tuple[str, str, str]]:
@@ -246,14 +246,15 @@ def certificates(facts: Facts) -> list[str]:
     """Return what is certified about the deployed observer."""
     entry, texts = facts.entry, []
     if entry.get("worst_case_h2") is not None:
-        texts.append(f"For the set of plants: the H2 norm of the error is at most {number(entry['worst_case_h2'])}.")
+        norm = number(entry["worst_case_h2"])
+        texts.append(f"For the set of linear plants: the H2 norm of the error is at most {norm}.")
     bounds = {c: b for c, b in (entry.get("set_bound") or {}).items() if b is not None and entry.get("set_certified")}
     hidden = [c for c in bounds if c not in facts.measured] or list(bounds)
     if hidden:
         parts = [" ".join(filter(None, (number(bounds[c]), facts.unit(c), "in", words(c)))) for c in hidden]
         bank = split(facts.deployed)[1] == "estimator"
-        source = "Largest RMS error on units left out" if bank else "For recorded signals: the RMS error is at most"
-        texts.append(f"{source}{':' * bank} {joined(parts)}.")
+        source = "Measured on units left out of its regression" if bank else "For recorded signals"
+        texts.append(f"{source}: the RMS error is at most {joined(parts)}.")
     if entry.get("relift_certified"):
         gain = number(entry.get("relift_gain"))
         texts.append(f"At run time: the gain from the model's one-step residual to the error is at most {gain}.")
@@ -264,7 +265,7 @@ def voids(facts: Facts) -> list[str]:
     """Return when the certificates of the deployed observer do not hold, the most frequent mistake first."""
     texts = ["A controller uses the estimate: the recordings did not depend on it."]
     if facts.entry.get("set_certified") or facts.entry.get("worst_case_h2") is not None:
-        texts += ["Signals have more power at some frequency than those recorded, or leave the range of training."]
+        texts += ["The motion differs from the recorded one, or leaves the range of training."]
         texts += ["The unit is worn, badly assembled, or of another batch."]
     rate = 1 / facts.study["sample_period_s"]
     return [*texts, f"The rate is not {rate:g} Hz, or the sensor, the delay or the loss of samples is not as declared."]

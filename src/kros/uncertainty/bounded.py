@@ -132,9 +132,7 @@ def _leaves_out(form: Form, ratio: Array) -> bool:
     largest = np.nanmax(ratio) if unknown < ratio.size else np.inf
     if largest <= SET.exact and not unknown:
         return False
-    text = (
-        "Uncertainty form %s cannot represent up to %.3g of a unit's response; an additive term covers the difference."
-    )
+    text = "Uncertainty form %s cannot represent up to %.3g %% of a unit's response, which an additive term covers."
     level = logging.WARNING if largest > SET.warned else logging.INFO
-    _LOG.log(level, f"{text} The additive form needs none.", form.value, largest)
+    _LOG.log(level, f"{text} The additive form needs none.", form.value, 100 * largest)
     return True

@@ -278,7 +278,7 @@ def _resampling(
     if not uneven and all(abs(s.period_s - median) <= CHECK.period * median for s in looks):
         return (), []
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
-    text = f"time is uneven: everything is brought to a period of {period_s:g} s {recorded}"
+    text = f"time is uneven: all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
         text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
     return ({"step": "resample", "period_s": period_s},), [text, *_gaps(population, source, looks)]

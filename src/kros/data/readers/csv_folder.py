@@ -149,7 +149,7 @@ def _matches(source: Path, mapping: CsvMapping) -> Iterator[tuple[Path, re.Match
         else:
             others.append(relative)
     if others:
-        text = "%d files in %s do not match files = %r and are left alone: %s."
+        text = "%d files in %s do not match files = %r and are ignored: %s."
         log.warning(text, len(others), source, mapping.files, some(others))
 
 

@@ -90,7 +90,7 @@ def frozen_gain(system: ErrorSystem) -> float:
 def growing_place(system: ErrorSystem) -> str:
     """Return where frozen slopes let the error grow; empty where they do not."""
     radius = max(system.frozen(place).spectral_radius() for place in _places(system))
-    return f"The error grows: frozen slopes multiply it by {radius:.6g} a step." if radius >= 1 else ""
+    return f"The error grows: with constant slopes, by a factor of {radius:.6g} per step." if radius >= 1 else ""
 
 
 def _places(system: ErrorSystem) -> list[Array]:

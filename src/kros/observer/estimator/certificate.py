@@ -65,7 +65,7 @@ def linear_estimate(
     own, n, q = observer.lifting, len(observer.recorded), len(observer.measured)
     if delay_of(observer.sensor):
         raise SynthesisError(
-            "not certified for the set of plants: measurements arrive late, and the set has none that do."
+            "not certified for the set of plants: measurements arrive late, and the set contains no delay."
         )
     size, first = n + observer.bank.filters, q + modelled.n_states
     weights = np.hstack([observer.A, observer.B])[:size]
@@ -82,7 +82,7 @@ def linear_estimate(
     if unknown:
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         shares = ", ".join(f"{name} {percent:.2g} %" for name, percent in (outside or {}).items() if percent)
-        share = f"; it carries, of the range of estimates: {shares}" if shares else ""
+        share = f"; the missing ones contribute, in percent of the range: {shares}" if shares else ""
         reason = f"the models have no signal {without_limits(unknown[0])}{more}{share}."
         raise SynthesisError(f"not certified for the set of plants: {reason}")
     A = weights[:, :size].copy()

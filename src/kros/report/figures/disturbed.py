@@ -11,7 +11,7 @@ from ...evaluate.disturb import Kind
 from ...evaluate.errors import error_spectrum
 from ..canvas import Axes, Figure, frequency_axis, grid, legend, logarithmic, power_of_ten
 from ..disturbances import AXES, Curve, curves
-from ..names import Look, in_condition, method_label, method_look, model_label, model_look, split_observer, words
+from ..names import in_condition, method_label, method_look, model_label, model_look, split_observer, words
 from ..run_folder import NotShownError, RunFolder
 from ..theme import DRAWING
 from .episodes import TRUTH, draw_lines, hide_times
@@ -41,7 +41,7 @@ def robustness(run: RunFolder) -> tuple[Figure, str]:
     legend(figure, panels[0], 4)
     seconds, units = run.disturbed["seconds"], len(run.disturbed["units"])
     return figure, (
-        f"RMS error of the {words(channel)}{in_condition(condition)}, mean over {units} units, the first {seconds:g} s "
+        f"RMS error of the {words(channel)}{in_condition(condition)}, mean over {units} units, at most {seconds:g} s "
         "of a held-out episode. Lines end where the estimate diverges. Gaps take a tenth of the time. "
         "Filtered difference and learned estimator get the last measurement that arrived."
     )
@@ -58,25 +58,17 @@ def _panel(panel: Axes, kind: Kind, lines: Mapping[str, Curve], deployed: str | 
         x = np.where(x > 0, x, 0.1 * x[1]) if axis.logarithmic else x
         look, main = method_look(name), name == deployed
         errors = np.where(curve.errors < DRAWING.diverged_percent, curve.errors, np.nan)
-        label = method_label(name) + (" (deployed)" if main else "")
-        panel.plot(
-            x,
-            errors,
-            look.style,
-            color=look.colour,
-            lw=DRAWING.broad if main else None,
-            marker="o",
-            ms=2.4,
-            label=label,
-        )
+        label, width = method_label(name) + (" (deployed)" if main else ""), DRAWING.broad if main else None
+        panel.plot(x, errors, look.style, color=look.colour, lw=width, marker="o", ms=2.4, label=label)
     panel.set_title(axis.title.replace(" (", "\n("), size="small")
     if axis.logarithmic:
         low, high = float(severities[1]), float(severities[-1])
-        ticks = [10.0**k for k in range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)][::2]
+        ticks = [10.0**k for k in range(int(np.ceil(np.log10(low))), int(np.floor(np.log10(high))) + 1)]
+        ticks = ticks[:: 1 + len(ticks) // 4]
         panel.set_xscale("log")
         panel.set_xlim(0.07 * low, 1.4 * high)
         panel.xaxis.set_minor_locator(NullLocator())
-        panel.set_xticks([0.1 * low, *ticks], ["0", *map(power_of_ten, ticks)])
+        panel.set_xticks([0.1 * low, *ticks], ["0", *(power_of_ten(t) if "e" in f"{t:g}" else f"{t:g}" for t in ticks)])
 
 
 def load_torque(run: RunFolder) -> tuple[Figure, str]:
@@ -95,7 +87,7 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
         spectrum.plot(freqs[1:], density[1:], color=TRUTH.colour, alpha=TRUTH.opacity, lw=TRUTH.weight)
         for name in reversed(names):
             model, values = name.partition("/")[0], arrays[f"estimate/{name}"].astype(float)
-            look: Look = model_look(model)
+            look = model_look(model)
             draw_lines(time, times, {model_label(model): (values, look)})
             error = error_spectrum(values - truth, run.sample_period_s, 4 * DRAWING.segment)[1]
             spectrum.plot(freqs[1:], error[1:], color=look.colour)

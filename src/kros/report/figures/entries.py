@@ -85,7 +85,7 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             frequency_axis(panel, freqs, "", 4)
             order = f"order {residuals.entry_orders[i, j]}"
             note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
-        row[0].set_ylabel(f"to {short(names[0][i])}\n(dB)")
+        row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")
     for j, panel in enumerate(block[0]):
         panel.set_title(f"{label},\nfrom {short(names[1][j])}")
     label_below(block[-1])

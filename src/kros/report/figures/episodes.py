@@ -94,7 +94,7 @@ def estimates(run: RunFolder, paper: bool = False) -> tuple[Figure, str]:
         for role, one in zip(("nominal", "worst off-nominal"), shown, strict=False)
     ]
     measured = " and ".join(words(c.name) for c in run.states if c.measured)
-    text = f"{_PAPER if paper else ''}Estimated from {measured} alone; errors are recorded minus estimated values."
+    text = f"{_PAPER if paper else ''}Estimated from {measured} and inputs; errors are recorded minus estimated values."
     return _figure(run, blocks, text)
 
 
@@ -147,11 +147,11 @@ def blocks_figure(signals: Signals, blocks: Sequence[Block]) -> Figure:
 def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, window: slice) -> None:
     """Draw one state of an episode in four panels."""
     time_s, recorded = block.shown.time_s, block.shown.states[:, i].astype(float)
-    near, start = _near(recorded), int(DRAWING.settled * len(recorded))
+    start = int(DRAWING.settled * len(recorded))
     for panel, part in ((row[0], slice(None)), (row[1], window)):
         draw_lines(panel, time_s[part], {"recorded": (recorded[part], TRUTH)})
         for label, (values, look) in block.lines.items():
-            draw_lines(panel, time_s[part], {label: (_inside(values[part, i], near), look)})
+            draw_lines(panel, time_s[part], {label: (_inside(values[part, i], recorded), look)})
     row[0].axvspan(*time_s[window][[0, -1]], color=Tone.GRID.light, lw=0, zorder=0.5)
     for label, (values, look) in block.lines.items():
         error = recorded - values[:, i].astype(float)
@@ -166,16 +166,10 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
         row[3].axvspan(*signals.band_hz, color=Tone.GRID.light, lw=0, zorder=0.5)
 
 
-def _near(recorded: Array) -> tuple[float, float]:
-    """Return the range in which lines are drawn: that of the recorded signal with a margin."""
-    low, high = float(recorded.min()), float(recorded.max())
-    room = 0.5 * max(high - low, np.finfo(float).tiny)
-    return low - room, high + room
-
-
-def _inside(values: Array, limits: tuple[float, float]) -> Array:
-    """Return values with those outside of limits replaced by NaN, which ends a line."""
-    return np.where((values >= limits[0]) & (values <= limits[1]), values, np.nan)
+def _inside(values: Array, recorded: Array) -> Array:
+    """Return values; those outside the range of the recorded signal with a margin become NaN, which ends a line."""
+    room = max(float(np.ptp(recorded)), np.finfo(float).tiny) / 2
+    return np.where((values >= recorded.min() - room) & (values <= recorded.max() + room), values, np.nan)
 
 
 def draw_lines(axes: Axes, time_s: Array, lines: Mapping[str, tuple[Array, Look]], width: float = 1.0) -> None:

@@ -85,10 +85,10 @@ def weights(run: RunFolder) -> tuple[Figure, str]:
     """Draw fitted weights over the optimal bound, and every unit relative to them (the paper's Figure 8)."""
     chosen = {n: run.uncertain[n] for n in best_models(run.unit_residuals) if n in run.uncertain}
     rows = {n: (model, run.models[n], run.unit_residuals[n]) for n, model in chosen.items()}
-    parts = [f"{model_label(n)} at most {number(model.overbound_db_max)} dB above it" for n, model in chosen.items()]
+    parts = [f"{model_label(n)} {number(model.overbound_db_max)} dB" for n, model in chosen.items()]
     return weights_figure(rows), (
-        "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free "
-        f"({'; '.join(parts)}, in the mean). A unit at most 0 dB is bounded."
+        "Shaded: the optimal bound by diagonal weights at each frequency; the scale between left and right is free. "
+        f"Largest mean excess of a weight: {', '.join(parts)}. A unit at most 0 dB is bounded."
     )
 
 
@@ -142,7 +142,7 @@ def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: S
         note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
     frequency_axis(axes, freqs_hz, "", 4)
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
-    axes.set_ylim(low, high + 0.13 * (high - low) * len(columns))
+    axes.set_ylim(low, high + 0.2 * (high - low) * len(columns))
 
 
 def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:

@@ -13,17 +13,17 @@ from ..names import BASELINES, axis_label, minus, observer_label, split_observer
 
 _TEXT = (
     "For the set of plants: a bound on the H2 norm of the error for every plant between the weights, and a lower bound "
-    "for corrections of this kind. For recorded signals: a bound on the RMS error for all signals with at most the "
-    "recorded power in every band of frequency, beside the worst RMS error on held-out episodes. At run time: a bound "
-    "on the gain from the model's one-step residual to the error, with the state re-lifted at every step. The "
-    "estimator has no model: its bound for recorded signals is the largest error on a unit left out of its regression."
+    "for corrections of this kind. For recorded signals: a bound on the RMS error for weighted combinations of the "
+    "recorded residuals, beside the worst RMS error on held-out episodes. These are other signals and may exceed it. "
+    "At run time: a bound on the gain from the model's one-step residual to the error, with the state re-lifted at "
+    "every step. The estimator has no model; its entry is the largest error on a unit left out of its regression."
 )
 _ASSUMED = (
     "The recorded units represent those to come: another batch and wear are not covered.",
     "The recorded signals depended on no estimate: the certificates do not hold if a controller uses the estimate.",
-    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form. It says "
-    "how units differ, not how models differ from units.",
-    "The recorded signals: residuals have at most the recorded power in every band of frequency.",
+    "The set of plants: every unit is the nominal model perturbed by at most the weights, in one form. It "
+    "bounds how units differ, not how models differ from units.",
+    "The recorded signals: the residual combines recorded ones, with weights whose sizes sum to at most one.",
     "Errors are those relative to the recorded sensors, unless the true signal is known.",
 )
 _RECOMPUTED = (

@@ -46,7 +46,7 @@ def errors(facts: Facts) -> Section | None:
     caption = f"All {len(tables[0].cells)} observers in all conditions; small: 95 % interval of the mean over units"
     whole = _table(caption, about, every, facts, folded=True, sortable=True)
     more = [_TRUE] if any("true_rms" in r for r in facts.get("evaluation")) else []
-    return Section("errors", "Errors", [_TEXT, *more], tables=[first, whole], figure="observers_in_time")
+    return Section("errors", "Errors", [" ".join([_TEXT, *more])], tables=[first, whole], figure="observers_in_time")
 
 
 def other_conditions(facts: Facts) -> Section | None:

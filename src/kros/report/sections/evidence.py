@@ -49,9 +49,10 @@ def limit_text(limit: Mapping[str, Any] | None) -> str:
     """Return a limit and where units were seen at it."""
     if limit is None:
         return ""
-    ends = " to ".join(number(limit[side]) for side in ("lower", "upper") if limit[side] is not None)
+    sides = {"lower": "at least", "upper": "at most"}
+    ends = ", ".join(f"{text} {number(limit[side])}" for side, text in sides.items() if limit[side] is not None)
     seen = (limit.get("seen") or {}).get("units")
-    return f"{ends}, estimated, reached by {some(seen, 3)}" if seen else f"{ends}, estimated"
+    return f"{ends}, from the recordings of {some(seen, 3)}" if seen else f"{ends}, from the recordings"
 
 
 def calibration(facts: Facts) -> Section | None:
@@ -159,6 +160,6 @@ def run(facts: Facts) -> Section:
     timing = facts.get("timing_s", {})
     times = [Column("stage", list(timing)), Column("seconds", [float(v) for v in timing.values()])]
     versions = [f"{name} {import_module(name).__version__}" for name in _PACKAGES]
-    text = "metrics.json holds all numbers of this page, study.json all settings; the same results come again with "
+    text = "metrics.json holds all numbers of this page, study.json all settings. Software: "
     text += f"{', '.join(versions)} and Python {platform.python_version()}."
     return Section("run", "Run", [text], tables=[build("Time; a stage that was up to date counts in full", times)])

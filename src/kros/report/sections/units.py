@@ -8,7 +8,7 @@ from typing import Any
 
 from ..content import Column, Section, build
 from ..facts import Facts
-from ..names import condition_label, in_condition, number, words
+from ..names import in_condition, number, words
 from ..theme import DRAWING
 
 Row = Mapping[str, Any]
@@ -44,7 +44,7 @@ def units(facts: Facts) -> Section | None:
     table = build(f"{count}; errors in percent of the largest value", columns, sortable=True)
     text = [f"Errors are those of “{facts.label}”."] if facts.deployed else []
     text += [_SCORES, *(_flagged(r) for r in rows[: DRAWING.units] if r["outlier"])] if rows else []
-    return Section("units", "Units", text, tables=[table], figure="outlier_scores" if rows else "")
+    return Section("units", "Units", [" ".join(text)], tables=[table], figure="outlier_scores" if rows else "")
 
 
 def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: set[str]) -> list[Row]:
@@ -59,9 +59,9 @@ def _first(rows: Sequence[Row], errors: Mapping[tuple[str, str], Row], flagged: 
 
 def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list[Column]:
     """Return the errors of every hidden channel."""
-    keys = {"%": "error_percent", "against the true signal (%)": "true_error_percent"}
+    keys = {"error (%)": "error_percent", "against the true signal (%)": "true_error_percent"}
     return [
-        Column(title, [errors.get((unit, channel), {}).get(key) for unit in names], f"error of {words(channel)}")
+        Column(title, [errors.get((unit, channel), {}).get(key) for unit in names], words(channel))
         for channel in dict.fromkeys(c for _, c in errors)
         for title, key in keys.items()
     ]
@@ -69,11 +69,11 @@ def _errors(names: Sequence[str], errors: Mapping[tuple[str, str], Row]) -> list
 
 def _scores(names: Sequence[str], scores: Mapping[tuple[str, str], Row]) -> list[Column]:
     """Return scores and detectable changes in every condition."""
-    keys = {"(dB)": "score", "detectable change of gain (%)": "detectable"}
+    keys = {"score (dB)": "score", "detectable change of gain (%)": "detectable"}
     return [
-        Column(f"{condition_label(c)} {t}".strip(), [scores.get((u, c), {}).get(k) for u in names], "outlier score")
+        Column(title, [scores.get((u, c), {}).get(k) for u in names], f"outlier test{in_condition(c)}")
         for c in dict.fromkeys(c for _, c in scores)
-        for t, k in keys.items()
+        for title, k in keys.items()
     ]
 
 

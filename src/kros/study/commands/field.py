@@ -129,7 +129,7 @@ def unit_values(
                 sources[unit], reasons[unit] = "unknown", str(error)
                 continue
             phase, sources[unit] = calibration.units[unit], "of the run"
-            log.info("unit %s: its recordings do not show the phase, that of the run is taken", unit)
+            log.info("unit %s: its recordings do not determine the phase; the value of the run is used", unit)
         values[spec.parameter] = phase.phase_rad
     return known, sources, reasons
 

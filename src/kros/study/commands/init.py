@@ -55,7 +55,7 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
     unloaded = _unloaded(population)
     data |= {} if unloaded is None else {"identify_on": unloaded}
-    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not looked for")
+    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not searched for")
     try:
         check_population(population, allow_single=True)
         population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
@@ -89,7 +89,7 @@ def _unloaded(population: Population) -> str | None:
 def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
     """Return lifted functions where recordings ask for them: the periodic term of an angle, with a phase per unit."""
     if population.metadata.get("plant") == HARMONIC_DRIVE:
-        return LiftingProposal(why="these recordings say which plant they are of, and its own lifting is taken")
+        return LiftingProposal(why="the recordings name their plant, which has a known lifting")
     measured = [c for c in population.channels if c.role is Role.STATE and c.measured]
     angles = [c.name for c in measured if c.unit == "rad" or (not c.unit and kind_of(c.name) in ("angle", "position"))]
     keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]
@@ -98,17 +98,17 @@ def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingPro
         return LiftingProposal()
     share = f"{100 * term.share:.2g} % of"
     if term.ratio == 1:
-        why = f"sin({term.angle}), as of gravity, explains {share} what a linear model of one step leaves"
+        why = f"sin({term.angle}), as of gravity, explains {share} the one-step residual of a linear model"
         functions = [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]
         return LiftingProposal({"functions": functions}, {}, why)
-    above = f"{term.above:.0f} times what is left at ratios around; {share} the residual"
-    why = f"what a linear model of one step leaves repeats {term.ratio:g} times a turn of {term.angle!r} ({above})"
+    above = f"{term.above:.0f} times the residual at neighbouring ratios; {share} the whole residual"
+    why = f"the residual of a linear model repeats {term.ratio:g} times per turn of {term.angle!r} ({above})"
     spec = _phase_spec(population, term)
     if spec is not None and _calibrates(population, facts, spec):
         names = ("angle", "ratio", "reference", "measured")
         function = f"sin({term.ratio:g}*{term.angle} + phase)"
         table = {name: getattr(spec, name) for name in names}
-        return LiftingProposal({"functions": [function]}, table, f"{why}; every unit has a phase of its own")
+        return LiftingProposal({"functions": [function]}, table, f"{why}; the phase differs from unit to unit")
     return LiftingProposal({"functions": [f"{f}({term.ratio:g}*{term.angle})" for f in ("sin", "cos")]}, {}, why)
 
 
@@ -147,7 +147,7 @@ def _lines(
     more = len(findings) - MOST_FINDINGS
     lines += [f"looks wrong: {more} further points, which are written at the start of the study"] if more > 0 else []
     until = " --until identify" if len(units) < FEWEST else ""
-    return [*lines, f"study: {out}; look through it, then: kros run {out}{until}"]
+    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
 
 
 def column_lines(columns: Sequence[TableColumn]) -> list[str]:

@@ -20,7 +20,7 @@ class LiftingProposal:
 
     lifting: dict[str, Any] = field(default_factory=dict)
     calibrate: dict[str, Any] = field(default_factory=dict)
-    why: str = "no periodic term of an angle stands out in what a linear model leaves"
+    why: str = "no periodic nonlinearity was found"
 
 
 def study_text(
@@ -31,7 +31,7 @@ def study_text(
     findings: Sequence[str],
 ) -> str:
     """Return a study as TOML."""
-    written = f"Written by kros init from the recordings in {source.name}. kros run takes it as it is; edit any line."
+    written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
     lines = _comment(written)
     if findings:
         lines += ["#", "# What looks wrong:", *(line for text in findings for line in _comment(f"- {text}"))]

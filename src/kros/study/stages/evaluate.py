@@ -158,7 +158,7 @@ def facts_of(name: str, result: Outcome | str) -> Mapping[str, Any]:
     """Return what the records say about a baseline that was made here."""
     if isinstance(result, Outcome):
         return result.facts
-    log.info("%s could not be made: %s", name, result)
+    log.info("%s could not be computed: %s", name, result)
     return {"status": "failed", "reason": result}
 
 

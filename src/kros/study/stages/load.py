@@ -74,7 +74,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
             curves[name], fact = make()
         except KrosError as error:
             fact = {"status": "failed", "reason": str(error)}
-            log.info("%s could not be made: %s", name, error)
+            log.info("%s could not be computed: %s", name, error)
         facts |= {name: fact} if fact else {}
     shown = int(np.flatnonzero(trial.loaded)[0])
     key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}

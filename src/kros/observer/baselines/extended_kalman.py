@@ -51,11 +51,7 @@ class ExtendedKalman:
         parameters: Mapping[str, npt.ArrayLike] | None = None,
         starts: npt.NDArray[np.bool_] | None = None,
     ) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m); shape (n_samples, batch, n).
-
-        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
-        corrected at that sample, and the covariance grows. At `starts`, (n_samples, batch), machines start again.
-        """
+        """Predict a batch from y (n_samples, batch, q), NaN where missing, and u; machines start again at `starts`."""
         return self.run_all(y, u, parameters, starts)[0]
 
     def run_all(

@@ -56,6 +56,7 @@ class ProofSettings:
 
 
 SETTINGS = ProofSettings()
+_TIGHT = 1e-8  # relative, of a norm that decides
 _DIGITS = np.finfo(float).nmant + 1  # binary, of a number
 
 
@@ -203,7 +204,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     inputs, feed, n = inputs / gain, feed / gain, len(A)
     T, back = reachable_coordinates(A, inputs, system.dt)
     A, inputs, outputs = np.eye(n) + back @ (A - np.eye(n)) @ T, back @ inputs, outputs @ T
-    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), 1e-8) * (1 + 1e-8)) ** 2
+    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), _TIGHT) * (1 + _TIGHT)) ** 2
     if room <= 0:
         return None
     spread = hinf_norm(StateSpace(A, inputs, np.eye(n), np.zeros((n, inputs.shape[1])), system.dt), 1e-2)

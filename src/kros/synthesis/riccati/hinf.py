@@ -25,7 +25,7 @@ import numpy as np
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
-from ...core.rounding import ITERATED
+from ...core.rounding import AGREED, ITERATED
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis, enclosed
@@ -79,7 +79,7 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     trivial = 0 in plant.sizes[2::2]
     best, lower = (idle, idle.norm) if trivial else _search(Frame.of(plant), idle, tolerance, negligible)
     lower = 0.0 if best.norm <= negligible else lower
-    optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2e-6))
+    optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2 * AGREED))
     return _result(plant, best, lower, optimal, time.perf_counter() - start)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.evaluate import Kind
+from kros.evaluate.disturb import Kind
 from kros.identify import ModelSet
 from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
 

@@ -232,6 +232,8 @@ def attack_running(
     inside = (x == observer.runtime.clip_estimate(x)).all(axis=2)
     seen = np.logical_and.accumulate((np.abs(x / scales.error).max(axis=2) < _FAR) & inside, axis=0)
     spent = np.cumsum(np.sum(w**2, axis=2), axis=0)[np.maximum(seen.sum(axis=0) - 2, 0), np.arange(batch)]
-    allowed = certificate.gain**2 * spent + certificate.initial_energy(first)
+    allowed = certificate.gain**2 * spent + np.sum(
+        (first @ certificate.start[:, : first.shape[-1]].T @ certificate.root.T) ** 2, axis=-1
+    )
     energy = np.sum(((x - estimates) / scales.error) ** 2, axis=(0, 2), where=seen[..., None])
     return float(np.sqrt(np.max(energy / (allowed + _TINY)))), int(seen[1:].sum())

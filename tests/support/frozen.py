@@ -41,5 +41,7 @@ def compared(
     energy = [
         np.sum(np.where(inside[: len(s), :, None], s, 0.0) ** 2, axis=(0, 2)) for s in (z, seen.error / scales.error, w)
     ]
-    energy[2] = certificate.gain**2 * energy[2] + certificate.initial_energy(seen.first)
+    energy[2] = certificate.gain**2 * energy[2] + np.sum(
+        (seen.first @ certificate.start[:, : seen.first.shape[-1]].T @ certificate.root.T) ** 2, axis=-1
+    )
     return [Row(*row) for row in np.sqrt(np.array(energy) / lengths).T]

@@ -7,7 +7,8 @@ import numpy as np
 from kros.core.lti import StateSpace
 from kros.export.c99.realise import in_coordinates
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Observer, Runtime, Seen
+from kros.observer import Observer, Runtime, Seen
+from kros.observer.filter_bank import FilterBank
 from kros.observer.monitor import Monitor, octaves
 from kros.synthesis import Injection
 

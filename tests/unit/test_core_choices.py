@@ -4,7 +4,6 @@ import pytest
 
 from kros.core.errors import ConfigError
 from kros.data import Channel, Role
-from kros.evaluate.disturb import Disturbance, Kind
 from kros.plants.harmonic_drive.parameters import Loop
 from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
 
@@ -13,7 +12,6 @@ from kros.plants.harmonic_drive.population import HarmonicDrivePopulation
     ("build", "field", "member"),
     [
         (lambda name: Channel("position", name), "role", Role.STATE),
-        (lambda name: Disturbance(name, 0.1), "kind", Kind.DROPPED),
         (lambda name: HarmonicDrivePopulation(loop=name), "loop", Loop.SOFT),
     ],
 )

@@ -13,7 +13,8 @@ import pytest
 from kros.core.errors import DataError, DimensionError
 from kros.core.lti import StateSpace, gain
 from kros.lifting import Lifting
-from kros.observer import FilterBank, Observer, Runtime
+from kros.observer import Observer, Runtime
+from kros.observer.filter_bank import FilterBank
 from kros.synthesis.result import Injection
 
 

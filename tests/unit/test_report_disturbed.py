@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DimensionError
-from kros.evaluate import Kind, unit_interval
-from kros.evaluate.disturb import severity_of_growth
+from kros.evaluate import unit_interval
+from kros.evaluate.disturb import Kind, severity_of_growth
 from kros.evaluate.intervals import interval_rows
 from kros.report.disturbances import curves
 from kros.report.error_tables import error_tables

@@ -85,6 +85,14 @@ The array format of pykoop is no longer in kros.data; use from_pykoop and to_pyk
     kros.data: from_pykoop to_pykoop
 Random Fourier features are no longer a family of liftings; use radial, with centres by k-means.
     kros.lifting: fourier_features
+Resampled models are no longer public; kros.quantify and the report use them by themselves.
+    kros.identify: ModelSamples bootstrap_edmd episode_weights
+The residual-shaped observer is no longer a public function; use kros.synthesize with the method residual_h2.
+    kros.synthesis: ResidualProblem residual_h2
+The start and the gaps of an observer are no longer a public class; kros.synthesize makes them, observers hold them.
+    kros.observer: FilterBank
+Parts of the evaluation are no longer public; a study computes them, error_percent and unit_interval remain.
+    kros.evaluate: Kind error_rms error_spectrum next_unit_bound true_errors
 """
 
 

@@ -14,7 +14,7 @@ from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
-from ..evaluate import error_rms
+from ..evaluate.errors import error_rms
 from ..identify import ModelSet
 from ..loops.filtering import recursion
 from ..observer import Observer, ReliftCertificate, ReliftScales, ReliftStatus, relift_certificate, run_observer
@@ -24,7 +24,6 @@ from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
-from ..observer.simulate import run_observers
 from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
@@ -61,10 +60,7 @@ def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSe
 
 
 def certified_on(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
-    """Return episodes whose signals make the certified set, and the same of every other condition.
-
-    They are the start of the first episode of every unit, or all of short ones.
-    """
+    """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
     others: dict[str, list[EpisodeKey]] = {}
     for key in (k for k in task.recordings.keys if k.condition not in home and k.unit in units):
@@ -155,7 +151,8 @@ def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, setti
     y, x = some.measurements(first.measured), some.states
     lost = losses(np.random.default_rng(0), len(y), len(rows))
     lost[len(y) // 4 :, 0] = True
-    estimates = run_observers(observers, np.where(lost[..., None], np.nan, y), some.inputs, first.own(some.parameters))
+    y, values = np.where(lost[..., None], np.nan, y), first.own(some.parameters)
+    estimates = (run_observer(observer, y, some.inputs, values) for observer in observers)
     size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
@@ -196,7 +193,7 @@ def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> 
     y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
     recorded = np.arange(n) < states.shape[-1]
     inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
-    x = run_observers(observers, y, inputs, observers[0].own(batch.parameters))
+    x = np.stack([run_observer(o, y, inputs, o.own(batch.parameters)) for o in observers])
     least, most = np.full(n, np.inf), np.full(n, -np.inf)
     least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
     most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rounding import EPS, ITERATED, ROUNDING
 from ..core.work import Work
 from ..observer import Observer
 from ..observer.monitor import WEIGHT, Monitor, octaves
@@ -71,7 +72,7 @@ def fit_monitor(
     # Mean squares are computed wherever they are needed: all of them would fill a memory.
     squares = {group: partial(free.in_turn, run) for group, run in episodes.items()}
     most = {group: np.max([p.max(axis=0) for p in of()], axis=0) for group, of in squares.items()}
-    largest = {group: 10 * np.log10(np.maximum(values, 1e-30)) for group, values in most.items()}
+    largest = {group: 10 * np.log10(np.maximum(values, EPS**2)) for group, values in most.items()}
     weights = weighted(steady(largest, settings))
     peaks = {group: [float(_decibels(p, weights).max()) for p in of()] for group, of in squares.items()}
     bound = bound_of_peaks([max((p for (u, _), p in peaks.items() if u == unit), key=max) for unit in units], settings)
@@ -126,7 +127,7 @@ def steady(largest: Mapping[Group, Array], settings: MonitorSettings = DEFAULT) 
     apart = np.concatenate([np.array(levels) - np.mean(levels, axis=0) for levels in by_condition.values()])
     covariance = apart.T @ apart / max(len(apart) - len(by_condition), 1)
     variance = np.diag(covariance)
-    floor = max(settings.quietest * float(np.median(variance)), 1e-12)
+    floor = max(settings.quietest * float(np.median(variance)), ROUNDING)
     diagonal = settings.shrink * variance + np.maximum(floor - variance, 0.0)
     covariance = (1 - settings.shrink) * covariance + np.diag(diagonal)
     root, large = np.linalg.cholesky(covariance).T, 1e3 * float(np.sqrt(np.trace(covariance)))
@@ -146,7 +147,7 @@ def _decibels(mean_squares: Array, weights: Array) -> Array:
     """Return weighted means of levels, shape (n_samples,), of mean squares (n_samples, q, bands), band by band."""
     level = np.zeros(len(mean_squares))
     for channel, band in np.argwhere(weights > 0):
-        level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], 1e-30))
+        level += weights[channel, band] * np.log10(np.maximum(mean_squares[:, channel, band], EPS**2))
     return level * (10 / WEIGHT)
 
 
@@ -155,5 +156,5 @@ def settling(observer: Observer, settings: MonitorSettings = DEFAULT) -> int:
     n, r, nl = observer.lifting.n_states, observer.controller.n_states, observer.lifting.n_lifted
     step = observer.one_step[:, [*range(n), *range(nl, nl + r)]]
     radius = float(np.abs(np.linalg.eigvals(step)).max(initial=0.0))
-    samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, 1e-9))
+    samples = settings.settle[1] if radius >= 1 else np.log(settings.forgotten) / np.log(max(radius, ITERATED))
     return int(np.clip(np.ceil(samples), *settings.settle)) + observer.runtime.delay

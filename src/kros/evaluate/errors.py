@@ -52,16 +52,7 @@ def _summary(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64], dt: 
 
 
 def error_rms(estimate: Array, truth: Array, lengths: npt.NDArray[np.int64]) -> Array:
-    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import error_rms
-    >>> recorded = np.array([0.0, 2.0, -4.0]).reshape(3, 1, 1)  # sample, episode, state
-    >>> error_rms(recorded + 0.1, recorded, np.array([3])).round(9).tolist()
-    [[0.1]]
-    """
+    """Return the root mean square error of every episode, shape (batch, n); arguments as in `summarise`."""
     with np.errstate(over="ignore", invalid="ignore"):
         error = estimate - truth
         if np.any(lengths != len(truth)):
@@ -97,32 +88,7 @@ def _percent(rms: Array, largest: Array) -> Array:
 
 
 def error_spectrum(error: Array, dt: float, segment: int = _SEGMENT, axis: int = 0) -> tuple[Array, Array]:
-    """Return Welch's estimate of the error's power spectral density: half overlapping Hann windows.
-
-    Parameters
-    ----------
-    error : ndarray, shape (n_samples, ...)
-        Samples on the first axis, or on that of `axis`.
-    dt : float, s
-    segment : int
-        Samples of a segment; shorter signals are padded with zeros, so that all spectra have the same frequencies.
-    axis : int
-
-    Returns
-    -------
-    freqs_hz : ndarray, shape (n_freqs,)
-    density : ndarray, shape (n_freqs, ...)
-        One-sided: the powers of a frequency and its negative together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import error_spectrum
-    >>> tone = np.sin(2 * np.pi * 25 * 0.001 * np.arange(4000))
-    >>> freqs_hz, density = error_spectrum(tone, 0.001, segment=400)
-    >>> float(freqs_hz[density.argmax()])
-    25.0
-    """
+    """Return frequencies and one-sided power density of an error by Welch's method: half overlapping Hann windows."""
     from scipy.signal import welch
 
     values = np.asarray(error, dtype=float)

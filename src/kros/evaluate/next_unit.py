@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
-_ROUNDING = 1e-9  # 0.9 / (1 - 0.9) is a little more than 9
 
 
 def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]:
@@ -31,50 +31,16 @@ def draw_reserve(units: Sequence[str], n: int, seed: int = 0) -> tuple[str, ...]
 
 def fewest_units(confidence: float) -> int:
     """Return how many units bound the next one: ``1 / (1 - confidence) - 1``, rounded up."""
-    return ceil(confidence / (1 - confidence) - _ROUNDING)
+    return ceil(confidence / (1 - confidence) - ITERATED)  # 0.9 / (1 - 0.9) is a little more than 9
 
 
 def next_unit_bound(errors: npt.ArrayLike, scale: npt.ArrayLike, confidence: float = 0.95) -> Array | None:
-    """Bound the errors of the next unit, all of them together.
-
-    Parameters
-    ----------
-    errors : array_like, shape (unit, k)
-        Of units that nothing was made from, exchangeable with each other and with the next; what is not finite counts
-        as infinite.
-    scale : array_like, shape (k,)
-        Positive, and fixed without a look at these units: errors divided by it are compared with each other.
-    confidence : float
-        In (0, 1).
-
-    Returns
-    -------
-    ndarray, shape (k,), or None
-        None where the units are fewer than `fewest_units`; infinite where too many errors are.
-
-    Raises
-    ------
-    DataError
-        When the scale is not positive and finite, shapes differ or the confidence is none.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import next_unit_bound
-    >>> errors = np.linspace(1.0, 2.0, 30)[:, None]  # of 30 units that were held in reserve
-    >>> next_unit_bound(errors, [1.0], confidence=0.95).tolist()
-    [2.0]
-    """
+    """Bound the errors of the next unit, (k,), all of them together; None with fewer units than `fewest_units`."""
     errors, scale = np.asarray(errors, dtype=float), np.asarray(scale, dtype=float)
-    if not 0 < confidence < 1:
-        raise DataError(f"Bound of the next unit: the confidence is between 0 and 1, found {confidence:g}.")
-    if errors.ndim != 2 or scale.shape != errors.shape[1:] or not scale.size:
-        shapes = f"needs errors (unit, k) and a scale (k,), found {errors.shape} and {scale.shape}"
-        raise DataError(f"Bound of the next unit: {shapes}.")
     if not (np.isfinite(scale) & (scale > 0)).all():
         raise DataError(f"Bound of the next unit: a scale is positive and finite, found {scale.tolist()}.")
     if len(errors) < fewest_units(confidence):
         return None
     scores = np.max(np.where(np.isfinite(errors), errors, np.inf) / scale, axis=1)
-    rank = ceil(confidence * (len(errors) + 1) - _ROUNDING)
+    rank = ceil(confidence * (len(errors) + 1) - ITERATED)
     return np.sort(scores)[rank - 1] * scale

@@ -37,27 +37,7 @@ class TrueErrors:
 def true_errors(
     signals: Array, truths: Array, states: tuple[int, ...], lengths: npt.NDArray[np.int64], dt: float
 ) -> TrueErrors:
-    """Return the errors of recorded or estimated states against truths.
-
-    Parameters
-    ----------
-    signals : ndarray, shape (n_samples, batch, n)
-    truths : ndarray, shape (n_samples, batch, n_truths)
-    states : tuple of int
-        Column of `signals` that each truth is the truth of.
-    lengths : ndarray, shape (batch,)
-        Samples of every episode that count.
-    dt : float, s
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.evaluate import true_errors
-    >>> truth = np.sin(0.02 * np.arange(1000)).reshape(1000, 1, 1)
-    >>> late = np.concatenate([truth[:1], truth[:1], truth[:-2]])  # a filtered sensor shows it two samples later
-    >>> true_errors(late, truth, (0,), np.array([1000]), 0.001).lag_s.round(4).item()
-    0.002
-    """
+    """Return the errors of signals (n_samples, batch, n) against the truths of some states, and how late these are."""
     signals, lag = signals[..., list(states)], np.empty(truths.shape[1:])
     for length in np.unique(lengths):
         rows = lengths == length
@@ -66,13 +46,7 @@ def true_errors(
 
 
 def delay_samples(signals: Array, truths: Array, longest: int = 200) -> Array:
-    """Return the delay of truths, at most `longest` either way, that fits signals best in the least-squares sense.
-
-    Minimises ``J(d) = sum_k (y_k - x_{k-d})^2`` over a window of samples that is the same for all `d`, so that the ends
-    of an episode favour no delay. All whole `d` are computed at once, ``J(d) = sum y^2 - 2 sum y_k x_{k-d} + sum
-    x_{k-d}^2``, by FFT and running sums; the least one and its neighbours are interpolated by a parabola, which for a
-    signal sampled `s` times a period misses by about ``0.06 (2 pi / s)^2`` samples at most.
-    """
+    """Return the delay of truths, at most `longest`, that fits signals best; a parabola refines the least cost."""
     from scipy.fft import irfft, next_fast_len, rfft
 
     n = len(signals)

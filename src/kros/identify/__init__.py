@@ -14,7 +14,6 @@ import sys
 from types import ModuleType
 
 from ..core.removed import refusing
-from .bootstrap import ModelSamples, bootstrap_edmd, episode_weights
 from .calibration import PhaseCalibration, PhaseSpec
 from .edmd import KoopmanMatrices, edmd, smallest_stabilising_alpha
 from .factors import Factor, combine, episode_factors
@@ -27,15 +26,12 @@ __all__ = [
     "Factor",
     "IdentifiedModels",
     "KoopmanMatrices",
-    "ModelSamples",
     "ModelSet",
     "PhaseCalibration",
     "PhaseSpec",
-    "bootstrap_edmd",
     "combine",
     "edmd",
     "episode_factors",
-    "episode_weights",
     "free_run",
     "identify",
     "smallest_stabilising_alpha",

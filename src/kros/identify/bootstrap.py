@@ -30,17 +30,7 @@ Array = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ModelSamples:
-    """Models of resampled episodes around an estimate.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.identify import KoopmanMatrices, ModelSamples
-    >>> estimate = KoopmanMatrices(np.full((1, 1, 1), 0.9), np.ones((1, 1, 1)))
-    >>> draws = KoopmanMatrices(np.array([0.89, 0.9, 0.91]).reshape(1, 3, 1, 1), np.ones((1, 3, 1, 1)))
-    >>> ModelSamples(("a",), estimate, draws).samples.A.std(axis=1, ddof=1).round(3).item()
-    0.01
-    """
+    """Models of resampled episodes around an estimate."""
 
     unit_ids: tuple[str, ...]
     estimate: KoopmanMatrices  # A (unit, n, n) and B (unit, n, m)
@@ -52,19 +42,7 @@ class ModelSamples:
 
 
 def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
-    """Draw episodes with replacement, E - 1 of E, and return how much each counts.
-
-    The result has the shape (unit, draw, max(n_episodes)), zero where a unit has fewer episodes; each draw sums to the
-    unit's number of episodes. A unit's draws depend on the seed and its row alone. With fewer than two episodes or
-    draws a DataError is raised.
-
-    Examples
-    --------
-    >>> from kros.identify import episode_weights
-    >>> weights = episode_weights([4, 3], draws=100, seed=0)
-    >>> weights.shape, weights.sum(axis=2).min(axis=1).tolist()
-    ((2, 100, 4), [4.0, 3.0])
-    """
+    """Draw E - 1 of E episodes with replacement, and return how much each counts: (unit, draw, max(n_episodes))."""
     counts = [int(e) for e in n_episodes]
     if not counts or min(counts) < 2 or draws < 2:
         raise DataError(
@@ -81,35 +59,7 @@ def episode_weights(n_episodes: Sequence[int], draws: int, seed: int) -> Array:
 def bootstrap_edmd(
     R: Array, n_lifted: int, alpha: float, weights: Array, unit_ids: Sequence[str] | None = None
 ) -> ModelSamples:
-    """Return EDMD models of resampled episodes at a fixed alpha.
-
-    Parameters
-    ----------
-    R : ndarray, shape (unit, episode, p + n_lifted, p + n_lifted)
-        Factors of [Psi | Theta_plus] of every episode; zero where a unit has fewer episodes.
-    n_lifted : int
-    alpha : float
-    weights : ndarray, shape (unit, draw, episode)
-        See `episode_weights`.
-    unit_ids : sequence of str, optional
-
-    Raises
-    ------
-    IdentificationError
-        When the episodes drawn leave a column dependent and `alpha` is zero.
-
-    Examples
-    --------
-    >>> import kros
-    >>> from kros.identify import bootstrap_edmd, episode_factors, episode_weights
-    >>> from kros.lifting import Lifting
-    >>> motors = kros.plants.DcMotorPopulation(n_units=2, n_episodes=4, seconds=1.0, seed=3).simulate().population
-    >>> keys = {unit: motors.keys(unit) for unit in motors.unit_ids}
-    >>> factors = episode_factors(motors, keys, Lifting(motors.states))
-    >>> samples = bootstrap_edmd(factors.R, 3, 1e-3, episode_weights([4, 4], draws=20, seed=0), motors.unit_ids)
-    >>> samples.samples.A.shape
-    (2, 20, 3, 3)
-    """
+    """Return EDMD models of resampled episodes at a fixed alpha, from factors (unit, episode, k, k) and weights."""
     units, episodes, width, _ = R.shape
     models = []
     for draw in [np.ones((units, episodes)), *np.swapaxes(weights, 0, 1)]:

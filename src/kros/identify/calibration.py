@@ -134,11 +134,7 @@ def wrap(angle: float) -> float:
 
 
 def find_segments(angle: Array, reference: Array, measured: Array, dt: float, spec: PhaseSpec) -> list[Segment]:
-    """Find the constant-velocity segments of an episode and the phase of the error in each.
-
-    Signals (n_samples,) are in any units of measure; the speed of a segment is that of the angle. NaN, a missing
-    sample, ends a segment.
-    """
+    """Find the constant-velocity segments of an episode, signals (n_samples,), and the phase of the error in each."""
     there = np.isfinite(angle) & np.isfinite(reference) & np.isfinite(measured)
     angle, reference, measured = (np.where(there, signal, 0.0) for signal in (angle, reference, measured))
     top = np.max(np.abs(reference))
@@ -210,12 +206,7 @@ def _circular_mean(segments: Sequence[Segment]) -> tuple[float, float]:
 
 
 def resolve_branches(units: Mapping[str, UnitPhase], pooled: Sequence[str], spec: PhaseSpec) -> PhaseCalibration:
-    """Choose the branch of the half sum for the whole population.
-
-    Lags are known modulo pi; their mean is taken over doubled angles of the `pooled` units, and every unit is moved to
-    the branch whose lag lies within 90 degrees of it. What remains free is one pi common to all units, fixed by a mean
-    lag in [-pi, 0).
-    """
+    """Choose the branch of the half sum for the population: within 90 degrees of the mean lag, that in [-pi, 0)."""
     doubled = np.mean([np.exp(2j * units[u].lag_rad) for u in pooled])
     lag = float(np.angle(doubled)) / 2
     lag = lag - np.pi if lag >= 0 else lag

@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
-from ..core.rounding import EPS
+from ..core.rounding import EPS, ROUNDING
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
 from .edmd import KoopmanMatrices, edmd, relative_pivots
@@ -178,7 +178,7 @@ def require_excitation(
     if factor.input_range is None:
         return
     low, high = factor.input_range[..., 0, :], factor.input_range[..., 1, :]
-    still = high - low <= 450 * EPS * np.maximum(np.abs(low), np.abs(high))
+    still = high - low <= ROUNDING * np.maximum(np.abs(low), np.abs(high))
     dead = [name for name, zero in zip(inputs, np.all(still & (low == 0), axis=0), strict=True) if zero]
     for i, j in np.argwhere(still):
         kind = "zero" if low[i, j] == 0 else "constant"

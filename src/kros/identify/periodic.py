@@ -41,6 +41,7 @@ class PeriodicTest:
     largest_ratio: float = 500.0  # beyond that of any gear
     lags: int = 3  # steps whose states and inputs the residual is regressed on
     samples: int = 40_000  # of a unit
+    around: tuple[float, float] = (6.0, 40.0)  # surroundings of a peak, in its half widths
     above: float = 15.0  # of a peak over the median around it; noise alone reaches about 8
     above_in_every_unit: float = 3.0  # of the peak of each unit over its surroundings
     least_share: float = 0.002  # of the residual that a term explains
@@ -133,7 +134,8 @@ def _peak(units: Sequence[_Unit], test: PeriodicTest) -> tuple[float, float] | N
     if min(width, travel, advance) <= 0:
         return None
     largest = min(test.largest_ratio, 1.0 / advance, np.pi * _BINS / (32 * width))
-    smallest, half = 6 * np.pi / travel, np.pi / travel
+    half = np.pi / travel
+    smallest = test.around[0] * half
     if largest < 1.5 * smallest:
         return None
     cell = np.pi / (4 * largest)
@@ -160,7 +162,7 @@ def _standing_out(
     places = np.flatnonzero(inside)
     for i in places[np.argsort(total[places])[::-1][:50]]:
         off = np.abs(ratios - ratios[i])
-        around = inside & (off < max(ratios[i] / 3, 40 * half)) & (off > 6 * half)
+        around = inside & (off < max(ratios[i] / 3, test.around[1] * half)) & (off > test.around[0] * half)
         floor, middle = np.median(spectra[:, around], axis=1), np.median(total[around])
         in_every_unit = spectra[:, off < half].max(axis=1) > test.above_in_every_unit * floor
         if total[i] > test.above * middle and in_every_unit.all():

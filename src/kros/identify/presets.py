@@ -22,6 +22,7 @@ from .settings import CalibrationSettings, LiftingSettings
 Array = npt.NDArray[np.float64]
 HARMONIC_DRIVE = "harmonic-drive"
 PHASE = "phase"
+_BAND = 0.1  # half the width of the band around the gearbox frequency, share of it
 _EPISODES, _SAMPLES = 40, 5000  # of the training recordings that centres of families are found among, at most
 
 
@@ -109,7 +110,7 @@ def gearbox_band_hz(
     if population.metadata.get("plant") != HARMONIC_DRIVE or not top_speed:
         return None
     centre = _declared_ratio(declared, population) * top_speed / (2 * np.pi)
-    return 0.9 * centre, 1.1 * centre
+    return (1 - _BAND) * centre, (1 + _BAND) * centre
 
 
 def _declared_ratio(declared: CalibrationSettings, population: Population) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, IdentificationError, MissingDependencyError
+from ..core.rounding import ROUNDING
 from ..identify import edmd, free_run
 from ..identify.edmd import relative_pivots
 from ..identify.factors import triangular
@@ -170,18 +171,6 @@ class KoopmanRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         predicted = self._step(values[:, :n], values[:, n:])
         return predicted[:, 0] if self._one_dimensional else predicted
 
-    def predict_trajectory(self, X: Any) -> Array:
-        """Predict whole episodes from their first state and the recorded inputs, shape (n_samples, n_states).
-
-        Parameters
-        ----------
-        X : array_like or DataFrame, shape (n_samples, n_columns)
-            Of the states only the first row of each episode is used; the state is retracted and lifted again at every
-            step.
-        """
-        check_is_fitted(self)
-        return self._free_run(*self._read(X, reset=False))
-
     def score(self, X: Any, y: Any = None) -> float:
         """Return R2 of the prediction `horizon` samples ahead, the mean over the states; -inf where it diverges.
 
@@ -279,7 +268,7 @@ def _require_excited(R: Array, names: Sequence[str], n_pairs: int) -> None:
     if n_pairs < len(names):
         problem = f"Found n_samples = {n_pairs} transitions for {len(names)} unknowns of every row of [A B]"
         raise DataError(f"{problem}; record more, or use alpha > 0.")
-    dependent = np.flatnonzero(relative_pivots(R) <= 450 * np.finfo(float).eps)  # what rounding leaves of a sum
+    dependent = np.flatnonzero(relative_pivots(R) <= ROUNDING)
     if dependent.size:
         problem = f"With alpha = 0 {names[int(dependent[0])]!r} cannot be identified"
         reason = "it depends on the columns before it, or is zero"

@@ -55,15 +55,7 @@ def load(source: str, flags: tuple[str, ...]) -> ctypes.CDLL | None:
 
 
 def run_tool(command: Sequence[str], given: str = "", seconds: float = _SECONDS, cwd: str | None = None) -> str:
-    """Run a tool in a process group that ends in time; return what it printed, whatever its bytes.
-
-    Raises
-    ------
-    subprocess.SubprocessError
-        When it refuses, or takes too long, with the reason in one line.
-    OSError
-        When it cannot be run.
-    """
+    """Run a tool in a process group that ends in time; return what it printed, or raise with the reason in a line."""
     with subprocess.Popen(
         command,
         stdin=subprocess.PIPE,

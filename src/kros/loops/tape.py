@@ -23,7 +23,7 @@ class Tape:
     registers: int
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def tape_of(lifting: Lifting, m: int, entries: tuple[int, ...] = ()) -> Tape:
     """Return the tape of a lifting with m recorded inputs."""
     window, n, n_lifted = lifting.window.names, lifting.n_states, lifting.n_lifted

@@ -48,12 +48,11 @@ def known_load(
     sample_period_s: float,
     moment: float,
     inertia: float = 0.0,
-    angle_rad: float = 0.0,
     corner_hz: float = 20.0,
 ) -> Array:
-    """Return the torque of a mounted mass, ``moment sin(position - angle) + inertia position''``, position in rad."""
+    """Return the torque of a mounted mass, ``moment sin(position) + inertia position''``, position in rad."""
     position = np.asarray(position, dtype=float)
-    load = moment * np.sin(position - angle_rad)
+    load = moment * np.sin(position)
     if inertia:
         acceleration = np.zeros_like(position)
         acceleration[1:-1] = np.diff(position, n=2, axis=0) / sample_period_s**2
@@ -107,11 +106,7 @@ class TorqueScale:
     def calibrated(
         cls, error: npt.ArrayLike, known: npt.ArrayLike, sample_period_s: float, corner_hz: float = 5.0, skip: int = 300
     ) -> TorqueScale:
-        """Return the scale from measured minus estimated current and the torque of a known load, (n_samples, ...).
-
-        Least squares with a bias on signals low-passed without delay, without `skip` samples at the start. A DataError
-        says when the known load does not change, or the error does not follow it.
-        """
+        """Return the scale from the error of a current and a known load by least squares of low-passed signals."""
         x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
         dx, dt = x - x.mean(), t - t.mean()
         if not dt @ dt > 0 or not dx @ dt > 0:

@@ -17,7 +17,6 @@ from .certificate.error import ReliftScales
 from .estimator.build import identify_estimator
 from .estimator.regression import Recordings
 from .estimator.settings import EstimatorSettings
-from .filter_bank import FilterBank
 from .observer import Observer
 from .running import Estimate, RunningObserver
 from .runtime import Runtime, Seen
@@ -28,7 +27,6 @@ from .simulate import run_observer
 __all__ = [
     "Estimate",
     "EstimatorSettings",
-    "FilterBank",
     "Observer",
     "Recordings",
     "ReliftCertificate",

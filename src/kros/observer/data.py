@@ -153,13 +153,7 @@ class ObserverData:
 
     @property
     def filter_gain(self) -> Array:
-        """Gain of the filtered estimate, ``x_hat(k|k) = x_hat(k) + L_f (y - C x_hat(k))``; shape (n, q).
-
-        It follows from the correction: the direct correction of the next estimate is that of this one, carried
-        through the model: ``A_s L_f = (into D^c)_s`` by least squares. For a Kalman predictor of a linear model this is
-        its filter, exactly; states of the correction and slopes of lifted functions are left out. A filter bank takes
-        the measurement.
-        """
+        """Gain L_f of ``x_hat + L_f (y - C x_hat)``, (n, q): ``A_s L_f = (into D^c)_s`` by least squares."""
         n = self.lifting.n_states
         if self.bank is not None:
             return np.eye(n)[:, list(self.measured)]
@@ -201,15 +195,7 @@ class ObserverData:
     def values(
         self, parameters: Mapping[str, npt.ArrayLike] | None = None, shape: tuple[int, ...] | None = None
     ) -> dict[str, Any]:
-        """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`.
-
-        Raises
-        ------
-        ConfigError
-            When one is unknown, missing or not finite.
-        DimensionError
-            When one has another shape.
-        """
+        """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
         unknown = [name for name in values if name not in known and name not in self.parameters]
         missing = [name for name in known if values.get(name) is None]

@@ -29,44 +29,16 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
+from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
-_FORGOTTEN = 1e-9  # samples: an age whose square counts as nothing beside any half
+_FORGOTTEN = ITERATED  # samples: an age whose square counts as nothing beside any half
 _ARRAYS = ("start", "forget", "half", "recovery", "reach")
 
 
 @dataclass(frozen=True, eq=False)
 class FilterBank:
-    """Start and gaps of an observer that is a filter bank.
-
-    Parameters
-    ----------
-    filters : int
-        Number of filters z, the first internal states; filters of inputs alone and their estimates follow.
-    start : ndarray, shape (n_states, n_lifted + inputs)
-        First estimate ``start @ [theta(y_0); u_0; gamma(u_0, y_0)]``, with zero for states that are not measured.
-    forget : ndarray, shape (n,)
-        rho of every recorded state, between zero and one.
-    half : ndarray, shape (n,) or (batch, n)
-        T of every recorded state, the age of a gap at which its level is one half, in samples; by machine in trials.
-    recovery : ndarray, shape (n,)
-        mu of every recorded state, between zero and one.
-    reach : ndarray, shape (q,)
-        Largest distance between the substitute of a missing measurement and the fallback, at level zero.
-
-    Raises
-    ------
-    DataError
-        When a number is not finite or outside its range.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.observer import FilterBank
-    >>> bank = FilterBank(1, np.zeros((3, 5)), np.array([0.99]), np.array([30.0]), np.array([0.97]), np.array([0.1]))
-    >>> bank.level(np.array([[90.0]])).tolist()
-    [[0.9]]
-    """
+    """Start and gaps of an observer that is a filter bank."""
 
     filters: int
     start: Array

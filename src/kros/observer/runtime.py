@@ -143,13 +143,7 @@ class Runtime:
 
 @dataclass(frozen=True, eq=False)
 class Guard:
-    """Bounds of the states of an observer, and how long a start takes.
-
-    An observer is stable with the measurements that it was made for. Without some of them it runs on its own
-    predictions, which may grow. The step that would leave the bounds is not taken, the estimate stands still, and at
-    the next sample with a measurement and all inputs the observer starts as it did at first. `SampleStatus.RESTARTED`
-    is set from there on until the start has settled.
-    """
+    """Bounds of an observer's states: a step beyond them is not taken, the next good sample starts it again."""
 
     lower: Array  # (n,), of the estimate, internal states included
     upper: Array
@@ -185,7 +179,7 @@ class Guard:
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:
-    """Return the bounds of [x; x^c], those of a padded correction too: products of what is within are finite."""
+    """Return the bounds of [x; x^c]: products of what is within are finite."""
     most = float(np.sqrt(np.finfo(float).max))
     low, high = np.full(n + order, -most), np.full(n + order, most)
     if guard is not None:

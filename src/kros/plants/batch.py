@@ -107,10 +107,7 @@ class UnitTruth(ABC):
         return x
 
     def respond(self, inputs: Array) -> Array:
-        """Return states from rest without sensors, (n_states, n_units, n_episodes, n_samples), inputs held.
-
-        Two steps a sample of the method of Runge and Kutta of order four; inputs have shape (n_episodes, n_samples).
-        """
+        """Return states from rest, (n_states, n_units, n_episodes, n_samples), by two Runge-Kutta steps a sample."""
         x, h = np.zeros((self.n_states, len(self.unit_ids), len(inputs))), self.sample_period_s / 2
         out = np.empty((inputs.shape[1], *x.shape))
         for k, u in enumerate(inputs.T):

@@ -9,8 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..evaluate import Kind
-from ..evaluate.disturb import severity_of_growth
+from ..evaluate.disturb import Kind, severity_of_growth
 from .facts import Facts
 from .names import number
 

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from .generalized_plant import GeneralizedPlant
     from .mixed_norms.mixed import mixed
     from .problem.observer_problem import ObserverProblem
-    from .residual_shaped.residual_h2 import ResidualProblem, residual_h2
     from .result import Injection, Status, Synthesis
     from .riccati.h2 import h2
     from .riccati.hinf import hinf
@@ -33,14 +32,12 @@ _HOME = {
     "GeneralizedPlant": "generalized_plant",
     "Injection": "result",
     "ObserverProblem": "problem.observer_problem",
-    "ResidualProblem": "residual_shaped.residual_h2",
     "Status": "result",
     "Synthesis": "result",
     "h2": "riccati.h2",
     "hinf": "riccati.hinf",
     "kalman": "riccati.kalman",
     "mixed": "mixed_norms.mixed",
-    "residual_h2": "residual_shaped.residual_h2",
     "worst_case_h2": "worst_case.worst_case_h2",
 }
 
@@ -48,14 +45,12 @@ __all__ = [
     "GeneralizedPlant",
     "Injection",
     "ObserverProblem",
-    "ResidualProblem",
     "Status",
     "Synthesis",
     "h2",
     "hinf",
     "kalman",
     "mixed",
-    "residual_h2",
     "worst_case_h2",
 ]
 

@@ -18,8 +18,6 @@ from .generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
 
-_RANK = 1e-10
-
 # Label and remedy of each assumption.
 STABILISABLE = "A1a: (A, B2) stabilisable", "make the weights stable or let the control reach this mode"
 DETECTABLE = "A1b: (C2, A) detectable", "make the weights stable or measure this mode"
@@ -104,14 +102,11 @@ def _balanced(A: Array, B: Array) -> tuple[Array, Array]:
 
 def _rank(matrix: Array) -> int:
     values = np.linalg.svd(matrix, compute_uv=False) if matrix.size else np.zeros(0)
-    return int(np.sum(values > _RANK * max(values.max(initial=0.0), TINY)))
+    return int(np.sum(values > ITERATED * max(values.max(initial=0.0), TINY)))
 
 
 def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[complex]:
-    """Invariant zeros on the stability boundary.
-
-    D has full column rank, so zeros are eigenvalues of A - B D^+ C seen by the rest of C.
-    """
+    """Zeros on the stability boundary: D of full column rank, eigenvalues of A - B D^+ C that the rest of C sees."""
     pinv = np.linalg.pinv(D)
     inner, seen = _balanced((A - B @ pinv @ C).T, (C - D @ (pinv @ C)).T)
     zeros = []
@@ -119,6 +114,6 @@ def _boundary_zeros(A: Array, B: Array, C: Array, D: Array, dt: float) -> list[c
         distance = abs(abs(mode) - 1) if dt > 0 else abs(mode.real) / (1 + abs(mode))
         if distance < ROUNDING:
             values = np.linalg.svd(np.hstack([inner - mode * np.eye(len(A)), seen]), compute_uv=False)
-            if values[-1] <= 1e-10 * values[0]:
+            if values[-1] <= ITERATED * values[0]:
                 zeros.append(complex(mode))
     return zeros

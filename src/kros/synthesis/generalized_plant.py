@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, real_array, sampling_period
+from ..core.rounding import SINGULAR
 
 Array = npt.NDArray[Any]
 
@@ -169,7 +170,7 @@ class GeneralizedPlant:
                 f"Closing the loop: the controller should be {n_u} x {n_y} at {self.dt} s, found {size}."
             )
         loop = np.eye(n_y) - self.D22 @ K.D
-        if n_y and np.linalg.cond(loop) > 1e14:
+        if n_y and np.linalg.cond(loop) > SINGULAR:
             raise DimensionError("Closing the loop: I - D22 D^c is singular; use a strictly proper controller.")
         # y = loop^-1 (C2 x + D21 w + D22 C^c x^c),  u = C^c x^c + D^c y
         solved = np.linalg.solve(loop, np.hstack([self.C2, self.D22 @ K.C, self.D21]))

@@ -11,6 +11,7 @@ from typing import Any
 from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
+from ..core.rounding import AGREED
 from ..core.settings import member
 
 log = logging.getLogger(__name__)
@@ -118,7 +119,7 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
         return 0.0, None, ()
     if lower is None:
         return None, None, ("No lower bound could be proven.",)
-    if lower > value * (1 + _ROUNDING):
+    if lower > value * (1 + AGREED):
         problem = f"a lower bound of {lower:.9g} above the attained {value:.9g} was dropped"
         log.error("Internal error: %s", problem)
         return None, None, (f"Internal error: {problem}; please report this problem.",)
@@ -126,5 +127,4 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
     return lower, 100 * (value / lower - 1), ()
 
 
-_ROUNDING = 1e-6
 _PLAIN = tuple(name for name in Synthesis.__dataclass_fields__ if name != "controller")

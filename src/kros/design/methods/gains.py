@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ... import synthesis  # solvers load when they are used
 from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.baselines.kalman import kalman_candidates
 from ...observer.residual.models import Refitted, ResidualModel, refitted_models, residual_models
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
 from ...synthesis import Synthesis
+from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 from ..task import Design, DesignTask, Method
 from ..validation import hidden_mean, percent_of
 
@@ -87,9 +87,9 @@ class ResidualH2(Method):
         """Return the best of the models that promise the smallest errors."""
         models, n = promising(task)[: self.compared], task.models.lifting.n_states
         C, scale, dt = task.selector[:, :n], task.models.output_scale[:n], task.models.sample_period_s
-        problems = [synthesis.ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
+        problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
         lifted, order = task.models.lifting.n_lifted, self.max_order
-        syntheses = [synthesis.residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
+        syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
         observers = [
             task.observer(one, model.A, model.B) if model.refitted else task.observer(one)
             for model, one in zip(models, syntheses, strict=True)

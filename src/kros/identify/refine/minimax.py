@@ -16,10 +16,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import ITERATED
+
 Array = npt.NDArray[Any]
 Score = Callable[[Array], Array]
 
-TIE = 1e-9  # relative; scores closer than rounding are one
+TIE = ITERATED  # relative; scores closer than rounding are one
 
 
 def smallest_largest(

@@ -126,10 +126,7 @@ def _falling(options: RefineOptions) -> list[float]:
 
 
 def _path(data: TrainingData, problem: RefinementProblem, common: Array) -> tuple[list[Array], Array, Array]:
-    """Fit all units at falling strengths, until weaker ones bring nothing or too much uncertainty.
-
-    Returns their parameters, held-out scores and peak residuals.
-    """
+    """Fit all units at falling strengths, until weaker ones bring nothing; return parameters, scores and peaks."""
     options = problem.options
     search = replace(options.search, iterations=options.path_iterations)
     V = np.repeat(common[None], problem.segments.n_units, axis=0)

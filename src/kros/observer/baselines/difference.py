@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import ConfigError, DimensionError
 from ...data import EpisodeBatch
 
 Array = npt.NDArray[np.float64]
@@ -24,24 +23,9 @@ class FilteredDifference:
     sample_period_s: float
     scales: tuple[float, ...] = ()  # of every pair: the state over the rate, which units of measure decide; one
 
-    def __post_init__(self) -> None:
-        if not 0 < self.cutoff_hz < 0.5 / self.sample_period_s:
-            raise ConfigError(
-                f"Filtered difference: the cut-off of {self.cutoff_hz:g} Hz should lie between 0 and "
-                f"{0.5 / self.sample_period_s:g} Hz, half the sampling frequency."
-            )
-
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
-        """Estimate the rates from y (n_samples, batch, q), at rest before; shape (n_samples, batch, n).
-
-        Row k from measurements up to k - 1; NaN for states that are no rate of a measured one. Inputs and parameters
-        play no part.
-        """
+        """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
         del u, parameters
-        if y.ndim != 3:
-            raise DimensionError(
-                f"Filtered difference: measurements should have shape (n_samples, batch, q), found {y.shape}."
-            )
         estimate = np.full((*y.shape[:2], self.n_states), np.nan)
         for number, (measurement, state) in enumerate(self.pairs):
             rate = np.zeros(y.shape[1::-1])

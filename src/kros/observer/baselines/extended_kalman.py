@@ -44,14 +44,6 @@ class ExtendedKalman:
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
-    def __post_init__(self) -> None:
-        n, q = self.lifting.n_states, len(self.measured)
-        if self.Q.shape[-2:] != (n, n) or self.R.shape != (q, q) or self.P0.shape != (n, n):
-            raise DimensionError(
-                f"Extended Kalman filter: {n} states and {q} measurements need Q and P0 ({n}, {n}) and R ({q}, {q}), "
-                f"found {self.Q.shape}, {self.P0.shape} and {self.R.shape}."
-            )
-
     def run(
         self,
         y: Array,
@@ -59,11 +51,7 @@ class ExtendedKalman:
         parameters: Mapping[str, npt.ArrayLike] | None = None,
         starts: npt.NDArray[np.bool_] | None = None,
     ) -> Array:
-        """Estimate a batch from y (n_samples, batch, q) and u (n_samples, batch, m); shape (n_samples, batch, n).
-
-        Row k is the prediction from data up to k - 1; row 0 is the start. Where a measurement is not finite, nothing is
-        corrected at that sample, and the covariance grows. At `starts`, (n_samples, batch), machines start again.
-        """
+        """Predict a batch from y (n_samples, batch, q), NaN where missing, and u; machines start again at `starts`."""
         return self.run_all(y, u, parameters, starts)[0]
 
     def run_all(

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, DimensionError
+from ...core.errors import DataError
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...data.batch import hold_missing
@@ -48,9 +48,7 @@ class Learned:
         from scipy.fft import irfft, next_fast_len, rfft
 
         del parameters
-        (delays, channels, _), samples = self.weights.shape, len(y)
-        if y.shape[:-1] != u.shape[:-1] or y.shape[-1] + u.shape[-1] != channels:
-            raise DimensionError(f"Learned estimator: expected {channels} channels, found {y.shape} and {u.shape}.")
+        delays, samples = len(self.weights), len(y)
         z = np.concatenate([y, u], axis=-1)
         first, moved = z[0], np.concatenate([np.zeros((1, *z.shape[1:])), z[:-1] - z[0]])
         size = next_fast_len(samples + delays, real=True)

@@ -116,14 +116,6 @@ class ReliftCertificate:
         """Return the error dynamics that the certificate is about."""
         return error_system(observer, self.scales, self.box, self.parameters)
 
-    def initial_energy(self, error: npt.ArrayLike) -> Array:
-        """Return V(e_0) in scaled units, shape (...), of an error, shape (..., n_window), the controller at rest.
-
-        The first error is in physical units; behind it are earlier errors where the lifting has delays.
-        """
-        xi = np.asarray(error, dtype=float) @ self.start[:, : np.shape(error)[-1]].T
-        return np.asarray(np.sum((xi @ self.root.T) ** 2, axis=-1))
-
     def in_sizes(self, observer: ObserverData, sizes: Mapping[str, float]) -> ReliftCertificate:
         """Return what the certificate of an observer says of the same observer for signals divided by other sizes."""
         x, u = factors(observer, sizes)

@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
 from ...core.lti import StateSpace
-from ...core.rounding import EPS
+from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
 from ...lifting.intervals import break_of, slope_bounds_of
 from ..data import ObserverData
@@ -39,7 +39,7 @@ from ..data import ObserverData
 Array = npt.NDArray[np.float64]
 Box = Mapping[str, Any]
 _WIDER = 1 + 4 * EPS  # centre and half width are rounded
-_CONSTANT = 4e-12  # interval bounds are widened by 1e-12: a slope within that is constant
+_CONSTANT = 4 * ROUNDING  # interval bounds are widened by so much: a slope within that is constant
 
 
 class UnboundedSlopeError(KrosError):
@@ -153,11 +153,7 @@ class ErrorSystem:
         return StateSpace(self.A, self.B, self.M, self.D, self.dt)
 
     def mismatch(self) -> ErrorSystem:
-        """Return the system from q' of the frozen response to the rest of the error.
-
-        The frozen response has ``p' = 0``. The rest ``r = xi - xi'`` obeys ``r+ = A r + L p`` with
-        ``p = d (M r + E p + q')``.
-        """
+        """Return the system from q' (frozen) to the rest: ``r+ = A r + L p``, ``p = d (M r + E p + q')``."""
         width = self.L.shape[1]
         return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
 

@@ -49,13 +49,15 @@ class ProofSettings:
     accuracy: float = 5e-4  # of the least squared gain on the grid
     rounds: int = 60  # of cutting planes
     cuts: int = 30  # of a round
-    above: tuple[float, ...] = (1.001, 1.01, 1.1, 2.0)  # of the least gain on the grid: what is tried
+    above: tuple[float, ...] = tuple(1 + 10.0**-k for k in (3, 2, 1, 0))  # of the least gain on the grid: what is tried
     spare: float = 0.25  # share of the distance to one that the extra output may take
     corners: int = 64  # of a box, which are visited where slopes are frozen
     bits: int = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted
 
 
 SETTINGS = ProofSettings()
+_TIGHT = 1e-8  # relative, of a norm that decides
+_DIGITS = np.finfo(float).nmant + 1  # binary, of a number
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +204,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     inputs, feed, n = inputs / gain, feed / gain, len(A)
     T, back = reachable_coordinates(A, inputs, system.dt)
     A, inputs, outputs = np.eye(n) + back @ (A - np.eye(n)) @ T, back @ inputs, outputs @ T
-    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), 1e-8) * (1 + 1e-8)) ** 2
+    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), _TIGHT) * (1 + _TIGHT)) ** 2
     if room <= 0:
         return None
     spread = hinf_norm(StateSpace(A, inputs, np.eye(n), np.zeros((n, inputs.shape[1])), system.dt), 1e-2)
@@ -230,7 +232,7 @@ def proven(root: Array, inputs: tuple[Array, Array], C: Array, D: Array, gain: f
     parts = [root, np.hstack(inputs), np.hstack([C, D]), np.array([[gain]])]
     if not all(np.isfinite(part).all() for part in parts):
         return False
-    shift = max(53, *(53 - int(np.frexp(part)[1].min(initial=0)) for part in parts))
+    shift = max(_DIGITS, *(_DIGITS - int(np.frexp(part)[1].min(initial=0)) for part in parts))
     R, AB, CD, level = (_integers(part, shift) for part in parts)
     moved, n = R @ AB, len(root)
     F = -moved.T @ moved - ((CD.T @ CD) << (2 * shift))
@@ -243,8 +245,8 @@ def proven(root: Array, inputs: tuple[Array, Array], C: Array, D: Array, gain: f
 def _integers(matrix: Array, shift: int) -> Integers:
     """Return ``2^shift`` times a matrix of doubles, as integers without rounding."""
     mantissa, exponent = np.frexp(matrix)
-    whole = (mantissa * 2.0**53).astype(np.int64).astype(object)
-    return np.asarray(whole << (exponent - 53 + shift).astype(object), dtype=object)
+    whole = (mantissa * 2.0**_DIGITS).astype(np.int64).astype(object)
+    return np.asarray(whole << (exponent - _DIGITS + shift).astype(object), dtype=object)
 
 
 def positive(F: Integers) -> bool:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.rounding import TINY
+from ...core.rounding import AGREED, TINY
 from ...data import EpisodeBatch
 from ...loops.filtering import recursion
 from ..data import ObserverData
@@ -34,7 +34,6 @@ from .proof import proven_gain
 
 Array = npt.NDArray[np.float64]
 _OTHERS = (0.0, 1e-3)  # weights of other states' errors: with them the Riccati equation is better conditioned
-_ROUNDING = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +111,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
     gains, moving = mismatch_gains(system, share, n), np.linalg.norm(acted / share, axis=1)[:, None]
     with np.errstate(invalid="ignore"):
         added = np.where(moving > 0, gains * moving, 0.0)
-    bounds, taken = sizes * (1 + _ROUNDING) * (frozen[:, :n] + added) + rms(seen.beyond), seen.taken(observer)
+    bounds, taken = sizes * (1 + AGREED) * (frozen[:, :n] + added) + rms(seen.beyond), seen.taken(observer)
     outside = tuple(unit for unit, rows in zip(units, member > 0, strict=True) if not taken[rows].all())
     bounds[[unit in outside for unit in units]] = np.inf
     reason = "" if np.isfinite(gains).all() else "what slopes can add has no proven gain"

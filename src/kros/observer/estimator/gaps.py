@@ -108,10 +108,7 @@ def recorded_estimates(observer: Observer, y: Array, u: Array, parameters: Param
 
 
 def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]:
-    """Return for every state, of errors (c, batch, n), the best candidate with the least half that is not worse.
-
-    Worse is by more than a margin of paired standard errors over patterns than the best of all.
-    """
+    """Return for every state of errors (c, batch, n) the best of least half within paired standard errors."""
     mean = errors.mean(axis=1)
     apart = errors - np.take_along_axis(errors, np.argmin(mean, axis=0)[None, None], axis=0)
     error = apart.std(axis=1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else 0.0

@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, DimensionError
+from ...core.errors import DataError
 from ...lifting import Lifting
 
 Array = npt.NDArray[np.float64]
@@ -37,10 +37,6 @@ def one_step_residual(
     parameters: Mapping[str, npt.ArrayLike] | None = None,
 ) -> Array:
     """Run the one-step model along recordings and return what it misses; A (n_lifted, n_lifted), B (n_lifted, m)."""
-    if states.ndim != 3 or inputs.ndim != 3 or states.shape[:2] != inputs.shape[:2]:
-        raise DimensionError(
-            f"One-step residual: states {states.shape} and inputs {inputs.shape} should agree in (n_samples, batch)."
-        )
     n, h = lifting.n_states, lifting.history
     lifting.window.require(len(states), beyond=1)
     x, u = np.swapaxes(states, 0, 1), np.swapaxes(inputs, 0, 1)
@@ -77,11 +73,6 @@ def one_step_covariance(residual: Array, lengths: npt.ArrayLike) -> Array:
 def residual_spectra(residual: Array, lengths: npt.ArrayLike, units: Sequence[str], segment: int = SEGMENT) -> Array:
     """Return every unit's cross spectral density of the residual by Welch's method, means included."""
     lengths = np.asarray(lengths, dtype=int)
-    if residual.ndim != 3 or lengths.shape != (residual.shape[1],) or len(units) != residual.shape[1]:
-        raise DimensionError(
-            f"Residual spectra: {residual.shape} should be (n_samples, batch, n) with as many lengths "
-            f"({lengths.shape}) and units ({len(units)})."
-        )
     size = int(min(segment, lengths.min(), len(residual)))
     if size < FEWEST_SAMPLES:
         raise DataError(

@@ -42,15 +42,16 @@ def transition(p: DriveParameters, loaded: Array) -> Array:
     n = len(p)
     Jm, Jl = p.motor_inertia, p.flange_inertia + loaded * p.load_inertia
     F = np.zeros((n, 8, 8))  # states s, w, w_l, i, q; held inputs u, f_m, f_l
-    F[:, 0, 1], F[:, 0, 2] = 1.0, -1.0
-    F[:, 1, 0], F[:, 1, 1], F[:, 1, 2] = -p.stiffness / Jm, -(p.damping + p.viscous_friction) / Jm, p.damping / Jm
-    F[:, 1, 3], F[:, 1, 6] = p.torque_constant / Jm, 1.0 / Jm
-    F[:, 2, 0], F[:, 2, 1], F[:, 2, 2] = p.stiffness / Jl, p.damping / Jl, -p.damping / Jl
-    F[:, 2, 7] = 1.0 / Jl
-    F[:, 3, 3], F[:, 3, 5] = -1.0 / p.current_lag_s, 1.0 / p.current_lag_s
-    F[:, 4, 1] = 1.0
+    q, u = COMMAND, COMMAND + 1  # places in F, where what is held comes behind q
+    F[:, TWIST, W], F[:, TWIST, WL] = 1.0, -1.0
+    F[:, W, TWIST], F[:, W, W], F[:, W, WL] = -p.stiffness / Jm, -(p.damping + p.viscous_friction) / Jm, p.damping / Jm
+    F[:, W, CURRENT], F[:, W, FM + 1] = p.torque_constant / Jm, 1.0 / Jm
+    F[:, WL, TWIST], F[:, WL, W], F[:, WL, WL] = p.stiffness / Jl, p.damping / Jl, -p.damping / Jl
+    F[:, WL, FL + 1] = 1.0 / Jl
+    F[:, CURRENT, CURRENT], F[:, CURRENT, u] = -1.0 / p.current_lag_s, 1.0 / p.current_lag_s
+    F[:, q, W] = 1.0
     Phi = expm(F * SUBSTEP_S)
-    return Phi[:, :5][:, :, [0, 1, 2, 3, 5, 6, 7]]
+    return np.delete(Phi[:, :u], q, axis=2)
 
 
 class Physics:
@@ -61,7 +62,7 @@ class Physics:
         self.p, self.moment = p, loaded * p.load_moment
         self.M = np.ascontiguousarray(np.moveaxis(transition(p, loaded), 0, -1))
         self.ripple = np.ascontiguousarray((p.ripple * np.exp(1j * p.phase_rad)).T)
-        self.rows = np.zeros((MEASURED + 1 + 7, n))  # side by side, so that recording a sample is one copy
+        self.rows = np.zeros((MEASURED + 2 + FL, n))  # side by side, so that recording a sample is one copy
         self.p_v, self.q, self.z = self.rows[:MEASURED], self.rows[MEASURED], self.rows[MEASURED + 1 :]
         self.q[:] = q0
         for _ in range(20):

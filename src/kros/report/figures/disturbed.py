@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...core.artifacts import read_arrays, read_json
-from ...evaluate import Kind
+from ...evaluate.disturb import Kind
 from ...evaluate.errors import error_spectrum
 from ..canvas import Axes, Figure, frequency_axis, grid, legend, logarithmic, power_of_ten
 from ..disturbances import AXES, Curve, curves

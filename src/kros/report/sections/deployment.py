@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...evaluate import Kind
+from ...evaluate.disturb import Kind
 from ..content import Section
 from ..disturbances import doublings
 from ..facts import Facts

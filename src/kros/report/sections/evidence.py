@@ -10,7 +10,7 @@ from typing import Any
 
 from ...core.linalg import radius_text
 from ...data.recording import some
-from ...evaluate import Kind
+from ...evaluate.disturb import Kind
 from ..content import Column, Section, build
 from ..disturbances import AXES, doublings
 from ..facts import Facts

@@ -24,9 +24,8 @@ from ...core.work import Progress
 from ...data.population import OUTLIERS, Population, split_episodes
 from ...data.survey import RecordingFacts
 from ...design.task import is_robust
-from ...evaluate import next_unit_bound
 from ...evaluate.held_out import HeldOut, Outcome
-from ...evaluate.next_unit import fewest_units
+from ...evaluate.next_unit import fewest_units, next_unit_bound
 from ...identify.calibration import calibration_keys, segments_of
 from ...identify.identified import recordings_of, recordings_path
 from ...observer import Observer

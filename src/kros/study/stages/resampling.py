@@ -14,7 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ...identify import Factor, ModelSamples, ModelSet, bootstrap_edmd, episode_weights
+from ...identify import Factor, ModelSet
+from ...identify.bootstrap import ModelSamples, bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ..engine.context import Context
 

@@ -40,17 +40,7 @@ _SHRINK, _CENTRED, _STEPS = 0.3, 1.0, 400  # of mu once the decrement is below t
 
 
 class Ending(str, Enum):
-    """How it ended.
-
-    SOLVED
-        The value is within the tolerance of the optimum.
-    INFEASIBLE
-        No point within the box satisfies the inequalities.
-    TIME
-        The time limit was reached; a point, if any, satisfies the inequalities.
-    STALLED
-        Rounding stopped the progress; a point, if any, satisfies the inequalities.
-    """
+    """How it ended; a point, if any, satisfies the inequalities unless they are infeasible within the box."""
 
     SOLVED = "solved"
     INFEASIBLE = "infeasible"
@@ -122,10 +112,7 @@ def _find_feasible(programme: _Programme, start: Array) -> Outcome:
 
 
 def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -np.inf) -> Outcome:
-    """Follow the central path from a point inside.
-
-    With `stop_below`, end at a centred point whose value lies clearly below it.
-    """
+    """Follow the central path from a point inside; with `stop_below` to a centred point clearly below it."""
     size = programme.size
     mu, lower, ending = max(abs(programme.value(x)), 1e-3) / size * 10, -np.inf, Ending.STALLED
     for _ in range(_STEPS):
@@ -180,10 +167,7 @@ class _Programme:
         return inside and all(np.linalg.eigvalsh(b.at(x)).min(initial=1.0) > 0 for b in self.blocks)
 
     def derivatives(self, x: Array) -> tuple[Array, Array, list[Array]]:
-        """Gradient ``-tr D_i`` and Hessian ``tr D_i D_j`` of the barrier, and the inverse Cholesky factors R.
-
-        ``D_i = R M_i R'`` for every matrix M_i of coefficients.
-        """
+        """Gradient ``-tr D_i``, Hessian ``tr D_i D_j`` with ``D_i = R M_i R'``, and the inverse Cholesky factors R."""
         above, below = 1 / (self.box - x), 1 / (self.box + x)
         gradient, hessian, roots = above - below, np.diag(above**2 + below**2), []
         for block in self.blocks:

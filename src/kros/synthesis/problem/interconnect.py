@@ -16,6 +16,7 @@ import numpy.typing as npt
 
 from ...core.errors import DimensionError
 from ...core.lti import StateSpace, block_diagonal
+from ...core.rounding import SINGULAR
 
 Array = npt.NDArray[Any]
 Sum = Mapping[str, Array]
@@ -32,7 +33,7 @@ def interconnect(
     tall = {name: next(iter(row.values())).shape[0] for name, row in outputs.items()}
     P, Q = _matrix(outputs, tall, sources), _matrix(outputs, tall, inputs)
     loop = np.eye(len(F)) - F @ whole.D
-    if len(F) and np.linalg.cond(loop) > 1e14:
+    if len(F) and np.linalg.cond(loop) > SINGULAR:
         raise DimensionError("Interconnection: an algebraic loop has no solution; put a delay into it.")
     v = np.linalg.solve(loop, np.hstack([F @ whole.C, H]))
     v_x, v_w = v[:, : whole.n_states], v[:, whole.n_states :]

@@ -31,6 +31,7 @@ import numpy.typing as npt
 from ...core.errors import DimensionError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import hinf_norm
+from ...core.rounding import AGREED
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
@@ -179,7 +180,7 @@ class ObserverProblem:
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
         expected, own = (s.frequency_response(freqs) for s in (uncertain.scaled_nominal(), case.scaled_model))
-        if own.shape != expected.shape or np.abs(own - expected).max() > 1e-6 * np.abs(expected).max():
+        if own.shape != expected.shape or np.abs(own - expected).max() > AGREED * np.abs(expected).max():
             problem = f"the model of {unit!r} is not the nominal that the uncertain set surrounds"
             raise SynthesisError(f"Observer problem: {problem}; quantify these very models.")
         return case

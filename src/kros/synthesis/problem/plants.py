@@ -42,11 +42,7 @@ _LEAST_NOISE, _LEAST_PENALTY = 1e-3, 3e-2
 
 
 def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
-    """Whole problem.
-
-    W = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); the brackets stand for a remainder and process noise, where there
-    are any.
-    """
+    """Whole problem: w = (w1, w2, [w3], n, [v]), z = (z1, z2, [z3]); brackets for remainder and process noise."""
     A, B, C, _ = problem.scaled
     location, J, eye = problem.location, problem.injection_matrix, np.eye
     n, m, q = len(A), B.shape[1], len(C)
@@ -82,10 +78,7 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
 
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
-    """White noise through shaping filters at the input and at the state.
-
-    W = (nu_d, nu_r, n, v), states (xi, W_p, d, r).
-    """
+    """White noise (nu_d, nu_r, n, v) through shaping filters at the input and at the state."""
     q, n = len(problem.C), problem.nominal.n_states
     return shape_inputs(problem.error_plant(), block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)]))
 

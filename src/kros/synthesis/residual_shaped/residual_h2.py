@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError, SynthesisError
+from ...core.errors import SynthesisError
 from ...core.linalg import balancing
 from ...core.lti import StateSpace, gain
 from ...core.norms import gramian, gramian_root, h2_norm
-from ...core.rounding import TINY
+from ...core.rounding import ROUNDING, TINY
 from ..result import Injection, Status, Synthesis, enclosed
 from ..riccati.kalman import kalman, predictor_bound
 from .shaping_filter import Basis, circle_weights, shaping_filter
@@ -33,27 +33,10 @@ from .shaping_filter import Basis, circle_weights, shaping_filter
 Array = npt.NDArray[np.float64]
 Spectra = npt.NDArray[Any]
 
-_NEGLIGIBLE = 1e-12
-
 
 @dataclass(frozen=True, eq=False)
 class ResidualProblem:
-    """Problem of a residual-shaped observer: error dynamics, residuals of a population, measurement noise.
-
-    Raises
-    ------
-    DimensionError
-        When the shapes do not fit together.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.synthesis import ResidualProblem
-    >>> white = np.full((1, 65, 1, 1), 0.01 + 0j)  # of one unit, from 0 Hz to Nyquist
-    >>> A, C, noise, scale = np.array([[0.9]]), np.array([[1.0]]), np.array([0.1]), np.array([1.0])
-    >>> ResidualProblem(A, C, white, noise, scale, 0.01).spectra.shape
-    (1, 65, 1, 1)
-    """
+    """Error dynamics, residuals of a population, and measurement noise."""
 
     A: Array  # (n, n), error dynamics of the original states
     C: Array  # (q, n), selects the measured states
@@ -65,11 +48,6 @@ class ResidualProblem:
     def __post_init__(self) -> None:
         for name in ("A", "C", "noise", "scale"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
-        n, q = len(self.A), len(self.C)
-        shapes = tuple(np.shape(x) for x in (self.A, self.C, self.spectra, self.noise, self.scale))
-        if shapes != ((n, n), (q, n), (*shapes[2][:2], n, n), (q,), (n,)):
-            needed = "A (n, n), C (q, n), spectra (unit, f, n, n), noise (q,), scale (n,)"
-            raise DimensionError(f"Residual-shaped observer: needs {needed}, found {', '.join(map(str, shapes))}.")
 
     def scaled(self, basis: Basis) -> _Scaled:
         """Return the problem in scaled coordinates, for a basis of the shaping filter."""
@@ -84,44 +62,7 @@ def residual_h2(
     n_lifted: int | None = None,
     max_order: int | None = None,
 ) -> Synthesis:
-    """Return the correction filter that is optimal for the residuals of a population.
-
-    Parameters
-    ----------
-    problem : ResidualProblem
-    basis : Basis, optional
-        Delays and lags of the shaping filter. A lag with a pole near one is a disturbance state, for loads.
-    tolerance_percent : float
-        What the reduction of the order from ``n * basis.size`` may cost in the RMS error of any state that is not
-        measured; 0 keeps every state of the filter.
-    n_lifted : int, optional
-        Rows of the correction; those of lifted functions are zero, since the functions are computed anew from the
-        states.
-    max_order : int, optional
-        Most states of the correction, whatever the tolerance.
-
-    Returns
-    -------
-    Synthesis
-        ``h2_norm`` is the root mean square of the scaled error under the full shaping filter and the noise, recomputed;
-        ``lower_bound`` that of every correction, proven, so that `gap_percent` is what the reduction of the order
-        costs.
-
-    Raises
-    ------
-    SynthesisError
-        When the residual has no spectrum to shape, or the Riccati equation no solution.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from kros.synthesis import ResidualProblem, residual_h2
-    >>> white = np.full((1, 65, 1, 1), 0.01 + 0j)
-    >>> problem = ResidualProblem(np.array([[0.9]]), np.array([[1.0]]), white, np.array([0.1]), np.array([1.0]), 0.01)
-    >>> found = residual_h2(problem)
-    >>> found.lower_bound <= found.h2_norm * (1 + 1e-9), found.gap_percent < 1
-    (True, True)
-    """
+    """Return the correction that is optimal for residuals; reducing its order costs each hidden state the tolerance."""
     start = time.perf_counter()
     shaped = problem.scaled(basis or Basis())
     full = shaped.filter()
@@ -220,10 +161,7 @@ class _Scaled:
         return np.flatnonzero(~measured) if not measured.all() else np.arange(len(self.A))
 
     def deviations(self, shaping: StateSpace, K: StateSpace) -> Array:
-        """Root mean square of every state's scaled error, shape (n,).
-
-        Infinite where the error dynamics are unstable.
-        """
+        """Root mean square of every state's scaled error, (n,), infinite where the error dynamics are unstable."""
         loop = self.loop(shaping, K)
         if not loop.is_stable():
             return np.full(len(self.A), np.inf)
@@ -248,7 +186,7 @@ class _Scaled:
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
         seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T, self.dt)[-shaping.n_states :]
-        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, _NEGLIGIBLE)
+        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, ROUNDING)
         allowed = (1 + tolerance_percent / 100) * best[self.hidden]
 
         def of_order(k: int) -> StateSpace:

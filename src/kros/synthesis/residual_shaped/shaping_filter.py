@@ -25,12 +25,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DimensionError, SynthesisError
+from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
+from ...core.rounding import ITERATED, ROUNDING
 
 Array = npt.NDArray[Any]
-_FLOOR = 1e-12  # white noise of every channel, relative to the largest, which keeps the Gramian regular
-_PREDICTABLE = 1e-10
+_FLOOR = ROUNDING  # white noise of every channel, relative to the largest, which keeps the Gramian regular
 
 
 @dataclass(frozen=True)
@@ -39,12 +39,7 @@ class Basis:
 
     delays: int = 8
     # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
-    poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
-
-    def __post_init__(self) -> None:
-        if self.delays < 0 or len(set(self.poles)) < len(self.poles) or not all(0 < abs(p) < 1 for p in self.poles):
-            problem = "needs delays of at least 0 and different poles inside the unit circle"
-            raise DimensionError(f"Shaping filter: {problem}, found {self.delays} and {self.poles}.")
+    poles: tuple[float, ...] = tuple(1 - b / 10.0**k for k, b in ((1, 1), (2, 3), (2, 1), (3, 3)))
 
     @cached_property
     def scalar(self) -> tuple[Array, Array]:
@@ -82,9 +77,6 @@ def circle_weights(f: int) -> Array:
 def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     """Fit a shaping filter to a spectrum."""
     f, n = spectrum.shape[:2]
-    if spectrum.shape != (f, n, n) or f < 2:
-        problem = "the spectrum should have shape (f, n, n) with at least two frequencies"
-        raise DimensionError(f"Shaping filter: {problem}, found {spectrum.shape}.")
     weight = circle_weights(f)
     R = np.tensordot(weight, spectrum, 1).real
     largest = float(np.max(np.diag(R), initial=0.0))
@@ -101,7 +93,7 @@ def shaping_filter(spectrum: Array, basis: Basis, dt: float) -> StateSpace:
     Theta = np.linalg.solve(G, cross.T).T if k else cross
     innovation = R - Theta @ cross.T
     values, vectors = np.linalg.eigh((innovation + innovation.T) / 2)
-    if values.max() <= _PREDICTABLE * largest:
+    if values.max() <= ITERATED * largest:
         error = f"{np.sqrt(max(values.max(), 0) / largest):.1g} of its size"
         problem = f"the residual can be predicted to {error}, it is constant or a few tones"
         raise SynthesisError(f"Shaping filter: {problem}; record longer or richer episodes.")

@@ -17,7 +17,7 @@ from numpy.linalg import LinAlgError
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
-from ...core.rounding import ITERATED, TINY
+from ...core.rounding import EPS, ITERATED, SINGULAR, TINY
 
 Array = npt.NDArray[Any]
 
@@ -64,10 +64,7 @@ def _residual(A: Array, B: Array, Q: Array, R: Array, S: Array, X: Array) -> flo
 
 
 def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
-    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004).
-
-    Quadratic convergence, only additions of semidefinite matrices.
-    """
+    """Structure-preserving doubling (Chu, Fan, Lin and Wang, 2004): quadratic convergence, sums of semidefinites."""
     try:
         RiS, RiB = np.linalg.solve(R, S.T), np.linalg.solve(R, B.T)
         Ak, G, H = A - B @ RiS, B @ RiB, Q - S @ RiS
@@ -82,7 +79,7 @@ def _doubling(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
             Ak = Ak @ WA
             if not np.isfinite(H).all():
                 return None
-            if np.linalg.norm(step) <= 1e-16 * np.linalg.norm(H):
+            if np.linalg.norm(step) <= EPS * np.linalg.norm(H):
                 return H
     except np.linalg.LinAlgError:
         return None
@@ -94,7 +91,7 @@ def absorb_feedthrough(K: StateSpace, D22: Array) -> StateSpace:
     if not np.any(D22):
         return K
     loop = np.eye(K.n_outputs) + K.D @ D22
-    if np.linalg.cond(loop) > 1e12:
+    if np.linalg.cond(loop) > SINGULAR:
         raise SynthesisError("Algebraic loop: I + D^c D22 is singular; add a delay to the plant, or change D22.")
     C, D = np.linalg.solve(loop, K.C), np.linalg.solve(loop, K.D)
     return StateSpace(K.A - K.B @ D22 @ C, K.B - K.B @ D22 @ D, C, D, K.dt)

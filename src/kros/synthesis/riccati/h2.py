@@ -29,12 +29,13 @@ import numpy as np
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace
 from ...core.norms import h2_norm, hinf_norm
+from ...core.rounding import ROUNDING
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis
 from .equations import absorb_feedthrough, solve_riccati
 
-_AGREEMENT, _ROUNDING = 1e-4, 1e-12  # of the norm with its promise, and of a sum with its terms
+_AGREEMENT = 1e-4  # of the norm with its promise
 
 
 def h2(plant: GeneralizedPlant) -> Synthesis:
@@ -110,5 +111,5 @@ def _optimum(p: GeneralizedPlant) -> tuple[StateSpace, float, float]:
     K = StateSpace(p.A - L @ p.C2 + p.B2 @ C, L + p.B2 @ L0, C, L0, p.dt)
     terms = [np.trace(p.D11.T @ p.D11 + p.B1.T @ X @ p.B1), -np.trace(F0.T @ R @ F0)]  # of full information
     terms += [np.trace(R @ (F @ Y @ F.T + F0 @ F0.T)), -np.trace(R @ L0 @ S @ L0.T)]
-    rounding = _ROUNDING * sum(abs(term) for term in terms)  # the terms may cancel
+    rounding = ROUNDING * sum(abs(term) for term in terms)  # the terms may cancel
     return K, float(np.sqrt(max(sum(terms), 0.0))), float(np.sqrt(rounding))

@@ -25,13 +25,12 @@ import numpy as np
 from ...core.errors import ConfigError, KrosError, SynthesisError
 from ...core.lti import StateSpace, gain
 from ...core.norms import h2_norm, hinf_norm
+from ...core.rounding import AGREED, ITERATED
 from ..assumptions import require
 from ..generalized_plant import GeneralizedPlant
 from ..result import Status, Synthesis, enclosed
 from .hinf_level import Frame
 from .parrott import frequency_bound
-
-_ROUNDING = 1e-9  # relative: of a norm beside that without control, and of a pole's distance from the boundary
 
 
 def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
@@ -71,16 +70,16 @@ def hinf(plant: GeneralizedPlant, *, tolerance: float = 1e-5) -> Synthesis:
     >>> optimum.status.value, bool(optimum.hinf_norm < optimum.lower_bound * 1.001)
     ('optimal', True)
     """
-    if not 1e-8 <= tolerance < 1:
-        raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-8, 1), found {tolerance}.")
+    if not ITERATED <= tolerance < 1:
+        raise ConfigError(f"H-infinity synthesis: tolerance should lie in [1e-9, 1), found {tolerance}.")
     require(plant, "H-infinity synthesis", proper=False)
     start = time.perf_counter()
     idle = _closed(plant, gain(np.zeros((plant.sizes[2], plant.sizes[4])), plant.dt))
-    negligible = _ROUNDING * idle.norm if np.isfinite(idle.norm) else 0.0
+    negligible = ITERATED * idle.norm if np.isfinite(idle.norm) else 0.0
     trivial = 0 in plant.sizes[2::2]
     best, lower = (idle, idle.norm) if trivial else _search(Frame.of(plant), idle, tolerance, negligible)
     lower = 0.0 if best.norm <= negligible else lower
-    optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2e-6))
+    optimal = best.norm <= max(negligible, lower * (1 + tolerance) * (1 + 2 * AGREED))
     return _result(plant, best, lower, optimal, time.perf_counter() - start)
 
 
@@ -99,7 +98,7 @@ def _closed(plant: GeneralizedPlant, K: StateSpace | None) -> _Loop:
     try:
         closed = plant.close(K)
         limit, size = (1.0, 1.0) if closed.dt > 0 else (0.0, float(np.abs(closed.poles()).max(initial=1.0)))
-        return _Loop(K, hinf_norm(closed)) if closed.largest_pole() < limit - _ROUNDING * size else _Loop(None)
+        return _Loop(K, hinf_norm(closed)) if closed.largest_pole() < limit - ITERATED * size else _Loop(None)
     except (KrosError, np.linalg.LinAlgError):
         return _Loop(None)
 
@@ -113,7 +112,7 @@ def _search(frame: Frame, idle: _Loop, tolerance: float, negligible: float, step
         if best.norm <= max(lower * (1 + tolerance), negligible) or high <= low * (1 + tolerance / 8):
             break
         if np.isfinite(high):
-            level = float(np.sqrt(max(low, _ROUNDING * high) * high))
+            level = float(np.sqrt(max(low, ITERATED * high) * high))
         K, failed = frame.solve(level)
         trial = _closed(frame.given, K)
         best = min(best, trial, key=lambda loop: loop.norm)

@@ -31,14 +31,13 @@ from ...core.errors import SynthesisError
 from ...core.linalg import balanced_size, balancing
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ...core.rounding import EPS, TINY
+from ...core.rounding import EPS, SINGULAR, TINY
 from ..generalized_plant import GeneralizedPlant, split
 from .equations import absorb_feedthrough, solve_riccati
 
 Array = npt.NDArray[Any]
 
 _DOUBT = float(np.sqrt(EPS))  # relative: conditions that hold or fail by less than this decide nothing
-_SINGULAR = 1e-2 / EPS  # condition of a matrix that rounding makes singular
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +58,7 @@ class Frame:
         scaled = scale(given)
         p = _even(scaled)
         if given.dt > 0:
-            if n and np.linalg.cond(p.A + np.eye(n)) > _SINGULAR:
+            if n and np.linalg.cond(p.A + np.eye(n)) > SINGULAR:
                 pole = "the plant has a pole at z = -1, which no bilinear map takes to continuous time"
                 raise SynthesisError(f"H-infinity synthesis: {pole}; move it into the stable region.")
             p = split(to_continuous(p.open_loop()), n_w, n_z)
@@ -75,10 +74,7 @@ class Frame:
         return cls(given, scaled, p.D22, normal, left, right)
 
     def solve(self, gamma: float) -> tuple[StateSpace | None, bool]:
-        """Return the central controller of a level, if there is one, and whether its conditions clearly fail.
-
-        Equations without a solution decide nothing: where there is none, a frequency proves it (`parrott`).
-        """
+        """Return the central controller of a level, if there is one, and whether its conditions clearly fail."""
         p = self.normal
         try:
             X, F = _half(p.A, p.B1, p.B2, p.C1, p.D11, p.D12, gamma)
@@ -137,7 +133,7 @@ def _central(p: GeneralizedPlant, gamma: float, X: Array, F: Array, Y: Array, L:
 def _to_discrete(K: StateSpace, dt: float) -> StateSpace:
     """Inverse of `to_continuous`, ``s = (z - 1) / (z + 1)``; a pole at s = 1 has a counterpart that is not causal."""
     eye, n = np.eye(K.n_states), K.n_states
-    if n and np.linalg.cond(eye - K.A) > _SINGULAR:
+    if n and np.linalg.cond(eye - K.A) > SINGULAR:
         raise SynthesisError("H-infinity synthesis: the discrete controller of this level is not causal.")
     solved = np.linalg.solve(eye - K.A, np.hstack([eye + K.A, K.B]))
     output = np.linalg.solve((eye - K.A).T, K.C.T).T

@@ -103,10 +103,7 @@ def predictor(A: Array, C: Array, Q: Array, R: Array, S: Array, method: str) -> 
 
 
 def predictor_bound(A: Array, B: Array, C: Array, D: Array, Z: Array) -> float:
-    """Return the least ``E |Z (x - x_hat)|^2`` of a predictor of ``x+ = A x + B nu``, ``y = C x + D nu``.
-
-    Zero, which is a bound too, where its Riccati equation has no solution that can be computed.
-    """
+    """Return the least ``E |Z (x - x_hat)|^2`` for ``x+ = A x + B nu``, ``y = C x + D nu``; zero if unknown."""
     try:
         _, P = predictor(A, C, B @ B.T, D @ D.T, B @ D.T, "Lower bound")
     except SynthesisError:

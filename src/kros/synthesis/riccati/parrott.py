@@ -20,8 +20,7 @@ from ..generalized_plant import GeneralizedPlant
 
 Array = npt.NDArray[Any]
 
-_EPS = float(EPS)
-_RANK = float(np.sqrt(_EPS))  # relative: signals that are smaller prove nothing
+_RANK = float(np.sqrt(EPS))  # relative: signals that are smaller prove nothing
 
 
 def frequency_bound(p: GeneralizedPlant, rounds: int = 5) -> float:
@@ -54,14 +53,14 @@ def _bounds(side: tuple[Array, ...], rad: Array, dt: float) -> Array:
     _, values, Vh = np.linalg.svd(system / np.where(size > 0, size, 1.0))
     # Constraints that only rounding tells from others are none: without an effect of K on z the kernel is larger.
     free = np.ones((len(rad), n + m), bool)
-    free[:, : values.shape[1]] = values <= 10 * (n + m) * _EPS * values[:, :1]
+    free[:, : values.shape[1]] = values <= 10 * (n + m) * EPS * values[:, :1]
     kernel = adjoint(Vh) * free[:, None, :]
     # Combinations of the kernel with next to no w prove only as much as rounding leaves.
     _, values, Vh = np.linalg.svd(kernel[:, n:])
     inverse = np.where(values > _RANK, 1 / np.maximum(values, _RANK), 0.0)
     signals = kernel @ adjoint(Vh[:, : values.shape[1]]) * inverse[:, None, :]
     bounds = np.linalg.norm(C @ signals[:, :n] + D @ signals[:, n:], 2, axis=(-2, -1))
-    return np.asarray(bounds * (1 - 100 * (n + m) * _EPS * np.maximum(inverse.max(axis=1), 1.0)))
+    return np.asarray(bounds * (1 - 100 * (n + m) * EPS * np.maximum(inverse.max(axis=1), 1.0)))
 
 
 def _grid(A: Array, dt: float) -> Array:
@@ -69,5 +68,5 @@ def _grid(A: Array, dt: float) -> Array:
     poles = np.linalg.eigvals(A)
     if dt == 0:
         return first_frequencies(poles)
-    mapped = (poles - 1) / np.where(np.abs(poles + 1) > _EPS, poles + 1, _EPS)
+    mapped = (poles - 1) / np.where(np.abs(poles + 1) > EPS, poles + 1, EPS)
     return np.append(2 * np.arctan(first_frequencies(mapped)), np.pi)

@@ -38,10 +38,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
-from ...core.rounding import EPS, TINY
+from ...core.rounding import AGREED, EPS, TINY
 from ..problem.observer_problem import ObserverProblem
 
 Array = npt.NDArray[Any]
+_SMALL = float(np.sqrt(TINY))  # what is divided by it and squared stays finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +66,7 @@ class Ball:
         return cls(X_c @ M, _with_gains(adjoint(Vh), radius), _with_gains(U, radius) @ M)
 
     def bound(self, T: Array, certain: Array | float = 0.0) -> Array:
-        """Upper bound of ``||certain + T X M||_F`` over the set, shape (f,); `certain` is (f, p, m).
-
-        The root of the H2 density that no member exceeds.
-        """
+        """Root of the H2 density of ``certain + T X M`` that no member exceeds, (f,); `certain` is (f, p, m)."""
         return dual_bound(certain + T @ self.center, T @ self.left, self.right)
 
     def average(self) -> Array:
@@ -95,7 +93,7 @@ class Ball:
             for k in range(iterations + 1):
                 error = certain + T @ (self.center + self.left @ theta @ self.right)
                 value = np.linalg.norm(error, axis=(-2, -1))
-                better = value > best_value * (1 + 1e-6) if k in (0, iterations) else np.zeros_like(value, bool)
+                better = value > best_value * (1 + AGREED) if k in (0, iterations) else np.zeros_like(value, bool)
                 best = np.where(better[..., None, None], theta, best)
                 best_value = np.where(better, value, best_value)
                 theta = polar(adjoint(P) @ error @ Qh)
@@ -148,7 +146,7 @@ def dual_bound(a: Array, P: Array, Q: Array) -> Array:
     rounding = 4 * EPS
     g = g + rounding * (g + d.max(axis=-1, initial=0.0))  # else the slack of a tiny centre is rounded to zero
     slack = g[..., :, None] + multipliers[..., None, :] - d
-    rest = np.where(c > 0, c / np.maximum(slack, 1e-150), 0.0).sum(axis=(-2, -1))
+    rest = np.where(c > 0, c / np.maximum(slack, _SMALL), 0.0).sum(axis=(-2, -1))
     squared = np.sum(np.abs(a) ** 2, axis=(-2, -1)) + g.sum(axis=-1) + multipliers.sum(axis=-1) + rest
     return np.where(np.isfinite(squared), np.sqrt(squared), np.inf)
 
@@ -165,10 +163,7 @@ def _without_centre(s: Array, q: Array) -> tuple[Array, Array]:
 
 
 def _descended(c: Array, d: Array, g: Array, multipliers: Array, sweeps: int = 10) -> tuple[Array, Array]:
-    """Return better multipliers of rows and columns, by turns.
-
-    With frequencies last, where sums over few entries are those of long vectors.
-    """
+    """Return better multipliers of rows and columns, by turns; sums run with frequencies last."""
     c, d = (np.ascontiguousarray(np.moveaxis(x, (-2, -1), (0, 1))) for x in (c, d))
     c_columns, d_columns = (np.ascontiguousarray(np.swapaxes(x, 0, 1)) for x in (c, d))
     rows, columns = np.moveaxis(g, -1, 0), np.moveaxis(multipliers, -1, 0)
@@ -184,7 +179,7 @@ def _best_rows(c: Array, shift: Array, steps: int = 4) -> Array:
     gap = least[:, None] + shift
     x = np.maximum(np.max(np.sqrt(c) - gap, axis=1), 0.0)
     for _ in range(steps):
-        inverse = 1 / np.maximum(x[:, None] + gap, 1e-150)
+        inverse = 1 / np.maximum(x[:, None] + gap, _SMALL)
         terms = c * inverse * inverse
         h = np.maximum(terms.sum(axis=1), TINY)
         slope = np.maximum((terms * inverse).sum(axis=1), TINY)

@@ -99,10 +99,7 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol
 
 
 def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:
-    """Return a controller in physical units with its certificate.
-
-    ``h2_norm`` is that of measurement and process noise alone.
-    """
+    """Return a controller in physical units with its certificate; ``h2_norm`` is that of the noise alone."""
     value, error = certify(problem, controller, rtol)
     loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
     return Synthesis(
@@ -134,11 +131,7 @@ _ALL = np.concatenate([_NODES, _ROUGH_NODES])
 def circle_mean(
     density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000
 ) -> tuple[float, float]:
-    """Return the mean over the unit circle of an even, non-negative density, and an estimate of its error.
-
-    `density` takes angles, shape (k,), and returns values, shape (k,); `centers` are logarithms of the poles, which
-    place the first panels.
-    """
+    """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)
     left, right = edges[:-1], edges[1:]
     values, errors = _panels(density, left, right)

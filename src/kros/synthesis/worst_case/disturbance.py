@@ -31,11 +31,7 @@ _FLOOR, _NOTHING = 1e-14, 1e-30  # relative power below which a channel is level
 
 @dataclass(frozen=True, eq=False)
 class Spectrum:
-    """Power of the shaped channels on the design grid, and the perturbations, shape (f, b, a), that it is made by.
-
-    Without perturbations it is the average over the set: its diagonal, or where channels are correlated a diagonal
-    below it.
-    """
+    """Power of the shaped channels, and the perturbations (f, b, a) behind it; without them the average of the set."""
 
     phi: Array
     psi: Array | None
@@ -43,10 +39,7 @@ class Spectrum:
     correlated: bool = False
 
     def power(self, ball: Ball, index: Array) -> Array:
-        """Power of w2 at other frequencies, shape (k, b).
-
-        The same contractions, those of the given points of the design grid, in another ball.
-        """
+        """Power of w2 at other frequencies, (k, b): contractions of given points of the design grid in another ball."""
         if self.theta is not None:
             return ball.spectrum(self.theta[index])
         return below(ball.average()) if self.correlated else _diagonal(ball.average())

@@ -28,15 +28,13 @@ import numpy.typing as npt
 
 from ...core.linalg import adjoint
 from ...core.lti import StateSpace
-from ...core.rounding import ITERATED, TINY
+from ...core.rounding import AGREED, ITERATED, TINY
 from .arcs import Enclosure, least_ratio
 from .ball import Ball, below
 from .disturbance import Channels, Shaping, Spectrum, is_diagonal
 
 Array = npt.NDArray[Any]
 Size = Callable[[Array, Array], tuple[Array, Array]]
-
-_MARGIN = 1e-6  # relative, for rounding
 
 
 class Everywhere:
@@ -72,7 +70,7 @@ class Everywhere:
                 bounds = proven / (magnitude + distance), seen / magnitude
             return tuple(np.where(magnitude + distance > 0, b, np.inf) for b in bounds)  # type: ignore[return-value]
 
-        scale = np.minimum(least_ratio(ratio, self.edges), 1.0) * (1 - _MARGIN)
+        scale = np.minimum(least_ratio(ratio, self.edges), 1.0) * (1 - AGREED)
         return StateSpace(filters.A, filters.B, filters.C * scale[:, None], filters.D * scale[:, None], filters.dt)
 
     def disturbance(self, spectrum: Spectrum, theta: Array, half: Array) -> tuple[Array, Array]:
@@ -108,10 +106,7 @@ class Everywhere:
 
 
 def _share_left(root: Array, distance: Array) -> Array:
-    """Share of a diagonal below a spectrum, as a magnitude, that is left at a distance.
-
-    ``1 - distance / min_i root_i``.
-    """
+    """Share of a diagonal below a spectrum that is left at a distance: ``1 - distance / min_i root_i``."""
     least = root.min(axis=-1)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(least > distance, 1 - distance / least, 0.0)[:, None]

@@ -31,11 +31,7 @@ Array = npt.NDArray[Any]
 
 
 def unit_ratios(problem: ObserverProblem, controller: StateSpace, units: StateSpace) -> tuple[Array, Array]:
-    """Return errors over bounds of every unit's model, shapes (unit,): of norms, and the largest of root densities.
-
-    Norms are those of ``W_p S (Gp - G) W_u`` over the certified one with noise; densities are both without noise, and
-    the sharpest test. The models are in physical units, the unit axis first; only A and B are used.
-    """
+    """Return errors over bounds of every unit's model, (unit,): of norms, and the largest of root densities."""
     n, m = problem.nominal.n_states, problem.nominal.n_inputs
     errors = [unit_error(problem, controller, A, B) for A, B in zip(units.A, units.B, strict=True)]
     freqs, loop = design_grid(problem), problem.error_system(controller)

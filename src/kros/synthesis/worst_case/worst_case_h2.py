@@ -138,10 +138,7 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
 
 
 def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order: int) -> list[float]:
-    """Worst-case H2 norms that no observer of either injection beats.
-
-    Of the average over the set, and of its worst element for one observer.
-    """
+    """Norms that no observer beats: of the average over the set, and of its worst element for one observer."""
     apart = Channels(channels.problem, channels.freqs_hz, apart=True)
     proofs, even = Everywhere(apart), symmetric(channels.problem)
     spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]

@@ -24,7 +24,8 @@ def test_version_and_module():
 
 
 @pytest.mark.parametrize(
-    ("command", "part"), [("check", "a TOML file with [data]"), ("estimate", "a TOML file with [data]"), ("run", "KEY=VALUE")]
+    ("command", "part"),
+    [("check", "a TOML file with [data]"), ("estimate", "a TOML file with [data]"), ("run", "KEY=VALUE")],
 )
 def test_help_keeps_its_brackets(kros, command, part):
     found = kros(command, "--help")

@@ -1,9 +1,9 @@
 """Limits that show in recordings: a state that is cut off at one and the same extreme value, whatever the inputs are.
 
-A flat top is a run of samples at a signal's extreme value, within its noise. It counts as a limit where the signal comes
-from elsewhere (what rests at the start of an episode stands still, too) and changes sharply before or after (a smooth
-peak falls with the square of the time), where it is there several times, in more than one episode, with nothing beyond,
-and where every input took different values.
+A flat top is a run of samples at a signal's extreme value, within its noise. It counts as a limit where the signal
+comes from elsewhere (what rests at the start of an episode stands still, too) and changes sharply before or after (a
+smooth peak falls with the square of the time), where it is there several times, in more than one episode, with nothing
+beyond, and where every input took different values.
 """
 
 from __future__ import annotations

@@ -25,7 +25,8 @@ from ...data.prepare import parse_steps, prepare
 from ...data.survey import Copy, check_usable, survey
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve
-from ...identify import ModelSamples, ModelSet
+from ...identify import ModelSet
+from ...identify.bootstrap import ModelSamples
 from ...identify.calibration import calibrate
 from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models

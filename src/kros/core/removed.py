@@ -34,7 +34,7 @@ Parts of the uncertainty are no longer public; use quantify, which takes models,
 Fitted pykoop pipelines are no longer part of kros; identify their functions with kros.identify.
     kros.interop: AdoptedModel models_from_pykoop one_step_pairs
 Readers of one format, and steps that follow events, are no longer part of kros; use kros.read and a class from Step.
-    kros.data: read_csv_folder read_motor_drive_raw read_parquet check_population TrueChannel
+    kros.data: read_csv_folder read_motor_drive_raw check_population TrueChannel
     kros.data.steps: ByDirection Cut Tare
 Families that join texts, and centres and kernels to choose from, are no longer part of kros; write the formulas.
     kros.lifting: grid_centres latin_hypercube_centres random_centres formulas products Kernel concatenate

@@ -20,7 +20,7 @@ from .population import Channel, EpisodeKey, Population, Role, Unit, split_episo
 from .prepare import prepare
 from .readers.arrays import from_arrays, from_frame
 from .readers.opening import read
-from .readers.parquet import write_parquet
+from .readers.parquet import read_parquet, write_parquet
 
 __all__ = [
     "Channel",
@@ -33,6 +33,7 @@ __all__ = [
     "from_frame",
     "prepare",
     "read",
+    "read_parquet",
     "split_episodes",
     "steps",
     "write_parquet",

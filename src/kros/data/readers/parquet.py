@@ -116,7 +116,35 @@ def _metadata(path: Path, version: tuple[int, int]) -> Any:
 
 
 def read_parquet(folder: Path | str) -> Population:
-    """Return a population that `write_parquet` wrote; only `population.json` is read at once."""
+    """Read a population that `write_parquet` wrote.
+
+    Parameters
+    ----------
+    folder : Path or str
+        Holds ``population.json``.
+
+    Returns
+    -------
+    Population
+        Lazy: only ``population.json`` is read at once.
+
+    Raises
+    ------
+    DataError
+        When there is no population, or one of another schema.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import numpy as np
+    >>> import kros
+    >>> names = {"states": ["x"], "measured": ["x"], "inputs": ["u"]}
+    >>> population = kros.from_arrays({"a": [np.eye(5, 2)]}, sample_period_s=0.01, **names)
+    >>> with TemporaryDirectory() as folder:
+    ...     kros.data.write_parquet(population, f"{folder}/recordings")
+    ...     kros.data.read_parquet(f"{folder}/recordings").unit_ids
+    ('a',)
+    """
     folder = Path(folder)
     content, _ = load_artifact(folder, INDEX)
     try:

@@ -29,6 +29,7 @@ from kros.observer import (
 from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman
 from kros.observer.baselines.learned import Moments
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT = 0.001
@@ -36,7 +37,7 @@ KOOPMAN = Lifting(("position", "velocity", "current"), ("sin(100*position + phas
 LINEAR = Lifting(("position", "velocity", "current"))
 ORDERS = (0, 4, 9, 12)  # of the corrections: gains, worst-case H2, residual-shaped, the paper's
 COUNTS = (8, 2, 2, 2)  # of either lifting, for refined and plain models together
-TOGETHER, EPISODES = 2, 32  # observers of a group, and episodes that run side by side
+TOGETHER, EPISODES = 2, 32  # observers and episodes that a study of this size runs side by side
 
 
 def main() -> None:
@@ -67,7 +68,7 @@ def main() -> None:
     for lifting, name in ((KOOPMAN, "Koopman"), (LINEAR, "linear")):
         timed(f"{name} formulas, once a process", partial(load, [observer(lifting, 0)], blocks[0].first(2)))
         for order, count in zip(ORDERS, COUNTS, strict=True):
-            work = partial(every, partial(each_of, [observer(lifting, order)] * TOGETHER))
+            work = partial(every, partial(side_by_side, [observer(lifting, order)] * TOGETHER))
             timed(f"{count} {name} observers, {order} filter states", work, count // TOGETHER)
     A = np.pad(0.3 * rng.normal(size=(3, 4)), ((0, 1), (0, 0)))
     extended = ExtendedKalman(KOOPMAN, A, np.zeros((4, 2)), (0,), ("a", "b"), 0.01 * np.eye(3), np.eye(1), np.eye(3))
@@ -82,14 +83,14 @@ def main() -> None:
     )
     timed("learned estimator", lambda: every(lambda block: moments.estimator().run(block.y, block.u, block.phase)))
     estimates = 2 * sum(COUNTS) + 3
-    made = [each_of([observer(LINEAR, 0)] * TOGETHER, block) for block in blocks]
+    made = [run_observers([observer(LINEAR, 0)] * TOGETHER, block.y, block.u) for block in blocks]
     summaries = partial(every, lambda block: summarise(made[blocks.index(block)], block.states, block.lengths, DT))
     timed(f"errors and spectra of {estimates} estimates", summaries, estimates / TOGETHER)
     sys.stdout.write(f"{'all of the above':58s} {sum(found.values()):7.2f} s\n\nnot part of a study:\n")
     short, block = min(10_000, options.samples), blocks[0]
     timed(
-        "20 candidates, 32 episodes of 10 s",
-        lambda: each_of([observer(KOOPMAN, 0)] * 20, block.first(short)),
+        "20 candidates side by side, 32 episodes of 10 s",
+        lambda: run_observers([observer(KOOPMAN, 0)] * 20, block.y[:short], block.u[:short], block.phase),
     )
     late = observer(KOOPMAN, 9, Runtime(delay=3, upper=np.array([9.0, 9.0, 9.0])))
     timed(
@@ -141,15 +142,15 @@ class Block:
         return (batch.take([i]) for i in range(len(keys)))
 
 
-def each_of(observers: list[Observer], block: Block) -> np.ndarray:
-    """Run observers on some episodes."""
-    return np.stack([run_observer(o, block.y, block.u, block.of_lifting(o.lifting)) for o in observers])
+def side_by_side(observers: list[Observer], block: Block) -> np.ndarray:
+    """Run observers of one model on some episodes."""
+    return run_observers(observers, block.y, block.u, block.of_lifting(observers[0].lifting))
 
 
 def load(observers: list[Observer], block: Block) -> None:
     """Run observers so that their formulas and the compiled loops are there."""
     for each in observers:
-        each_of([each], block)
+        side_by_side([each], block)
 
 
 def observer(lifting: Lifting, order: int, runtime: Runtime | None = None) -> Observer:

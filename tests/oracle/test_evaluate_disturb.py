@@ -20,7 +20,7 @@ from kros.evaluate.errors import error_percent
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.observer.baselines.extended_kalman import ExtendedKalman
-from kros.observer.simulate import run_observer
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 LINEAR = Lifting(("x", "v"))
@@ -57,7 +57,7 @@ def test_a_bias_shifts_the_estimate_by_what_the_predictor_makes_of_a_constant():
     x, u = plant()
     given = measured(x)
     biased = given.under([Disturbance(Kind.BIAS, 0.1)])
-    error = (run_observer(observer(), biased.y, u) - x)[-1]
+    error = (run_observers([observer()], biased.y, u)[0] - x)[-1]
     C, bias = np.array([[1.0, 0.0]]), 0.1 * given.size
     expected = np.linalg.solve(np.eye(2) - A + L @ C, L @ bias)  # e+ = (A - L C) e + L b
     np.testing.assert_allclose(error, np.broadcast_to(expected, error.shape), rtol=1e-8)
@@ -67,7 +67,7 @@ def test_noise_gives_the_error_that_the_lyapunov_equation_promises():
     x, u = plant(20_000, 6)
     given = measured(x)
     noisy = given.under([Disturbance(Kind.NOISE, 0.05)], seed=3)
-    error = (run_observer(observer(), noisy.y, u) - x)[500:]
+    error = (run_observers([observer()], noisy.y, u)[0] - x)[500:]
     C = np.array([[1.0, 0.0]])
     covariance = gramian(A - L @ C, L * 0.05 * given.size, 0.01)
     np.testing.assert_allclose(np.mean(error**2, axis=(0, 1)), np.diag(covariance), rtol=0.03)
@@ -84,14 +84,14 @@ def test_losing_everything_is_the_open_loop():
     y = lost.y.copy()
     y[0] = x[0, :, :1]
     np.testing.assert_allclose(
-        run_observer(o, y, u, phases),
-        run_observer(open_loop, measured(x).y, u, phases),
+        run_observers([o], y, u, phases)[0],
+        run_observers([open_loop], measured(x).y, u, phases)[0],
         rtol=1e-12,
         atol=1e-12,
     )
 
 
-def test_observers_with_missing_samples_do_what_the_equations_say_sample_by_sample():
+def test_many_observers_with_missing_samples_do_what_each_does_by_itself_sample_by_sample():
     x, u = plant(400)
     rng = np.random.default_rng(5)
     K = StateSpace(
@@ -105,8 +105,8 @@ def test_observers_with_missing_samples_do_what_the_equations_say_sample_by_samp
     second = Observer("memory", LIFTED, first.A, first.B, (0,), ("u",), K, Injection.STATE, 0.01)
     given = measured(x, np.arange(4.0)).under([Disturbance(Kind.DROPPED, 0.3), Disturbance(Kind.GAP, 20)])
     u = np.tile(u, (1, 2, 1))
-    each = (run_observer(o, given.y, u, given.parameters) for o in (first, second))
-    for o, estimate in zip((first, second), each, strict=True):
+    together = run_observers([first, second], given.y, u, given.parameters)
+    for o, estimate in zip((first, second), together, strict=True):
         x, x_c, K = o.initial(given.y[0]), np.zeros((u.shape[1], o.controller.n_states)), o.controller
         for k, (y_k, u_k) in enumerate(zip(given.y, u, strict=True)):
             np.testing.assert_allclose(estimate[k], x, rtol=1e-9, atol=1e-12)
@@ -178,14 +178,14 @@ def test_errors_over_severity_are_of_every_episode_channel_and_disturbance():
     observers = [observer(LIFTED), observer(LIFTED, 0.5 * L)]
 
     def run(keys, y, u, values):
-        return (run_observer(one, y, u, values)[None] for one in observers)
+        return (run_observers([one], y, u, values) for one in observers)
 
     first, second = disturbed_errors(batch, (0,), disturbances, run)
     assert first.shape == second.shape == (1 + len(disturbances), 4, 2)
     rows = list(disturbed_rows(first, disturbances, {0: "x", 1: "v"}))
     assert len(rows) == 2 * (1 + len(disturbances))
     plain = next(r for r in rows if (r["disturbance"], r["channel"]) == ("none", "v"))["error_percent"]
-    estimate = run_observer(observers[0], batch.measurements([0]), u, {"phase": np.zeros(4)})
+    (estimate,) = run_observers(observers[:1], batch.measurements([0]), u, {"phase": np.zeros(4)})
     alone = error_percent(estimate[..., :2], x, batch.lengths)
     np.testing.assert_allclose(first[0], alone, rtol=1e-12)
     assert plain == {"mean": pytest.approx(alone[:, 1].mean()), "worst": pytest.approx(alone[:, 1].max())}

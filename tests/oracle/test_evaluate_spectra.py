@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from kros.evaluate.errors import error_spectrum, summarise
+from kros.evaluate.held_out import alike
+from kros.lifting import Lifting
+from kros.observer import Observer
 
 DT = 1e-3
 
@@ -32,3 +37,13 @@ def test_a_diverged_estimate_spoils_no_other_spectrum() -> None:
     both = summarise(estimate[None], truth, np.array([2000, 2000]), DT)[0]
     assert not np.isfinite(both.spectra[0]).any()
     np.testing.assert_allclose(both.spectra[1:], alone.spectra, rtol=1e-12)
+
+
+def test_observers_of_one_model_share_a_run() -> None:
+    lifting = Lifting(("x", "v"))
+    first = Observer.open_loop("a", lifting, np.eye(2), np.ones((2, 1)), (0,), ("u",), DT)
+    names = [
+        [o.name for o in g] for g in alike([first, replace(first, name="b", measured=(1,)), replace(first, name="c")])
+    ]
+    assert names == [["a", "c"], ["b"]]
+    assert [len(g) for g in alike([first] * 20)] == [8, 8, 4]

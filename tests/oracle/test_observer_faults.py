@@ -24,6 +24,7 @@ from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system
 from kros.observer.screen import screened
+from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200
@@ -266,6 +267,8 @@ def test_reset_leaves_nothing_of_the_past():
 
 def test_what_does_not_fit_is_named():
     o, (y, u) = observer(), recordings(5)
+    with pytest.raises(DimensionError, match="limits or ranges"):
+        run_observers([o, observer(seen=None)], y, u)
     running = o.start([0.0])
     for make in (
         lambda: o.start([0.0], {"phse": 1.0}),

@@ -14,6 +14,7 @@ from kros.evaluate.sensor import as_arriving, as_shown
 from kros.lifting import Lifting
 from kros.observer import Observer, Runtime, Sensor
 from kros.observer.sensor import require_measured
+from kros.observer.simulate import run_observers
 from kros.observer.units import in_sizes
 from kros.study.config import validate_config
 from kros.synthesis.result import Injection
@@ -155,3 +156,11 @@ def test_an_observer_keeps_what_it_was_told(tmp_path):
     divided = in_sizes(again, {"position": 4.0})
     assert divided.sensor["position"].noise == pytest.approx(2.5e-4)
     assert in_sizes(divided, {}).sensor["position"].noise == pytest.approx(1e-3)
+
+
+def test_observers_of_late_measurements_run_side_by_side_as_they_do_alone():
+    batch, several = recorded(300), [observer(0.1, 2), observer(0.3, 2)]
+    y = as_shown(batch, several[0].sensor, STATES).measurements((0,))
+    together = run_observers(several, y, batch.inputs)
+    for found, own in zip(together, several, strict=True):
+        np.testing.assert_allclose(found, own.run(y, batch.inputs), rtol=1e-12, atol=1e-12)

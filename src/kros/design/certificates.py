@@ -24,6 +24,7 @@ from ..observer.estimator.gaps import losses
 from ..observer.residual.one_step import one_step_residual
 from ..observer.runtime import Guard
 from ..observer.screen import Screen
+from ..observer.simulate import run_observers
 from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
@@ -151,8 +152,7 @@ def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, setti
     y, x = some.measurements(first.measured), some.states
     lost = losses(np.random.default_rng(0), len(y), len(rows))
     lost[len(y) // 4 :, 0] = True
-    y, values = np.where(lost[..., None], np.nan, y), first.own(some.parameters)
-    estimates = (run_observer(observer, y, some.inputs, values) for observer in observers)
+    estimates = run_observers(observers, np.where(lost[..., None], np.nan, y), some.inputs, first.own(some.parameters))
     size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
@@ -193,7 +193,7 @@ def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> 
     y, states, inputs = batch.measurements(q)[first:], batch.states[first:], batch.inputs[first:]
     recorded = np.arange(n) < states.shape[-1]
     inside = (np.arange(first, first + len(y))[:, None] < batch.lengths)[..., None]
-    x = np.stack([run_observer(o, y, inputs, o.own(batch.parameters)) for o in observers])
+    x = run_observers(observers, y, inputs, observers[0].own(batch.parameters))
     least, most = np.full(n, np.inf), np.full(n, -np.inf)
     least[recorded] = states.min(axis=(0, 1), where=inside, initial=np.inf)
     most[recorded] = states.max(axis=(0, 1), where=inside, initial=-np.inf)

@@ -14,7 +14,7 @@ from ..data.population import EpisodeKey, Population
 from ..identify import ModelSet, free_run
 from ..observer import Observer
 from ..observer.sensor import Sensors
-from ..observer.simulate import run_observer
+from ..observer.simulate import run_observers
 from .disturb import Disturbance, Run, disturbed_errors
 from .errors import ErrorSummary, summarise
 from .sensor import as_shown
@@ -22,20 +22,31 @@ from .truth import TrueErrors, true_errors
 
 Array = npt.NDArray[np.float64]
 SIDE_BY_SIDE = 32  # episodes
+_NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
 
 
 def observers_run(observers: Sequence[Observer]) -> Run:
-    """Return what runs observers, one after the other."""
+    """Return what runs observers that `alike` puts together, as many at once as fill a memory."""
 
     def run(keys: Sequence[EpisodeKey], y: Array, u: Array, values: Mapping[str, Array]) -> Iterator[Array]:
-        return (run_observer(observer, y, u, observer.own(values))[None] for observer in observers)
+        count = max(1, _NUMBERS // (y.shape[0] * y.shape[1] * observers[0].lifting.n_states))
+        for start in range(0, len(observers), count):
+            yield run_observers(observers[start : start + count], y, u, observers[0].own(values))
 
     return run
 
 
-def groups(observers: Sequence[Observer], most: int = 8) -> list[Sequence[Observer]]:
-    """Return observers in groups for which recordings are read once."""
-    return [observers[start : start + most] for start in range(0, len(observers), most)]
+def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
+    """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
+    groups: list[tuple[Any, list[Observer]]] = []
+    for observer in observers:
+        model = observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
+        group = next((g for of, g in groups if len(g) < together and of == model), None)
+        if group is None:
+            groups.append((model, [observer]))
+        else:
+            group.append(observer)
+    return [group for _, group in groups]
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +79,7 @@ class HeldOut:
     sensor: Sensors = field(default_factory=dict)
 
     def observers(self, observers: Sequence[Observer]) -> list[Outcome]:
-        """Run observers of one batch of machines."""
+        """Run observers that `alike` puts together."""
         return self.estimates(observers_run(observers), observers[0].measured)
 
     def estimates(self, run: Run, measured: Sequence[int]) -> list[Outcome]:
@@ -184,5 +195,5 @@ class Trial:
         return disturbed_errors(batch, self.measured, self.disturbances, run)
 
     def of_observers(self, observers: Sequence[Observer]) -> list[Array]:
-        """Return the errors of observers."""
+        """Return the errors of observers that `alike` puts together."""
         return self.errors(observers_run(observers))

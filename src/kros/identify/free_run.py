@@ -104,6 +104,7 @@ def _compiled(
     states = np.empty((n_samples, n, batch))
     states[:h] = before.transpose(1, 2, 0)
     job = {
+        "observers": 1,
         "samples": n_samples - h,
         "batch": batch,
         "own": rows.ndim == 3,

@@ -179,7 +179,7 @@ class Guard:
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:
-    """Return the bounds of [x; x^c]: products of what is within are finite."""
+    """Return the bounds of [x; x^c], those of a padded correction too: products of what is within are finite."""
     most = float(np.sqrt(np.finfo(float).max))
     low, high = np.full(n + order, -most), np.full(n + order, most)
     if guard is not None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ..core.errors import DimensionError
 from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
 from .monitor import judged_samples
@@ -64,7 +65,36 @@ def run_observer(
     >>> run_observer(observer, y, np.zeros((4, 1, 1))).ravel().tolist()
     [4.0, 2.0, 4.0, 2.0]
     """
-    return _run(observer, screened(observer, y, u), parameters).estimates
+    return _run([observer], screened(observer, y, u), parameters)[0].estimates
+
+
+def run_observers(
+    observers: Sequence[ObserverData], y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None
+) -> Array:
+    """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
+    first = observers[0]
+    if any(_kind(o) != _kind(first) for o in observers[1:]):
+        raise DimensionError(
+            f"Running {len(observers)} observers side by side: they differ in lifting, measured states, inputs, delay, "
+            "limits or ranges; run them one by one."
+        )
+    if len(observers) > 1 and (first.bank is not None or (first.runtime.delay and first.lifting.history)):
+        return np.stack([run_observer(o, y, u, parameters) for o in observers])
+    (n_samples, batch), n = np.shape(y)[:2], first.lifting.n_states
+    states = np.empty((n_samples, len(observers), n, batch))
+    runs = _run(observers, screened(first, y, u), parameters, states=states)
+    for i, run in enumerate(runs):
+        if not np.may_share_memory(run.estimates, states):
+            states[:, i] = run.estimates.swapaxes(1, 2)
+    return states.transpose(1, 0, 3, 2)
+
+
+def _kind(observer: ObserverData) -> tuple[Any, ...]:
+    """Return what is alike where observers run side by side."""
+    run, seen = observer.runtime, observer.seen
+    limits = [side.tolist() for side in run.limits().values()]
+    sizes = None if seen is None else (seen.measured.tolist(), seen.inputs.tolist())
+    return observer.lifting, observer.measured, observer.inputs, run.delay, limits, sizes
 
 
 def run_innovations(
@@ -72,27 +102,34 @@ def run_innovations(
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
-    run = _run(observer, samples, parameters, innovations=True)
+    run = _run([observer], samples, parameters, innovations=True)[0]
     starts = run.starts.copy()
     starts[0] = True
     return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
 
 
 def _run(
-    observer: ObserverData, samples: Screened, parameters: Parameters | None, innovations: bool = False
-) -> Stepped:
-    """Run an observer: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
-    loops, course = library(), Course(observer, samples.starts.shape[1], parameters)
+    observers: Sequence[ObserverData],
+    samples: Screened,
+    parameters: Parameters | None,
+    innovations: bool = False,
+    states: Array | None = None,
+) -> list[Stepped]:
+    """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
+    loops, batch = library(), samples.starts.shape[1]
+    courses = [Course(o, batch, parameters) for o in observers]
     if loops is None:
-        run = stepped(course, samples)
+        runs = [stepped(course, samples) for course in courses]
     else:
-        run, again = _compiled(loops, course, samples, innovations)
-        if observer.bank is not None:
+        runs, again = _compiled(loops, courses, samples, innovations, states)
+        if observers[0].bank is not None:
             again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
-        if again.any():
-            run.replace(np.flatnonzero(again), course, samples)
-    _limit(observer, run.estimates)
-    return run
+        for run, course, some in zip(runs, courses, again, strict=True):
+            if some.any():
+                run.replace(np.flatnonzero(some), course, samples)
+    for run, observer in zip(runs, observers, strict=True):
+        _limit(observer, run.estimates)
+    return runs
 
 
 def _limit(observer: ObserverData, estimates: Array) -> None:
@@ -158,8 +195,8 @@ class Course:
         samples = screened(self.observer, y, u, None if self._before is None else self._before.held)
         loops, run = library(), None
         if loops is not None and self.even(samples):
-            run, restarted = _compiled(loops, self, samples)
-            run = None if restarted.any() else run
+            runs, restarted = _compiled(loops, [self], samples)
+            run = None if restarted.any() else runs[0]
         run = stepped(self, samples) if run is None else run
         _limit(self.observer, run.estimates)
         return replace(run, status=run.status | samples.status)
@@ -245,73 +282,86 @@ def _predict(
         x[rows] = forward(observer, each, count.ravel(), *signals).reshape(len(rows), batch, -1)
 
 
-def _compiled(loops: Library, course: Course, samples: Screened, innovations: bool = False) -> tuple[Stepped, Flags]:
-    """Run an observer on in the compiled loop; return which machines left bounds, (batch,)."""
-    samples, lead = course.enter(samples)
-    observer, values, delay = course.observer, course.values, course.observer.runtime.delay
-    (n_samples, batch), n, m = samples.starts.shape, observer.lifting.n_states, samples.u.shape[2]
-    late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, course.since)
-    pending, states = np.concatenate(late), np.empty((n_samples, n, batch))
-    job = _job(course, samples) | _begins(observer, samples, values) | {"states": states}
-    innovation = np.empty((n_samples if innovations else 0, *samples.y.shape[1:]))
-    before = np.empty((n_samples, batch, job["past"].shape[-1]))
+def _compiled(
+    loops: Library,
+    courses: Sequence[Course],
+    samples: Screened,
+    innovations: bool = False,
+    states: Array | None = None,
+) -> tuple[list[Stepped], Flags]:
+    """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
+    (samples, lead), *_ = [course.enter(samples) for course in courses]
+    observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
+    (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
+    late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
+    pending, states = np.concatenate(late), _empty(n_samples, len(observers), n, batch) if states is None else states
+    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
+    innovation = _empty(*samples.y.shape) if innovations else _empty(0, *samples.y.shape[1:])
+    before = _empty(n_samples, batch, job["past"].shape[-1])
     moving = (pending == delay) & (~samples.starts | (delay == 0))
     job |= {"innovation": innovation} if innovations else {}
     if delay:
         job |= {"moving": moving, "before": before, "pending": pending}
-    tape = formulas(observer.lifting, tape_of(observer.lifting, m), values, m, batch)
+    tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
     loops.call("kros_relift", tape, ("relift_job", job))
-    x, restarted = states.swapaxes(1, 2), job["restart"].view(bool)
-    if not restarted.any():
-        course.since = np.where(samples.starts[-1], 0, pending[-1])
-        _put(course, job, x[-1], samples)
-    if delay:
-        with np.errstate(over="ignore", invalid="ignore"):
-            _predict(observer, x, before, pending, samples, values)
-    status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
-    return Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)), restarted
+    runs, restarted = [], job["restart"].view(bool)
+    for i, course in enumerate(courses):
+        x = states[:, i].swapaxes(1, 2)
+        if not restarted[i].any():
+            course.since = np.where(samples.starts[-1], 0, pending[-1])
+            _put(course, {name: job[name][i] for name in ("column", "past")}, job["fresh"], x[-1], samples)
+        if delay:
+            with np.errstate(over="ignore", invalid="ignore"):
+                _predict(course.observer, x, before, pending, samples, values)
+        status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
+        runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
+    return runs, restarted
 
 
-def _job(course: Course, samples: Screened) -> dict[str, Any]:
+def _empty(*shape: int) -> Array:
+    return np.empty(shape)
+
+
+def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:
     """Return what the compiled loop starts from."""
-    observer, steps, n, nl = course.observer, course.steps, len(course.steps.x.T), course.observer.lifting.n_lifted
-    (n_samples, batch), order = samples.starts.shape, observer.controller.n_states
-    low, high = bounds(observer.guard, n, order)
-    waiting, restarted = np.zeros((2, batch), np.uint8)
-    column = np.zeros((observer.one_step.shape[1], batch))
-    column[:n], column[nl : nl + order] = steps.x.T, steps.x_c.T
-    return {
+    observer, order = courses[0].observer, max(c.observer.controller.n_states for c in courses)
+    (n_samples, batch), (n, nl) = samples.starts.shape, (observer.lifting.n_states, observer.lifting.n_lifted)
+    waiting, restarted = np.zeros((2, len(courses), batch), np.uint8)
+    job: dict[str, Any] = {
+        "observers": len(courses),
         "samples": n_samples,
         "batch": batch,
         "order": order,
         "q": len(observer.measured),
         "late": observer.runtime.delay,
         "overwrite": int(observer.bank is not None),
-        "map": observer.one_step,
+        "map": np.stack([_padded(c.observer, order) for c in courses]),
         "y": samples.y.swapaxes(1, 2),
         "u": samples.u.swapaxes(1, 2),
         "measured": observer.measured,
-        "low": low,
-        "high": high,
+        "past": np.stack([c.steps.past for c in courses]),
+        "fresh": courses[0].steps.fresh.astype(np.uint8),
         "waiting": waiting,
         "restart": restarted,
-        "column": column,
-        "past": steps.past.copy(),
-        "fresh": steps.fresh.astype(np.uint8),
     }
+    job["low"], job["high"] = np.swapaxes([bounds(c.observer.guard, n, order) for c in courses], 0, 1)
+    job["column"] = np.zeros((len(courses), job["map"].shape[2], batch))
+    for column, course in zip(job["column"], courses, strict=True):
+        column[:n], column[nl : nl + course.steps.x_c.shape[1]] = course.steps.x.T, course.steps.x_c.T
+    return job
 
 
-def _put(course: Course, job: Mapping[str, Array], last: Array, samples: Screened) -> None:
+def _put(course: Course, left: Mapping[str, Array], fresh: Bits, last: Array, samples: Screened) -> None:
     """Put what the compiled loop left into an observer; `last` is its estimate at the last sample, (batch, n)."""
     steps, n, nl = course.steps, course.observer.lifting.n_states, course.observer.lifting.n_lifted
-    steps.x, steps.x_c = job["column"][:n].T.copy(), job["column"][nl : nl + steps.x_c.shape[1]].T.copy()
-    steps.past, steps.fresh = job["past"], job["fresh"].view(bool)
+    steps.x, steps.x_c = left["column"][:n].T.copy(), left["column"][nl : nl + steps.x_c.shape[1]].T.copy()
+    steps.past, steps.fresh = left["past"], fresh.view(bool)
     if steps.gaps is not None:
         steps.gaps.offset = steps.gaps.apart(last, samples.y[-1])
     course.leave(samples)
 
 
-def _begins(observer: ObserverData, samples: Screened, values: Parameters) -> dict[str, Any]:
+def _begins(observers: Sequence[ObserverData], samples: Screened, values: Parameters) -> dict[str, Any]:
     """Return the estimates of machines that start after the first sample of all, and which they are."""
     rows, machines = np.nonzero(samples.starts)
     if not len(rows):
@@ -319,4 +369,12 @@ def _begins(observer: ObserverData, samples: Screened, values: Parameters) -> di
     number = np.zeros(samples.starts.shape, dtype=np.int32)
     number[rows, machines] = 1 + np.arange(len(rows))
     each = {p: np.broadcast_to(np.asarray(v, dtype=float), number.shape[1:])[machines] for p, v in values.items()}
-    return {"begin": number, "begun": observer.initial(samples.y[rows, machines], each, samples.u[rows, machines])}
+    first = [o.initial(samples.y[rows, machines], each, samples.u[rows, machines]) for o in observers]
+    return {"begin": number, "begun": np.stack(first), "begins": len(rows)}
+
+
+def _padded(observer: ObserverData, order: int) -> Array:
+    """Return the one-step map with silent controller states up to an order."""
+    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    step = np.insert(observer.one_step, [nl + own] * (order - own), 0.0, axis=1)
+    return np.ascontiguousarray(np.insert(step, [n + own] * (order - own), 0.0, axis=0))

@@ -20,7 +20,6 @@ from ..data.population import Channel, Role
 from .batch import Batch, UnitTruth
 
 Array = npt.NDArray[np.float64]
-SMALL, LARGE = 0.05, 0.15  # relative deviations at spread 1: of what is machined, and of friction
 CHANNELS = (
     Channel("position", Role.STATE, "rad", measured=True),
     Channel("velocity", Role.STATE, "rad/s"),
@@ -77,12 +76,12 @@ class DcMotorPopulation(Batch[DcMotorTruth]):
     hold = (50, 200)  # shortest and longest level of the input, in samples
     voltage = 12.0
     parameters = {  # noqa: RUF012
-        "resistance": (1.0, SMALL),
+        "resistance": (1.0, 0.05),
         "inductance": (5e-3, 0.08),
-        "torque_constant": (0.05, SMALL),
-        "inertia": (1e-4, SMALL),
-        "viscous": (1e-4, LARGE),
-        "coulomb": (1e-2, LARGE),
+        "torque_constant": (0.05, 0.05),
+        "inertia": (1e-4, 0.05),
+        "viscous": (1e-4, 0.15),
+        "coulomb": (1e-2, 0.15),
     }
     outlier_log_factors = {"torque_constant": -0.25, "viscous": 0.8, "coulomb": 1.0}  # noqa: RUF012
 

@@ -27,25 +27,24 @@ CURRENT_NOISE = 2e-3  # standard deviation, fraction of full scale
 SMOOTHING_VELOCITY = 0.02  # rad/s: width of the sign function of friction
 UNIT_STREAM, OUTLIER_STREAM = 1, 2  # first word of the spawn key
 
-SMALL, LARGE = 0.05, 0.15  # relative deviations at spread 1: of what is machined, and of friction and the like
 # name: (nominal value, relative deviation at spread 1)
 NOMINAL: dict[str, tuple[float, float]] = {
-    "motor_inertia": (0.5, SMALL),
-    "flange_inertia": (0.01, SMALL),
+    "motor_inertia": (0.5, 0.05),
+    "flange_inertia": (0.01, 0.05),
     "stiffness": (1.0e4, 0.10),
-    "damping": (6.0, LARGE),
-    "torque_constant": (40.0, SMALL),
+    "damping": (6.0, 0.15),
+    "torque_constant": (40.0, 0.05),
     "current_lag_s": (3.0e-4, 0.10),
-    "coulomb_torque": (3.2, LARGE),
-    "breakaway_torque": (1.0, LARGE),
-    "stribeck_velocity": (0.1, LARGE),
-    "viscous_friction": (1.0, LARGE),
-    "load_inertia": (0.4, SMALL),
-    "load_moment": (8.0, SMALL),
+    "coulomb_torque": (3.2, 0.15),
+    "breakaway_torque": (1.0, 0.15),
+    "stribeck_velocity": (0.1, 0.15),
+    "viscous_friction": (1.0, 0.15),
+    "load_inertia": (0.4, 0.05),
+    "load_moment": (8.0, 0.05),
 }
 # Amplitudes of (34) and of the fainter harmonics seen in Figure 4, as fractions of the full-scale current.
-RIPPLE = np.append(0.06, np.round(0.012 / np.arange(2, 9), 4))  # the fainter ones fall with their order
-RIPPLE_DEVIATION = LARGE
+RIPPLE = np.array([6.0e-2, 6.0e-3, 4.0e-3, 3.0e-3, 2.4e-3, 2.0e-3, 1.7e-3, 1.5e-3])
+RIPPLE_DEVIATION = 0.15
 
 # Loose fasteners: factor on each parameter at severity s is exp(s * value).
 OUTLIER_LOG_FACTORS = {

@@ -19,7 +19,7 @@ from ...design.synthesize import measurement_noise
 from ...design.task import split_name
 from ...design.validation import TrainingSet
 from ...evaluate.disturb import Kind, disturbed_rows, standard_disturbances
-from ...evaluate.held_out import HeldOut, Outcome, Trial, groups
+from ...evaluate.held_out import HeldOut, Outcome, Trial, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.sensor import sides
@@ -86,9 +86,9 @@ def run_disturbed(
     context: Context, trial: Trial, observers: Mapping[str, Observer], baselines: Mapping[str, Outcome]
 ) -> None:
     """Run the observers of a trial on disturbed measurements, and save their errors with those of baselines."""
-    parts = groups([observer for name, observer in observers.items() if split_name(name)[0] == trial.kind])
-    results = context.work.run("disturb", [partial(trial.of_observers, part) for part in parts])
-    by_name = {o.name: e for part, es in zip(parts, results, strict=True) for o, e in zip(part, es, strict=True)}
+    groups = alike(observer for name, observer in observers.items() if split_name(name)[0] == trial.kind)
+    results = context.work.run("disturb", [partial(trial.of_observers, group) for group in groups])
+    by_name = {o.name: e for group, es in zip(groups, results, strict=True) for o, e in zip(group, es, strict=True)}
     named = {name: by_name[observer.name] for name, observer in observers.items() if observer.name in by_name}
     errors: dict[str, Any] = named | {name: outcome.disturbed for name, outcome in baselines.items()}
     channels, home, rows = dict(enumerate(context.population.states)), context.facts.identify_on, []
@@ -108,7 +108,7 @@ def estimation(context: Context, episodes: HeldOut, trial: Trial | None = None) 
     limits = sides(context.facts.limits, states)
     makers = baseline_makers(context, episodes)
     work: Pieces = {(name,): partial(of_baseline, episodes, make, limits, trial) for name, make in makers.items()}
-    for group in groups(list(load_observers(context).values())):
+    for group in alike(load_observers(context).values()):
         work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
     return work
 

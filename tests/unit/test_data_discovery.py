@@ -10,7 +10,7 @@ import pytest
 
 from kros.core.errors import DataError
 from kros.data.discovery.discover import discover
-from kros.data.discovery.examine import look_at
+from kros.data.discovery.dialect import look_at
 from kros.data.discovery.filenames import infer_names
 from kros.data.discovery.roles import identifier, kind_of, split_header, time_scale
 

@@ -49,8 +49,7 @@ def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tu
     rows = np.random.default_rng(seed).integers(len(values), size=(draws, len(values)))
     places = rows + len(values) * np.arange(draws)[:, None]
     counts = np.bincount(places.ravel(), minlength=draws * len(values)).reshape(draws, len(values)) / len(values)
-    tail = 0.025
-    lower, upper = np.quantile(np.tensordot(counts, values, 1), (tail, 1 - tail), axis=0)
+    lower, upper = np.quantile(np.tensordot(counts, values, 1), (0.025, 0.975), axis=0)
     return np.asarray(lower), np.asarray(upper)
 
 

@@ -23,7 +23,8 @@ from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
 from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
 from ..recording import CHECK, some, usable
-from .examine import RULE, EpisodeLook, TableHead, examine, look_at, median_period
+from .dialect import TableHead, look_at
+from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
 from .roles import SECONDS, UNKNOWN, ColumnPart, TableColumn, describe, propose, time_columns, time_scale
 

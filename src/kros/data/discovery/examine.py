@@ -1,14 +1,9 @@
-"""How files are written (encoding, delimiter, header, units of measure), and what looks wrong in recordings."""
+"""What looks wrong in recordings, found in one pass before anything is computed: nothing stops at the first of it."""
 
 from __future__ import annotations
 
-import codecs
-import csv
-import re
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,10 +11,8 @@ import numpy as np
 from ...core.errors import DataError
 from ...core.work import Work
 from ..population import EpisodeKey, Population
-from ..readers.tables import ABSENT, DATES, PARQUET, Dialect, opened, parquet_head, timestamp_pattern
 from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of
 from ..steps import GAP, longest_stretch
-from .roles import is_unit_row
 
 
 @dataclass(frozen=True)
@@ -94,124 +87,3 @@ def _look(population: Population) -> list[EpisodeLook]:
         except DataError as error:
             looks[key] = replace(looks[key], wrong=str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())
-
-
-MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
-_NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
-_ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
-_NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
-
-
-@dataclass(frozen=True)
-class TableHead:
-    """What the first lines of a file say."""
-
-    dialect: Dialect
-    fields: tuple[str, ...]  # header; numbers of the columns as text where there is none
-    units: tuple[str, ...]  # cells of the row of units of measure, empty where there is none
-    rows: tuple[tuple[str, ...], ...]  # cells of the first rows of numbers
-
-    def cells(self, column: int) -> list[str]:
-        """Return the first cells of a column."""
-        return [row[column].strip() if column < len(row) else "" for row in self.rows]
-
-    def is_numeric(self, column: int) -> bool:
-        """Tell whether a column holds numbers."""
-        cells = [c for c in self.cells(column) if c.lower() not in _NO_NUMBER]
-        return bool(cells) and all(_is_number(c, self.dialect.decimal) for c in cells)
-
-    def timestamp(self, column: int) -> str | None:
-        """Return the order of the date where a column holds timestamps, or None."""
-        cells = [c for c in self.cells(column) if c]
-        return next((order for order in DATES if cells and all(_is_time(c, order) for c in cells)), None)
-
-
-def look_at(path: Path) -> TableHead:
-    """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
-    if path.suffix == PARQUET:
-        fields, cells = parquet_head(path, RULE.rows)
-        return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(cells))
-    with opened(path) as file:
-        content = b""
-        while len(content) < RULE.head and (more := file.read(RULE.head - len(content))):
-            content += more
-    encoding = encoding_of(content)
-    lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
-    lines = lines[:-1] if len(content) >= RULE.head else lines
-    readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
-    rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
-    if _score(rows, decimal)[0] < 2:
-        actual = f"no rows of numbers were found in its first {len(lines)} lines"
-        raise DataError(f"Reading {path}: {actual}; is it a recording?")
-    return _described(rows, Dialect(delimiter, decimal=decimal, encoding=encoding))
-
-
-def encoding_of(content: bytes) -> str:
-    """Return the encoding that the first bytes of a text speak for."""
-    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
-    for name in ("utf-8", "cp1252"):
-        try:
-            codecs.getincrementaldecoder(name)().decode(content)  # the last character may be cut
-            return name
-        except UnicodeDecodeError:
-            continue
-    return "latin-1"
-
-
-def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:
-    """Cut the first lines, and some of the others, into cells."""
-    first, rest = lines[: RULE.above + RULE.rows], lines[RULE.above + RULE.rows :]
-    rows = []
-    for line in (*first, *rest[:: max(1, len(rest) // RULE.spread)]):
-        try:
-            cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-        except csv.Error:
-            cells = []
-        rows.append([c.strip() for c in cells])
-    return rows
-
-
-def _is_number(cell: str, decimal: str) -> bool:
-    return bool(_NUMBER.match(cell)) and ("," if decimal == "." else ".") not in cell
-
-
-def _is_time(cell: str, order: str) -> bool:
-    return bool(re.match(timestamp_pattern(order), cell))
-
-
-def _is_data(row: Sequence[str], decimal: str) -> bool:
-    """Tell whether a row holds numbers: at most half of its cells are text that is no time."""
-    cells = [c for c in row if c.lower() not in _NO_NUMBER]
-    numbers = sum(_is_number(c, decimal) or any(_is_time(c, order) for order in DATES) for c in cells)
-    return len(row) > 1 and numbers >= 1 and 2 * numbers >= len(cells)
-
-
-def _width(rows: Sequence[Sequence[str]]) -> int:
-    """Return the commonest number of cells."""
-    return Counter(map(len, rows)).most_common(1)[0][0] if rows else 0
-
-
-def _score(rows: Sequence[Sequence[str]], decimal: str) -> tuple[int, int]:
-    """Return how many rows of equal width hold numbers, and how many numbers they hold, those with a point twice."""
-    data = [r for r in rows if _is_data(r, decimal)]
-    same = [r for r in data if len(r) == _width(data)]
-    return len(same), sum(1 + (decimal in c) for r in same for c in r if _is_number(c, decimal))
-
-
-def _described(rows: list[list[str]], dialect: Dialect) -> TableHead:
-    """Tell header, row of units and numbers apart."""
-    data = [i for i, r in enumerate(rows) if _is_data(r, dialect.decimal)]
-    width = _width([rows[i] for i in data])
-    first = next(i for i in data if len(rows[i]) == width and (i + 1 >= len(rows) or i + 1 in data))
-    cells = tuple(tuple(rows[i]) for i in data if i >= first)[: RULE.rows]
-    written = sum(bool(c) for c in cells[0])
-    above = [i for i in range(first) if 2 * sum(map(bool, rows[i])) >= written and abs(len(rows[i]) - width) <= 1]
-    blank = ("",) * width
-    if not above:
-        numbers = tuple(str(i + 1) for i in range(width))
-        return TableHead(replace(dialect, header=False, skip_rows=first), numbers, blank, cells)
-    unit_row = next((i for i in above[1:] if is_unit_row(rows[i])), None)
-    header = above[-1] if unit_row is None else above[above.index(unit_row) - 1]
-    fields, units = ((*row, *blank)[:width] for row in (rows[header], () if unit_row is None else rows[unit_row]))
-    return TableHead(replace(dialect, skip_rows=header, unit_rows=first - header - 1), fields, units, cells)

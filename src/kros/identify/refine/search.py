@@ -144,7 +144,7 @@ class RefineOptions:
     # Prior
     prior_level: float = 0.3  # residual up to which the prior is quadratic
     prior_power: int = 2  # beyond the level, which flattens the residual's peak
-    strengths: tuple[float, ...] = (1e3, 1e2, *(b / 10.0**k for k in range(-1, 4) for b in (3, 1)))  # strongest first
+    strengths: tuple[float, ...] = (1e3, 1e2, 3e1, 1e1, 3.0, 1.0, 0.3, 0.1, 3e-2, 1e-2, 3e-3, 1e-3)  # strongest first
     patience: int = 3  # strengths over which the held-out error must fall by half of the tolerance
     tolerance: float = 0.1  # the strongest prior whose held-out error exceeds the lowest by at most this is chosen
     largest_residual: float = 0.5  # peak above which a set of models is too large for a robust observer

@@ -49,7 +49,7 @@ class ProofSettings:
     accuracy: float = 5e-4  # of the least squared gain on the grid
     rounds: int = 60  # of cutting planes
     cuts: int = 30  # of a round
-    above: tuple[float, ...] = tuple(1 + 10.0**-k for k in (3, 2, 1, 0))  # of the least gain on the grid: what is tried
+    above: tuple[float, ...] = (1.001, 1.01, 1.1, 2.0)  # of the least gain on the grid: what is tried
     spare: float = 0.25  # share of the distance to one that the extra output may take
     corners: int = 64  # of a box, which are visited where slopes are frozen
     bits: int = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted

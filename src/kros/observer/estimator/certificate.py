@@ -81,7 +81,7 @@ def linear_estimate(
             unknown.append(text)
     if unknown:
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
-        shares = ", ".join(f"{name} {percent:.2g} %" for name, percent in (outside or {}).items() if percent)
+        shares = ", ".join(f"{name} {percent:.3g} %" for name, percent in (outside or {}).items() if percent)
         share = f"; the missing ones contribute, in percent of the range: {shares}" if shares else ""
         reason = f"the models have no signal {without_limits(unknown[0])}{more}{share}."
         raise SynthesisError(f"not certified for the set of plants: {reason}")

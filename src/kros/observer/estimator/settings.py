@@ -65,12 +65,12 @@ class EstimatorSettings(Settings):
         description="ratio of the weights of hidden and measured states in the reduction",
     )
     halves: tuple[float, ...] = Field(
-        (*(b / 10.0**k for k in range(2, -2, -1) for b in (1, 3)), 100.0),
+        (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0),
         description="ages of a gap at which the fallback counts one half, in longest delays; training chooses, "
         "among every other one for measured states",
     )
     recoveries: tuple[float, ...] = Field(
-        tuple(3 / 10.0**k for k in (1, 0, -1)),
+        (0.3, 3.0, 30.0),
         description="time constants of the age when measurements return, in longest delays; training chooses",
     )
     room: float = Field(

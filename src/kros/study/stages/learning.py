@@ -1,47 +1,28 @@
-"""The stages from recordings to observers, which are repeated where units are left out.
-
-EDMD models of resampled episodes --> which share of the residuals finite recordings make    uncertainty/<model>/noise
-residuals of all units      --> beside the weights                     uncertainty/<model>/units
-the most conspicuous unit   --> against the cover of all the others    outliers/<models>/others
-"""
+"""The stages from recordings to observers, which are repeated where units are left out."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
+from dataclasses import replace
 from shutil import copyfile
-from typing import Any
-
-import numpy as np
 
 from ...core.artifacts import save_artifact
-from ...core.errors import ConfigError, DataError, KrosError
+from ...core.errors import ConfigError, DataError
 from ...data import Population, read
 from ...data.population import OUTLIERS
 from ...data.prepare import parse_steps, prepare
 from ...data.survey import Copy, check_usable, survey
 from ...design.synthesize import synthesize_all
 from ...evaluate.next_unit import draw_reserve
-from ...identify import ModelSet
-from ...identify.bootstrap import ModelSamples
 from ...identify.calibration import calibrate
 from ...identify.identified import IdentifiedModels
 from ...identify.identify import with_models
 from ...identify.presets import resolve_lifting, resolve_phase
 from ...observer.residual.one_step import FEWEST_SAMPLES
 from ...observer.sensor import require_measured
-from ...uncertainty import Form, UncertainModel, residual
-from ...uncertainty.noise import NoiseShare, noise_share
-from ...uncertainty.nominal import choose_nominal
-from ...uncertainty.quantify import UncertainModels, quantify
-from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
-from ...uncertainty.weights.cover import optimal_cover
+from ...uncertainty.quantify import quantify
 from ..config import Stage, StudyConfig
 from ..engine.context import Context, StageStep
-from .resampling import resampling
+from .diagnose import diagnose
 
 PARQUET, ARRAYS = "parquet", "arrays"
 FEWEST = 2  # units that a population is learned from
@@ -106,110 +87,6 @@ def run_read(context: Context) -> None:
         raise DataError("Dropping episodes needs a copy of the recordings; convert them again without these episodes.")
     content = {"recordings": config.data.source if in_place else "recordings", **facts.content()}
     save_artifact(context.store.draft("population"), "facts", content)
-
-
-log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class DiagnosticSettings:
-    """Extent of what is computed for the report alone."""
-
-    noise_points: int = 80  # frequencies at which variation and noise are compared
-    points: int = 240  # frequencies of residuals
-    units: int = 60  # at most, whose models are resampled
-
-
-DEFAULT = DiagnosticSettings()
-Result = UnitResiduals | NoiseShare
-Task = tuple[Path, Callable[[], Result]]
-
-
-def diagnose(context: Context, uncertain: UncertainModels) -> None:
-    """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
-    folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
-    pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks: list[Task] = [
-        (folder / kind / "noise", task)
-        for kind in models.edmd_kinds
-        if kind in sets and (task := _noise(context, kind, sets[kind])) is not None
-    ]
-    tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
-    tasks += _others(context, uncertain.scores)
-    work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
-    for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
-        if result is not None:
-            result.save(place)
-
-
-def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
-    try:
-        return task()
-    except KrosError as error:
-        log.warning("%s: not in the report: %s", name, error)
-        return None
-
-
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> Callable[[], NoiseShare] | None:
-    """Return work that compares variation and noise over some units, the nominal one among them."""
-    units, models = uncertain.unit_ids, context.identified.models(name)
-    some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
-    chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
-    try:
-        samples = resampling(context, name, chosen)
-    except KrosError as error:  # single episodes
-        log.info("%s: variation and noise are not separated: %s", name, error)
-        return None
-    return partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
-
-
-def _compared(samples: Callable[[], ModelSamples], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
-    scale = models.output_scale[:, None] / models.input_scale
-    freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
-    return noise_share(samples(), scale, freqs, dt, form, nominal)
-
-
-def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
-    """Return the residuals of all covered units beside the weights of a study."""
-    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // DEFAULT.points)]
-    return unit_residuals(
-        uncertain.form,
-        (uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)),
-        dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True)),
-        uncertain.weight,
-        freqs,
-        models.sample_period_s,
-    )
-
-
-def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
-    """Compare the most conspicuous unit with the others, where it scores highest; for both kinds as in the paper."""
-    scored = [r for r in rows if r["score"] is not None]
-    top = max(scored, key=lambda r: (bool(r["outlier"]), float(r["score"])), default=None)
-    if top is None:
-        return []
-    condition, identified, form = top["condition"], context.identified, Form(context.config.uncertainty.form)
-    flagged = [r["unit"] for r in rows if r["outlier"] and r["condition"] == condition]
-    outside = list(dict.fromkeys([top["unit"], *flagged]))
-    sets = [identified.models(name, condition) for name in identified.edmd_kinds]
-    others = [u for u, s in zip(sets[0].unit_ids, sets[0].status, strict=True) if s == "ok" and u not in outside]
-    if len(others) < 2:
-        return []
-    responses = sets[0].scaled_responses(sets[0].frequencies(DEFAULT.points), others)
-    nominal = others[choose_nominal(responses, form).index]
-    places = (context.store.draft("outliers", identified.place(m.name, condition), "others") for m in sets)
-    work = (partial(against_others, m, others, outside, nominal, form) for m in sets)
-    return list(zip(places, work, strict=True))
-
-
-def against_others(models: ModelSet, others: list[str], outside: list[str], nominal: str, form: Form) -> UnitResiduals:
-    """Return the residuals of all units beside the smallest diagonal cover of `others` at every frequency."""
-    freqs, row = models.frequencies(DEFAULT.points), others.index(nominal)
-    everyone = [*others, *outside]
-    responses = models.scaled_responses(freqs, everyone)
-    cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
-    units = dict(zip(everyone, responses, strict=True))
-    return unit_residuals(form, (nominal, responses[row]), units, cover, freqs, models.sample_period_s, outside)
 
 
 def run_calibrate(context: Context) -> None:

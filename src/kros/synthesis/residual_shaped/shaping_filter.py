@@ -39,7 +39,7 @@ class Basis:
 
     delays: int = 8
     # Of the lags, inside the unit circle, each one once: disturbances that last up to 300 samples
-    poles: tuple[float, ...] = tuple(1 - b / 10.0**k for k, b in ((1, 1), (2, 3), (2, 1), (3, 3)))
+    poles: tuple[float, ...] = (0.9, 0.97, 0.99, 0.997)
 
     @cached_property
     def scalar(self) -> tuple[Array, Array]:

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from kros.core.errors import DataError
-from kros.data.discovery.discover import discover
 from kros.data.discovery.dialect import look_at
+from kros.data.discovery.discover import discover
 from kros.data.discovery.filenames import infer_names
 from kros.data.discovery.roles import identifier, kind_of, split_header, time_scale
 

@@ -209,7 +209,7 @@ class RunningObserver:
         if steps.waiting[0]:
             return
         if self._watch is not None:
-            self._watch.take(steps.innovation(y)[0].tolist(), not self._status)
+            self._watch.take(steps.innovation(y)[0], not self._status)
         if self._loop is None:
             steps.step(y, u)
         else:

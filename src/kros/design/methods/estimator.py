@@ -38,9 +38,9 @@ class Estimator(Method):
         settings = models.sample_period_s, nominal, self.settings
         identified = identify_estimator(task.name, *channels, recordings, *settings)
         runtime = identified.observer.runtime
-        if task.limits is not None and runtime.lower is not None and runtime.upper is not None:
+        if task.limits is not None:
             n = len(task.limits[0])
-            lower, upper = runtime.lower.copy(), runtime.upper.copy()
+            lower, upper = (side.copy() for side in runtime.sides(identified.observer.lifting.n_states))
             lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
             runtime = replace(runtime, lower=lower, upper=upper)
         observer = replace(identified.observer, runtime=runtime, seen=training.seen, sensor=task.sensor)

@@ -138,12 +138,11 @@ class Source:
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
-        o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
+        o, q, bounds, sides = self.observer, len(self.measured), self.bounds(), self.observer.runtime.sides
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
-            "clips_estimate": bool(limits),
-            "lower": row(limits.get("lower", np.full(o.lifting.n_states, -np.inf))),
-            "upper": row(limits.get("upper", np.full(o.lifting.n_states, np.inf))),
+            "clips_estimate": bool(o.runtime.limits()),
+            **dict(zip(("lower", "upper"), map(row, sides(o.lifting.n_states)), strict=True)),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": bounds[:q],
             "u_bounds": bounds[q:],

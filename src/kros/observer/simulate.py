@@ -17,7 +17,7 @@ from .screen import Bits, Flags, Held, SampleStatus, Screened, Whole, screened
 from .step import Parameters, Steps, forward
 
 Array = npt.NDArray[np.float64]
-_ROWS = 512  # samples predicted forward at a time
+_ROWS = 1000  # samples predicted forward at a time
 
 
 def run_observer(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import ConfigError
 from ...core.lti import gain
 from ...lifting import Lifting
 from ...synthesis.result import Injection
@@ -83,16 +84,19 @@ def identify_estimator(
     settings, measured = settings or EstimatorSettings(), tuple(measured)
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(measured)
+    require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
     readout, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
     channels = readout.design.channels
     blind_channels = channels.without_measurements()
     blind_bank = Bank.of(blind_channels, recordings.length, settings)
     blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
+    held = [measured[i] for i in blind_channels.held]
     first = first_estimate(channels, recordings)
     reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
-        own = name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
+        absolute = filters.absolute(channels), fallback.absolute(blind_channels)
+        own = name, lifting, inputs, channels, *absolute, first, sample_period_s, parameters or {}, reach
         return assembled(*own)
 
     filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
@@ -104,7 +108,7 @@ def identify_estimator(
         reduced(rest, errors_of(rest), len(fallback.A), settings.loss),
     )
     assert observer.bank is not None
-    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings))
+    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings, held))
     observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
@@ -124,6 +128,16 @@ def identify_estimator(
         "settle_samples": settle_samples(filters, fallback, observer.bank),
     }
     return Identified(observer, readout, family, facts)
+
+
+def require_known(unbounded: Mapping[str, Sequence[str]], measured: Sequence[str], inputs: Sequence[str]) -> None:
+    """Refuse names of unbounded coordinates that are no measured states, or no inputs behind these."""
+    others = [name for together in unbounded.values() for name in together]
+    if wrong := [*(set(unbounded) - set(measured)), *(set(others) - set(inputs))]:
+        raise ConfigError(
+            f"Estimator: unbounded should map measured states {list(measured)} to inputs that go on with them, of "
+            f"{list(inputs)}, found {sorted(wrong)}; correct the names."
+        )
 
 
 def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
@@ -198,7 +212,10 @@ def first_estimate(channels: Channels, recordings: Recordings) -> Array:
     units = np.array([key.unit for key in recordings.keys])
     some = np.array([*range(channels.linear), len(channels) - 1])
     found = np.zeros((x[0].size, len(channels)))
-    found[:, some] = _ridge(np.array(v)[:, some], np.array(x), units).T
+    N, E = channels.relative
+    still = N - E @ E.T
+    found[:, some] = _ridge((np.array(v) @ still.T)[:, some], np.array(x), units).T
+    found = found @ still
     found[list(channels.measured)] = np.eye(len(channels.measured), len(channels))
     return found
 
@@ -260,7 +277,8 @@ def assembled(
         (u, blind, fallback.C @ fallback.S + fallback.D),  # as if it had run before: no step at the start
     ):
         start[rows[:, None], np.array(inputs_of)] = first_of
-    model[at, at] += 1.0
+    held = [at[i] for i in channels.without_measurements().held]
+    model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     bank = FilterBank(r, start, np.ones(n), np.ones(n), np.zeros(n), reach)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,11 +63,13 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+def with_gaps(
+    bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
+) -> FilterBank:
     """Return a filter bank with forgetting and ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
-    side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
+    side, with the best of the others for each. Fallbacks of states `held` go on from the last value by themselves. A larger one, with which the filters go on by themselves for longer, has
     to be better by the margin.
     """
     states, shown, inputs, parameters = training(recordings, settings)
@@ -75,6 +78,7 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
     y, own = shown[..., at], trial.own(parameters)
     forget = forgetting(states - recorded_estimates(trial, y, inputs, own)[..., n:])
+    forget[list(held)] = 0.0
     longest = settings.blocks(recordings.length)[-1]
     halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     tried = halves[::2]

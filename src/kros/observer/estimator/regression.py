@@ -149,7 +149,7 @@ class Design:
     ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
         """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
 
-        Targets are states at the next sample, of measured ones their change.
+        Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
         thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
@@ -159,18 +159,20 @@ class Design:
             v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
             at, weights = thinning.at(length, number)
             targets = batch.states[at + 1, 0] / recordings.size
-            if not self.channels.inputs_only:
-                targets[:, measured] -= y[at] / recordings.size[measured]
-            yield key, self.bank.rows(v, at), targets, weights
+            reference = v[at] @ self.channels.reference.T
+            reference[:, self.channels.held] = y[at][:, self.channels.held]
+            targets[:, measured] -= reference / recordings.size[measured]
+            yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
     def signals(self, some: int, length: int) -> Array:
-        """Return the channels of some episodes, cut to one length, shape (n_samples, batch, channels)."""
+        """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
         found = []
         for key in self.recordings.some(some).keys:
             batch = self.recordings.read(key)
             y = interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
             own = {k: p[0] for k, p in batch.parameters.items()}
-            found.append(self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own))
+            v = self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own)
+            found.append(self.channels.filtered(v))
         shortest = min(length, *(len(v) for v in found))
         return np.stack([v[:shortest] for v in found], axis=1)
 

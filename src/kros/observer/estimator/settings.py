@@ -19,6 +19,11 @@ class EstimatorSettings(Settings):
     ((0, 1, 2, 4, 6, 8), (300.0, 600.0))
     """
 
+    unbounded: dict[str, tuple[str, ...]] = Field(
+        {},
+        description="measured states that may go on for ever, such as the position of a spindle, with the inputs that go "
+        "on with them, such as its reference; the estimator sees their changes and distances alone",
+    )
     dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
     longest: int = Field(
         100, ge=1, description="longest delay, in samples; a short episode allows a quarter of its length"

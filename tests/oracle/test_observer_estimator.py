@@ -10,10 +10,13 @@ from batches import run_with_status
 from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
+from kros.core.errors import ConfigError
 from kros.data import EpisodeBatch
+from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import Observer, Recordings, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
+from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import reduced
 from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated
@@ -209,6 +212,37 @@ def test_batches_and_single_machines_are_alike_with_and_without_gaps(motors):
         running = observer.start(y[0, machine])
         rows = [np.asarray(running.step(y[k, machine], batch.inputs[k, machine])) for k in range(299)]
         np.testing.assert_allclose(rows, wanted[1:, machine], atol=1e-8 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
+    """The same motion a thousand turns on gives the same estimates, with and without losses, and no gain at rest."""
+    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    names, inputs = population.states, (*population.inputs, "reference")[: 1 + reference]
+
+    def read(key: EpisodeKey) -> EpisodeBatch:
+        batch = EpisodeBatch.read(population, [key])
+        rng = np.random.default_rng(int(key.episode))
+        along = batch.states[:, :, :1] + rng.normal(size=batch.inputs.shape)
+        return replace(batch, inputs=np.concatenate([batch.inputs, along], axis=-1)[..., : len(inputs)])
+
+    recordings = Recordings.of(list(population.keys()), read)
+    free = FEW.model_copy(update={"unbounded": {names[0]: inputs[1:]}})
+    observer = identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=free).observer
+    batch, turns = read(recordings.keys[0]), 2 * np.pi * 1000
+    y, moved = batch.measurements([0]), batch.inputs + np.array([0.0, turns])[: len(inputs)]
+    lost = np.where(np.random.default_rng(0).random(y.shape) < 0.5, np.nan, y)
+    for shown in (y, lost):
+        here = run_observer(observer, shown, batch.inputs)[..., :3]
+        there = run_observer(observer, shown + turns, moved)[..., :3] - [turns, 0, 0]
+        np.testing.assert_allclose(there, here, atol=1e-6 * np.abs(batch.states).max())
+    response = noise_response(observer)
+    if not reference:
+        still = response.C @ np.linalg.solve(np.eye(len(response.A)) - response.A, response.B) + response.D
+        np.testing.assert_allclose(still[1:], 0.0, atol=1e-9)
+    with pytest.raises(ConfigError, match="unbounded should map measured states"):
+        wrong = FEW.model_copy(update={"unbounded": {names[1]: ()}})
+        identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=wrong)
 
 
 def test_units_of_measure_change_nothing():

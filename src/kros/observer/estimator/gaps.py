@@ -126,12 +126,15 @@ def blended_errors(
 ) -> Array:
     """Return log squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
-    x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
+    offset, squares = np.repeat((filtered - from_inputs)[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
+    x, level = filtered[0] + 0 * offset, 0 * offset
     for k, lost in enumerate(missing[:-1]):
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
+        apart = x - from_inputs[k]
+        offset = forget * (apart + level * (offset - apart))
         level = (age**2 / (age**2 + half**2))[..., None]
-        fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
+        fallback = from_inputs[k + 1] + offset
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])
         squares += (x - states[k + 1]) ** 2
     return np.log(squares / len(missing) + TINY)

@@ -149,17 +149,25 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     )
 
 
+def test_few_episodes_of_the_regression_leave_no_group_without_moments():
+    recordings, _ = plant(units=5, episodes=7, spread=0.1)
+    settings = FEW.model_copy(update={"episodes": 4})
+    readout = Readout.of(design(recordings, settings=settings))
+    assert set(readout.others) == set(readout.design.groups.values())
+    assert len(readout.unit_errors()) == 5
+
+
 def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     recordings, batches = plant(units=3, spread=0.1)
     biased = replace(recordings, bias=np.array([0.5]))
     made = design(biased)
-    bank, X = made.bank, made.sample()[0]
+    bank, X = made.bank, made.sample[0]
     expected = np.zeros_like(X)
     of_y = np.flatnonzero(bank.channel == 0)
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.sample(biased.bias)[0] - X
+    moved = made.thinned(biased.bias)[0] - X
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):

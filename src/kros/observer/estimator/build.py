@@ -158,7 +158,7 @@ def best_family(
     hidden: Sequence[int],
 ) -> tuple[Readout, str]:
     """Return the readout of the first family after which the next is not better by the margin on left-out units."""
-    ranges = ranges_of(lifting, measured, inputs, recordings)
+    ranges = ranges_of(lifting, measured, inputs, recordings, settings)
     best: Readout | None = None
     chosen = FAMILIES[0]
     for family in FAMILIES:
@@ -186,10 +186,14 @@ def errors_of(readout: Readout) -> Array:
 
 
 def ranges_of(
-    lifting: Lifting, measured: Sequence[int], inputs: Sequence[str], recordings: Recordings
+    lifting: Lifting,
+    measured: Sequence[int],
+    inputs: Sequence[str],
+    recordings: Recordings,
+    settings: EstimatorSettings,
 ) -> dict[str, tuple[float, float]]:
     """Return the least and largest value of measured states and inputs in the units that formulas are written in."""
-    batches = [recordings.read(key) for key in recordings.some(150).keys]
+    batches = [recordings.read(key) for key in recordings.some(settings.episodes).keys]
     found = {}
     names = [lifting.states[i] for i in measured]
     for name, size in zip([*names, *inputs], lifting.sizes_of([*names, *inputs]), strict=True):

@@ -109,11 +109,12 @@ def channels_of(
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
     names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
     groups = [(name, *together) for name, together in settings.unbounded.items()]
-    bounded = [name for name in names if not any(name in group for group in groups)]
+    free = {name for group in groups for name in group}
+    bounded = [[n for n in some if n not in free] for some in (names[: len(measured)], inputs)]
     if family in FAMILIES[2:]:
-        nonlinear += products(bounded, inputs, ranges, settings.beyond)
+        nonlinear += products(*bounded, ranges, settings.beyond)
     if family in FAMILIES[3:]:
-        nonlinear += random_features(bounded, inputs, ranges, settings)
+        nonlinear += random_features(*bounded, ranges, settings)
     bare = replace(
         lifting, functions=tuple(functions), inputs=tuple(inputs), input_functions=(*of_inputs, *nonlinear, CONSTANT)
     )
@@ -122,9 +123,7 @@ def channels_of(
     unbounded = tuple(tuple((place[name], 1 / sizes[name]) for name in group) for group in groups)
     count = linear + len(nonlinear) + 1
     reference, recent = np.eye(len(measured), count), family == FAMILIES[0]
-    return Channels(
-        bare, tuple(measured), len(inputs), reference, linear, len(nonlinear), recent, unbounded=unbounded
-    )
+    return Channels(bare, tuple(measured), len(inputs), reference, linear, len(nonlinear), recent, unbounded=unbounded)
 
 
 def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:
@@ -147,18 +146,19 @@ def without_limits(text: str) -> str:
     return re.sub(r"\(\(abs\((\w+)[^)]*\) - abs\([^)]*\)[^)]*\)/2\)", r"\1", text)
 
 
-def products(names: Sequence[str], inputs: Sequence[str], ranges: Ranges, beyond: float) -> list[str]:
-    """Return u|u|, u^2 and y u of every input and measurement among names."""
-    u, y = ([clipped(name, ranges, beyond) for name in names if (name in inputs) == known] for known in (True, False))
+def products(measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, beyond: float) -> list[str]:
+    """Return u|u|, u^2 and y u of every input and measurement."""
+    y, u = ([clipped(name, ranges, beyond) for name in names] for names in (measured, inputs))
     return [f"{a}*abs({a})" for a in u] + [f"{a}**2" for a in u] + [f"{a}*{b}" for a in u for b in y]
 
 
 def random_features(
-    names: Sequence[str], inputs: Sequence[str], ranges: Ranges, settings: EstimatorSettings
+    measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, settings: EstimatorSettings
 ) -> list[str]:
     """Return hyperbolic tangents of random combinations of measurements and inputs, of size one."""
     rng = np.random.default_rng(settings.seed)
-    if not set(names) & set(inputs):
+    names = [*measured, *inputs]
+    if not inputs:
         return []
     size = np.array([max(abs(low), abs(high)) / np.sqrt(3) for low, high in (ranges[name] for name in names)])
     size[size == 0] = 1.0

@@ -248,8 +248,8 @@ def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
     if not reference:
         still = response.C @ np.linalg.solve(np.eye(len(response.A)) - response.A, response.B) + response.D
         np.testing.assert_allclose(still[1:], 0.0, atol=1e-9)
+    wrong = FEW.model_copy(update={"unbounded": {names[1]: ()}})
     with pytest.raises(ConfigError, match="unbounded should map measured states"):
-        wrong = FEW.model_copy(update={"unbounded": {names[1]: ()}})
         identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=wrong)
 
 

@@ -91,12 +91,11 @@ def identify_estimator(
     blind_bank = Bank.of(blind_channels, recordings.length, settings)
     blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
     held = [measured[i] for i in blind_channels.held]
-    first = first_estimate(channels, recordings)
     reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
         absolute = filters.absolute(channels), fallback.absolute(blind_channels)
-        own = name, lifting, inputs, channels, *absolute, first, sample_period_s, parameters or {}, reach
+        own = name, lifting, inputs, channels, *absolute, sample_period_s, parameters or {}, reach
         return assembled(*own)
 
     filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
@@ -205,45 +204,6 @@ def ranges_of(
     return found
 
 
-def first_estimate(channels: Channels, recordings: Recordings) -> Array:
-    """Return the map (n, channels) from all channels of the first sample to the first state."""
-    v, x = [], []
-    for key in recordings.keys:
-        batch = recordings.read(key)
-        y, u = batch.measurements(channels.measured)[0], batch.inputs[0]
-        v.append(channels.signals(y, u, batch.parameters)[0])
-        x.append(batch.states[0, 0])
-    units = np.array([key.unit for key in recordings.keys])
-    some = np.array([*range(channels.linear), len(channels) - 1])
-    found = np.zeros((x[0].size, len(channels)))
-    N, E = channels.relative
-    still = N - E @ E.T
-    found[:, some] = _ridge((np.array(v) @ still.T)[:, some], np.array(x), units).T
-    found = found @ still
-    found[list(channels.measured)] = np.eye(len(channels.measured), len(channels))
-    return found
-
-
-def _ridge(X: Array, T: Array, units: npt.NDArray[Any]) -> Array:
-    """Return ridge coefficients, the penalty best on left-out units; the last column, a constant, has no penalty."""
-    size = np.sqrt(np.mean(X**2, axis=0))
-    X = X / np.where(size > 0, size, 1.0)
-
-    def solved(rows: npt.NDArray[np.bool_], penalty: float) -> Array:
-        rest = np.sqrt(penalty * rows.sum()) * np.eye(X.shape[1])
-        rest[-1] = 0.0
-        stacked = np.vstack([T[rows], np.zeros((X.shape[1], T.shape[1]))])
-        return np.asarray(np.linalg.lstsq(np.vstack([X[rows], rest]), stacked, rcond=None)[0])
-
-    def score(penalty: float) -> float:
-        errors = [((T[units == u] - X[units == u] @ solved(units != u, penalty)) ** 2).mean(axis=0) for u in set(units)]
-        return float(np.log(np.mean(errors, axis=0) + 1e-30).sum())
-
-    every, several = np.ones(len(units), dtype=bool), len(set(units)) > 1
-    best = min((10.0**d for d in range(-8, 3)), key=score) if several else 1e-4
-    return solved(every, best) / np.where(size > 0, size, 1.0)[:, None]
-
-
 def assembled(
     name: str,
     lifting: Lifting,
@@ -251,7 +211,6 @@ def assembled(
     channels: Channels,
     filters: Filters,
     fallback: Filters,
-    first: Array,
     sample_period_s: float,
     parameters: Mapping[str, float],
     reach: Array,
@@ -267,6 +226,8 @@ def assembled(
     z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
+    first = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
+    first[at] = np.eye(len(at), len(channels))
     for rows, states, inputs_of, system in (
         (x, z, places, (filters.C, filters.D)),
         (z, z, places, (filters.A, filters.B)),
@@ -278,7 +239,7 @@ def assembled(
         (x, places, first),
         (z, places, filters.S),
         (w, blind, fallback.S),
-        (u, blind, fallback.C @ fallback.S + fallback.D),  # as if it had run before: no step at the start
+        (u, blind, fallback.C @ fallback.S + fallback.D),
     ):
         start[rows[:, None], np.array(inputs_of)] = first_of
     held = [at[i] for i in channels.without_measurements().held]

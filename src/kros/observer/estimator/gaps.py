@@ -69,8 +69,8 @@ def with_gaps(
     """Return a filter bank with forgetting and ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
-    side, with the best of the others for each. Fallbacks of states `held` go on from the last value by themselves. A larger one, with which the filters go on by themselves for longer, has
-    to be better by the margin.
+    side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
+    to be better by the margin. Fallbacks of states `held` go on from their last value by themselves.
     """
     states, shown, inputs, parameters = training(recordings, settings)
     batch, n, at = states.shape[1], len(trial.recorded), list(trial.measured)

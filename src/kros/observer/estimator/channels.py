@@ -110,11 +110,11 @@ def channels_of(
     names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
     groups = [(name, *together) for name, together in settings.unbounded.items()]
     free = {name for group in groups for name in group}
-    bounded = [[n for n in some if n not in free] for some in (names[: len(measured)], inputs)]
+    y, u = ([name for name in some if name not in free] for some in (names[: len(measured)], inputs))
     if family in FAMILIES[2:]:
-        nonlinear += products(*bounded, ranges, settings.beyond)
+        nonlinear += products(y, u, ranges, settings.beyond)
     if family in FAMILIES[3:]:
-        nonlinear += random_features(*bounded, ranges, settings)
+        nonlinear += random_features(y, u, ranges, settings)
     bare = replace(
         lifting, functions=tuple(functions), inputs=tuple(inputs), input_functions=(*of_inputs, *nonlinear, CONSTANT)
     )

@@ -51,9 +51,6 @@ class EstimatorSettings(Settings):
     )
     parts: int = Field(3, ge=1, description="parts of the episodes, of which the one that is judged on is left out")
     folds: int = Field(4, ge=2, description="folds of units that are left out in turn, at most")
-    directions: int = Field(
-        400, ge=10, description="principal directions of the bank that the regression sees, at most"
-    )
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )

@@ -154,7 +154,7 @@ def test_few_episodes_of_the_regression_leave_no_group_without_moments():
     settings = FEW.model_copy(update={"episodes": 4})
     readout = Readout.of(design(recordings, settings=settings))
     assert set(readout.others) == set(readout.design.groups.values())
-    assert len(readout.unit_errors()) == 5
+    assert readout.episode_errors().shape == (35, 3)
 
 
 def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():

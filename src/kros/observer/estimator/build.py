@@ -112,7 +112,7 @@ def identify_estimator(
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
     growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
-    worst = np.sqrt(np.max(list(readout.unit_errors().values()), axis=0))
+    worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,
         "filters": len(filters.A),

@@ -368,14 +368,12 @@ class Readout:
         log = np.log(self.left_out[:, list(states)]).mean(axis=1)
         return np.array([log[self.folds == fold].mean() for fold in np.unique(self.folds)])
 
-    def unit_errors(self) -> dict[tuple[str, str], Array]:
-        """Return the left-out mean squared errors (n,) over the squared sizes of every unit and condition."""
-        sums: dict[tuple[str, str], list[Any]] = {}
-        for key, rows, targets, weights in self.design.rows(self.design.recordings, self.design.settings.rows):
-            missed = targets - rows @ self.others[self.design.groups[key]]
-            own = sums.setdefault((key.unit, key.condition), [0.0, 0.0])
-            own[0], own[1] = own[0] + weights @ missed**2, own[1] + weights.sum()
-        return {name: total / weight for name, (total, weight) in sums.items()}
+    def episode_errors(self) -> Array:
+        """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
+        design, found = self.design, []
+        for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
+            found.append(np.average((targets - rows @ self.others[design.groups[key]]) ** 2, axis=0, weights=weights))
+        return np.array(found)
 
 
 def spread(items: Sequence[T], count: int) -> set[T]:

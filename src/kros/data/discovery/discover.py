@@ -21,7 +21,7 @@ from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
-from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
+from ..readers.tables import Dialect, file_fields, read_table
 from ..recording import CHECK, some, usable
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine, median_period
@@ -57,7 +57,7 @@ class Discovery:
 
 
 def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of text tables or of Parquet files of any layout."""
+    """Describe a folder of text tables."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     mapping: dict[str, Any] = {"files": _names(list(alike), wanted.files)}
@@ -81,7 +81,11 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not selected:
         there = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
-        advice = there if files else f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV or Parquet"
+        advice = (
+            there
+            if files
+            else f"there are no files of recordings ({', '.join(ENDINGS)}); save text such as CSV, or use kros.from_frame"
+        )
         raise DataError(f"Looking at {source}: {advice}.")
     return selected
 
@@ -117,8 +121,7 @@ def _fits(path: Path, head: TableHead) -> bool:
         fields = file_fields(path, head.dialect)
     except DataError:
         return False
-    named = head.dialect.header or path.suffix == PARQUET
-    return set(head.fields) - {""} <= set(fields) if named else len(fields) == len(head.fields)
+    return set(head.fields) - {""} <= set(fields) if head.dialect.header else len(fields) == len(head.fields)
 
 
 def _columns(
@@ -179,11 +182,7 @@ def _time(
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
-    if path.suffix == PARQUET:
-        values = read_columns(path, file_fields(path), [head.fields[i] for i in columns])
-    else:
-        names = [f"{name or 'column'} #{i + 1}" for i, name in enumerate(head.fields)]
-        values = read_columns(path, names, [names[i] for i in columns], head.dialect)
+    values = read_table(path, head.fields, columns, head.dialect).T
     return np.where(usable(values), values, np.nan)
 
 

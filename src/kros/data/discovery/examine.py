@@ -19,7 +19,6 @@ from ..steps import GAP, longest_stretch
 class DiscoveryRule:
     """What recordings are judged by before a study exists."""
 
-    head: int = 1 << 18  # bytes of a text file that say how it is written
     rows: int = 60  # first rows of numbers that are looked at closely
     spread: int = 200  # further lines, spread over the head: machines rest at first, and zeros have no decimal point
     above: int = 20  # lines that may stand before the header

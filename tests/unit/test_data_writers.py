@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
 from kros.data.readers.parquet import group_file, read_parquet, write_group, write_index
+from kros.data.recording import usable_episodes
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
 
@@ -111,7 +112,8 @@ def test_groups_written_by_other_processes(tmp_path: Path) -> None:
     folder.mkdir()
     groups = [(unit, condition) for unit, condition, _ in population().groups()]
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        tasks = [pool.submit(write_group, population().select([u], [c]), u, c, folder) for u, c in groups]
+        parts = [population().select([u], [c]) for u, c in groups]
+        tasks = [pool.submit(write_group, part, folder, list(usable_episodes(part))) for part in parts]
         write_index(population(), [task.result() for task in tasks], folder)
     assert_same(read_parquet(folder), population())
     for path in folder.iterdir():

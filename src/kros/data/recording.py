@@ -340,12 +340,10 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
 
 
-def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: str = "error"
-) -> Iterator[tuple[EpisodeKey, Array, str]]:
+def usable_episodes(population: Population, on_nan: str = "error") -> Iterator[tuple[EpisodeKey, Array, str]]:
     """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
-    watch = GroupWatch(population.columns)
-    for key in keys:
+    watch, usable = GroupWatch(population.columns), 0
+    for key in population.episodes:
         try:
             values = population.source(key)
             check_episode(values, key, population.columns)
@@ -355,8 +353,12 @@ def usable_episodes(
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(key, values)
+        usable += 1
         yield key, values, digest_of(values)
     watch.check()
+    if not usable:
+        group = f"Unit {key.unit} ({key.condition})"
+        raise DataError(f"{group}: every episode was dropped; fix the source or leave the unit out.")
 
 
 def digest_of(values: Array) -> str:

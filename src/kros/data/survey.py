@@ -8,13 +8,14 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from ..core.artifacts import file_digest, load_artifact, loader
 from ..core.errors import DataError
@@ -138,21 +139,17 @@ class RecordingFacts:
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        facts["limits"] = {name: asdict(limit) for name, limit in self.limits.items()}
-        facts["digests"] = {part: [self.digests.get(k) for k in facts[part]] for part in _PARTS}
-        return facts | {part: [astuple(k) for k in facts[part]] for part in _PARTS}
+        facts["digests"] = [self.digests.get(key, "") for key in (*self.train, *self.test)]
+        return facts | {part: [astuple(key) for key in facts[part]] for part in _PARTS}
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
-        parts: dict[str, Any] = {part: tuple(EpisodeKey(*row) for row in content[part]) for part in _PARTS}
-        pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
-        limits = {name: FoundLimit(**{**of, "units": tuple(of["units"])}) for name, of in content["limits"].items()}
-        known: dict[str, Any] = {name: content[name] for name in ("identify_on", "groups", "resolution")}
-        known |= {name: tuple(content[name]) for name in ("dropped", "alerts", "reserve")}
-        return cls(**known, **parts, limits=limits, digests={key: text for key, text in pairs if text})
+        parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
+        digests = zip((*parts["train"], *parts["test"]), content["digests"], strict=True)
+        return TypeAdapter(cls).validate_python({**content, **parts, "digests": dict(digests)})
 
 
 @dataclass(frozen=True)
@@ -291,16 +288,15 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
-    ((unit, condition, keys),) = population.groups()
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
     n, hidden = len(population.states), [s for s in population.states if s not in population.measured]
 
     def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
-        for key, values, digest in usable_episodes(population, keys, task.on_nan):
+        for key, values, digest in usable_episodes(population, task.on_nan):
             for name in population.measured if not episodes else ():
                 resolution[name] = smallest_step(values[:, names.index(name)])
-            inputs, place = values[:, n : len(names)], f"{condition}/{key.episode}"
-            ends = {name: ends_of(unit, place, values[:, names.index(name)], inputs) for name in hidden}
+            inputs = values[:, n : len(names)]
+            ends = {name: ends_of(key, values[:, names.index(name)], inputs) for name in hidden}
             reach = np.stack([inputs.min(axis=0), inputs.max(axis=0)])
             episodes.append(_EpisodeFacts(key, digest, len(values), size_of(values), reach, ends))
             yield key, values, digest
@@ -308,10 +304,8 @@ def _read_group(task: _Group) -> _GroupFacts:
     if task.folder is None:
         deque(usable(), maxlen=0)
     else:
-        record = write_group(population, unit, condition, task.folder, usable())
-        written = file_digest(task.folder / record.file) if record.episodes else None
-    if not episodes:
-        raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
+        record = write_group(population, task.folder, usable())
+        written = file_digest(task.folder / record.file)
     return _GroupFacts(record, written, resolution, episodes)
 
 

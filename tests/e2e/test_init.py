@@ -117,7 +117,7 @@ def test_what_is_wrong_is_said_and_left_out_before_anything_is_computed(kros, tm
     for part in (
         "a copy of episode",
         "'current' stays at 1.5 in all ",
-        "a gap of 0.202 s after sample 498 of",
+        "the worst step differs by 0.2 s at sample 498 of",
         "1 files are not like the others and left alone: notes.csv",
     ):
         assert part in result.output

@@ -23,6 +23,7 @@ from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
 from ..readers.tables import Dialect, file_fields, read_table
 from ..recording import CHECK, some, usable
+from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
@@ -250,9 +251,8 @@ def _examined(
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good)
-    findings += [*text, *_lacking(retained)]
     reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), bool(nan), reading)
+    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), bool(nan), reading)
 
 
 def _resampling(
@@ -266,19 +266,10 @@ def _resampling(
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
     text = f"time is uneven: all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
-        text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
-    return ({"step": "resample", "period_s": period_s},), [text, *_gaps(population, source, looks)]
-
-
-def _gaps(population: Population, source: Path, looks: Sequence[EpisodeLook]) -> list[str]:
-    """Say what gaps in time leave of recordings."""
-    cut = sorted((s for s in looks if s.gap[0] > 0), key=lambda s: s.kept)
-    if not cut:
-        return []
-    first, where = cut[0], _relative(population, source, cut[0].key)
-    gap = f"a gap of {first.gap[0]:.3g} s after sample {first.gap[1]} of {where}"
-    text = f"{gap}, whose longest stretch without one is {100 * first.kept:.0f} % of it; that alone is taken"
-    return [text if len(cut) == 1 else f"{text}, as of {len(cut) - 1} more recordings with gaps, which lose less"]
+        where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"
+        text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"
+    text += f"; where a step is longer than {GAP:g} periods, the longest stretch without such a gap is taken"
+    return ({"step": "resample", "period_s": period_s},), [text]
 
 
 def _reading(population: Population, source: Path) -> str:
@@ -296,11 +287,3 @@ def _exclusion(names: Sequence[str]) -> dict[str, Any]:
 def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
     recordings: Any = population.source
     return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
-
-
-def _lacking(population: Population) -> list[str]:
-    """Report units that were not recorded in every condition."""
-    recorded = {(u, c) for u, c, _ in population.groups()}
-    lacking = {u: [c for c in population.conditions if (u, c) not in recorded] for u in population.unit_ids}
-    lacks = [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]
-    return [f"not every unit was recorded in every condition: {some(lacks)}"] if lacks else []

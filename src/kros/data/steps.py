@@ -339,7 +339,7 @@ def lowpass(values: Float, cutoff: float) -> Float:
     from scipy.signal import convolve, firwin
 
     taps = firwin(2 * half + 1, 2 * cutoff, window="hamming")[:, None]
-    padded = np.concatenate([2 * values[0] - values[half:0:-1], values, 2 * values[-1] - values[-2 : -half - 2 : -1]])
+    padded = np.pad(values, ((half, half), (0, 0)), "reflect", reflect_type="odd")
     return np.asarray(convolve(padded, taps, mode="valid"))
 
 

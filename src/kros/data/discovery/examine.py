@@ -63,7 +63,7 @@ def _look(population: Population) -> list[EpisodeLook]:
     for key in population.episodes:
         looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
-            recording = source.recorded(key)
+            recording = source.recordings(key)
             values, time = recording.values, recording.time_s
             check_increasing(recording)
             looks[key] = replace(looks[key], n_samples=len(values))

@@ -13,7 +13,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from ..core.artifacts import digest_of
 from ..core.errors import ConfigError, DataError
-from ..core.files import did_you_mean, shortened, stamp_of
+from ..core.files import shortened, stamp_of
 from .population import (
     Channel,
     EpisodeKey,
@@ -178,10 +178,7 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
         problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
         key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
         text = f"{key}: {problem['msg'].lower()}, found {actual}"
-        if problem["type"] in ("unexpected_keyword_argument", "missing"):
-            what = "is missing" if problem["type"] == "missing" else "is unknown"
-            text = f"key {key!r} {what}{did_you_mean(key, known) or ';'} the keys are {', '.join(known)}"
-        raise ConfigError(f"{where} (step {name!r}): {text}.") from error
+        raise ConfigError(f"{where} (step {name!r}): {text}; the keys are {', '.join(known)}.") from error
 
 
 @dataclass(frozen=True)

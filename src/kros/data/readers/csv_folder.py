@@ -165,11 +165,9 @@ class CsvMapping(Settings):
 
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
-        columns = [{name: c for name, c in u.columns.items() if name not in names} for u in self.unit]
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
         remaining = {
             "channel": tuple(c for c in self.channel if c.name not in names),
-            "unit": tuple(u.model_copy(update={"columns": c}) for u, c in zip(self.unit, columns, strict=True)),
             "prepare": tuple(step for step in steps if step is not None),
         }
         return self.model_copy(update=remaining)

@@ -20,7 +20,7 @@ from ...data.discovery.discover import Discovery, Wanted, discover
 from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
 from ...data.readers.csv_folder import CsvMapping
 from ...data.readers.opening import detect_reader
-from ...data.recording import check_population, some
+from ...data.recording import check_population
 from ...data.survey import UNLOADED, RecordingFacts, survey
 from ...identify import PhaseSpec
 from ...identify.calibration import calibrate
@@ -80,6 +80,9 @@ def _mapping(discovery: Discovery) -> Iterator[str]:
             yield from _comment(discovery.reading) if key == "files" else ()
             known = "" if key == "files" else CsvMapping.model_fields[key].description or ""
             yield _line(key, value, discovery.notes.get(key, known))
+    for column in discovery.columns:
+        if column.part is ColumnPart.LEFT_OUT:
+            yield from _comment(f"left out: column {column.reference!r} ({column.why})")
     by_name = {c.name: c for c in discovery.columns}
     for channel in discovery.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
@@ -155,7 +158,10 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     validate_config(tomllib.loads(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    return _lines(population, discovery, proposal, findings, out)
+    until = " --until identify" if len(population.units) < FEWEST else ""
+    lines = [repr(population), *([discovery.reading] if discovery else []), f"lifting: {proposal.why}"]
+    lines += [f"looks wrong: {text}" for text in findings]
+    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
 
 
 def _source(source: Path, out: Path) -> str:
@@ -215,35 +221,3 @@ def _calibrates(population: Population, facts: RecordingFacts, spec: PhaseSpec) 
     except IdentificationError as error:
         log.info("%s", error)
         return False
-
-
-def _lines(
-    population: Population, discovery: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path
-) -> list[str]:
-    """Return what people read at the terminal."""
-    units, counts = population.unit_ids, [len(keys) for _, _, keys in population.groups()]
-    each = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-    number = f"{len(units)} unit{'s' * (len(units) != 1)} ({some(units, 6)})"
-    episodes = f"{len(population.episodes)} episodes ({each} for each unit and condition)"
-    period = f"every {population.sample_period_s:g} s"
-    lines = [f"{number}, conditions {', '.join(population.conditions)}, {episodes}, {period}"]
-    if discovery is not None:
-        lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
-    functions = "; ".join(proposal.lifting.get("functions", ()))
-    lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
-    lines += [f"looks wrong: {text}" for text in findings]
-    until = " --until identify" if len(units) < FEWEST else ""
-    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
-
-
-def column_lines(columns: Sequence[TableColumn]) -> list[str]:
-    """Return one line a column: what it is taken for, its channel and its unit of measure."""
-    names = {c: f"{c.name}{f' [{c.unit}]' if c.unit else ''}" for c in columns}
-    width = max(len(n) for n in names.values())
-    lines = []
-    for part in ColumnPart:
-        for column in (c for c in columns if c.part is part):
-            came = f"column {column.reference!r}" if column.reference != column.name else ""
-            why = f"({column.why})" if part is ColumnPart.LEFT_OUT else ""
-            lines.append(f"  {part.value:<9} {names[column]:<{width}}  {came}  {why}".rstrip())
-    return lines

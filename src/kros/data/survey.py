@@ -85,7 +85,7 @@ class RecordingFacts:
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        facts["digests"] = [self.digests.get(key, "") for key in (*self.train, *self.test)]
+        facts["digests"] = {part: [self.digests.get(key) for key in facts[part]] for part in _PARTS}
         return facts | {part: [astuple(key) for key in facts[part]] for part in _PARTS}
 
     @classmethod
@@ -94,8 +94,9 @@ class RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
         parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
-        digests = zip((*parts["train"], *parts["test"]), content["digests"], strict=True)
-        return TypeAdapter(cls).validate_python({**content, **parts, "digests": dict(digests)})
+        pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
+        digests = {key: text for key, text in pairs if text}
+        return TypeAdapter(cls).validate_python({**content, **parts, "digests": digests})
 
 
 @dataclass(frozen=True)

@@ -223,14 +223,9 @@ class FieldRecordings:
     def _parameters(self) -> Values:
         return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
 
-    def batches(self, keys: tuple[EpisodeKey, ...]) -> Iterator[Arriving]:
-        """Read episodes, long ones one by one, so that memory does not grow with their number."""
-        start, count = 0, 1
-        while start < len(keys):
-            episodes = {key: self.population.read(key) for key in keys[start : start + count]}
-            batch = arriving(self.observer, self.population, episodes, self._parameters)
-            start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
-            yield batch
+    def arriving(self, key: EpisodeKey) -> Arriving:
+        """Read one episode as it arrives at the observer."""
+        return arriving(self.observer, self.population, {key: self.population.read(key)}, self._parameters)
 
     def estimates(self) -> Iterator[Estimated]:
         """Run the observer over all episodes: short ones side by side, long ones in blocks."""

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rounding import ITERATED
 from .population import EpisodeKey
 
 Array = npt.NDArray[np.float64]
@@ -122,7 +123,7 @@ def _width(signal: Array) -> float:
 
 def smallest_step(signal: Array) -> float:
     """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
-    steps, floor = np.abs(np.diff(signal)), 1e-9 * float(np.abs(signal).max())
+    steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     return smallest if np.isfinite(smallest) else floor
 

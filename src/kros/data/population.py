@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property, lru_cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -106,7 +106,7 @@ class EpisodeKey:
         return f"episode {self.episode} of unit {self.unit} ({self.condition})"
 
 
-@lru_cache(maxsize=1 << 16)
+@cache
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders ``2`` before ``10``."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)

@@ -108,13 +108,12 @@ def assemble(
     if channels != columns_in_order(channels):
         roles = [(c.name, c.role.value) for c in channels]
         raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
-    order = [(tuple((natural_key(name), name) for name in astuple(key)), key) for key in recordings.places]
-    episodes = tuple(key for _, key in sorted(order, key=lambda pair: pair[0]))
+    episodes = tuple(sorted(recordings.places, key=lambda key: [(natural_key(name), name) for name in astuple(key)]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
-    head = next(recordings.blocks(episodes[0], HEAD)) if sample_period_s is None else None
-    period = sample_period_s if head is None else estimate_period(head)
-    period = check_period(period, "Population")
+    if sample_period_s is None:
+        sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
+    period = check_period(sample_period_s, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
     about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
     population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
@@ -210,7 +209,7 @@ def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey
     read = source.recordings
     settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
     about = (source.channels, source.period_s, source.steps, source.gaps)
-    stamp, how = lru_cache(maxsize=64)(stamp_of), digest_of(about, type(read).__name__, settings, declared)
+    stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
 
     def mark(keys: Sequence[EpisodeKey]) -> str | None:
         files = [read.file(read.places[key]) for key in keys]

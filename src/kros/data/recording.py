@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ..core import limits
 from ..core.errors import DataError
 from ..core.files import shortened
+from ..core.rounding import AGREED, ROUNDING
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 Float = npt.NDArray[np.float64]
@@ -32,10 +33,10 @@ class CheckRule:
 
     time: float = 1e-3  # largest deviation of one time step, in sampling periods
     period: float = 1e-4  # largest relative difference of the sampling periods of two episodes
-    end: float = 1e-6  # of a sample: how far rounding may move the end of an even grid
+    end: float = AGREED  # of a sample: how far rounding may move the end of an even grid
     samples: int = 3  # fewest: two consecutive states and one more
     wild: float = 1e3  # times the size of a channel, from which on a sample is wild
-    constant: float = 1e-12  # of the largest value: what filters and scales make of a constant
+    constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
     # sampling periods outside are usual for a time in ms or us that is taken for seconds
     shortest_s: float = 1e-6
     longest_s: float = 0.5

@@ -44,10 +44,13 @@ class TableHead:
 
     def timestamp(self, column: int) -> str | None:
         """Return the order of the date where a column holds timestamps, or None."""
+        cells = [c for c in self.cells(column) if c]
+        if not cells or not all(map(_CLOCK.match, cells)):
+            return None
         import pyarrow as pa
 
-        cells = pa.array([c for c in self.cells(column) if c], pa.string())
-        return next((order for order in ORDERS if len(cells) and np.isfinite(microseconds(cells, order)).all()), None)
+        times = (microseconds(pa.array(cells), order) for order in ORDERS)
+        return next((order for order, values in zip(ORDERS, times, strict=True) if np.isfinite(values).all()), None)
 
 
 def look_at(path: Path) -> TableHead:

@@ -81,13 +81,10 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     files = {relative: path for path, relative in csv_files(source)}
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not selected:
-        there = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
-        advice = (
-            there
-            if files
-            else f"there are no files of recordings ({', '.join(ENDINGS)}); save text such as CSV, or use kros.from_frame"
-        )
-        raise DataError(f"Looking at {source}: {advice}.")
+        problem = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
+        if not files:
+            problem = f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV, or use kros.from_frame"
+        raise DataError(f"Looking at {source}: {problem}.")
     return selected
 
 

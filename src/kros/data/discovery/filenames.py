@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 
 from ..population import OUTLIERS
 
@@ -163,19 +163,20 @@ def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequ
 
 
 def _contiguous(roles: Roles) -> Roles:
-    """Keep of every role one stretch of places, with text between; later places become episodes."""
+    """Keep of every role one stretch of places, with text between; others become episodes, or are not needed."""
     for role in (GROUP, UNIT, CONDITION, EPISODE):
-        places = [i for i, r in enumerate(roles) if r == role]
-        if len(places) < 2:
-            continue
-        first, last = places[0], places[-1]
-        if all(r in (role, None) for r in roles[first : last + 1]):
-            roles[first : last + 1] = [role] * (last + 1 - first)
-        elif role is EPISODE:
-            for i in places[:-1]:
-                roles[i] = role if all(r in (role, None) for r in roles[i:last]) else "other"
-        else:
-            return _contiguous([EPISODE if i in places[1:] else r for i, r in enumerate(roles)])
+        runs: list[list[int]] = [[]]
+        for i, r in enumerate(roles):
+            if r == role:
+                runs[-1].append(i)
+            elif r is not None:
+                runs.append([])
+        runs = [run for run in runs if run]
+        if runs:
+            places = runs.pop(-1 if role is EPISODE else 0)
+            roles[places[0] : places[-1] + 1] = [role] * (places[-1] + 1 - places[0])
+        for i in chain(*runs):
+            roles[i] = "other" if role is EPISODE else EPISODE
     return roles
 
 

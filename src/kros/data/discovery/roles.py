@@ -15,6 +15,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import AGREED
 from ..recording import CHECK
 
 Array = npt.NDArray[np.float64]
@@ -138,7 +139,7 @@ def clean_unit(text: str) -> str:
 def unit_of_factor(factor: float, unit: str) -> str:
     """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
     sizes = ((name, size) for name, (size, base) in _TO_RADIANS.items() if base == unit)
-    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=1e-6)), "")
+    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=AGREED)), "")
 
 
 def identifier(text: str, taken: Collection[str] = ()) -> str:

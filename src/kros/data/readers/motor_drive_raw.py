@@ -26,8 +26,8 @@ from .tables import from_numpy
 
 GEAR_RATIO = 100
 RADIANS = math.pi / 180 / GEAR_RATIO  # at the gear's output of a degree at the motor
-PERCENT = 0.01
-PERIOD_S = 1e-3
+PERCENT = 1 / 100
+PERIOD_S = 1 / 1000
 REST = 1000  # samples at rest before an episode; in the second half of them the position is at its target
 LAG = 1  # samples by which targets lag the measurements
 STAMP = "20230101T000000"  # of the folders that are written

@@ -103,7 +103,7 @@ def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> I
             yield pa.Table.from_batches([part])
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def _metadata(path: Path, version: tuple[int, int]) -> Any:
     """Return the description of all row groups of a file, which are read one by one."""
     from pyarrow import parquet
@@ -217,7 +217,8 @@ def group_file(unit: str, condition: str) -> str:
     """Return the name of the file of one unit and condition; different ids never share a name."""
     name = f"{quote(unit, safe='')}@{quote(condition, safe='')}"
     if len(name) > LONGEST_NAME:
-        name = f"{name[: LONGEST_NAME - 65]}~{sha256(name.encode()).hexdigest()}"
+        digest = f"~{sha256(name.encode()).hexdigest()}"
+        name = name[: LONGEST_NAME - len(digest)] + digest
     return f"{name}.parquet"
 
 

@@ -23,7 +23,7 @@ from ...core.files import pass_on_shortage, require_regular, shortened
 Array = npt.NDArray[np.float64]
 # cells of spreadsheets without a number
 ABSENT = ("-", "--", "---", *["#DIV/0!", "#NUM!", "#REF!", "#VALUE!", "#WERT!", "#ZAHL!", "#BEZUG!", "#NV"])
-BLOCK = 1 << 22  # bytes that Arrow parses at once; a line has to fit into two
+BLOCK = 4 << 20  # bytes that Arrow parses at once; a line has to fit into two
 HEAD = 1 << 18  # bytes of a file that say how it is written, and what its columns are called
 TIMESTAMP_SCALE = 1e-6  # timestamps are read in microseconds, which doubles hold exactly
 _STAMP = r"^\s*(?P<whole>.*:\d{2})(?:[.,:](?P<fraction>\d{1,9}))?(?:Z|[+-]\d{2}:?\d{2})?\s*$"

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
+from ...core.rounding import AGREED
 from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
@@ -85,7 +86,7 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
             both = f"is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
             advice = "declare a scale step, or leave the unit out where it is only written differently"
             raise DataError(f"Channels: {channel.name} {both}; {advice}.")
-    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
+    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=AGREED):
         both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
         raise DataError(f"Sampling period: {both}; declare a resample step.")
 

@@ -43,7 +43,8 @@ Texts = dict[str, str]  # by unit
 # Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
-_BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer
+_BLOCK = 50_000  # samples of an episode that are run at once
+_BATCH, _SAMPLES = 64, 4 * _BLOCK  # shorter episodes that run side by side, and their samples
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:

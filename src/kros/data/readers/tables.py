@@ -44,7 +44,9 @@ class Dialect:
 
 def file_fields(path: Path, dialect: Dialect) -> list[str]:
     """Return the names of a table's columns, or the first numbers where it has no header."""
-    lines = lines_of(head_of(path), dialect.encoding, path)[dialect.skip_rows :]
+    needed = dialect.skip_rows + dialect.unit_rows + 2
+    lines = lines_of(head_of(path, 1000 * needed), dialect.encoding, path)
+    lines = (lines if len(lines) > needed else lines_of(head_of(path), dialect.encoding, path))[dialect.skip_rows :]
     if not lines or not lines[0].strip():
         raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
     if "\0" in lines[0]:
@@ -59,16 +61,16 @@ def file_fields(path: Path, dialect: Dialect) -> list[str]:
     return fields if width < 2 or any(spare) else (fields + [""] * width)[:width]
 
 
-def head_of(path: Path) -> bytes:
+def head_of(path: Path, size: int = HEAD) -> bytes:
     """Return the first bytes of a text file, without a last line that is cut."""
     with opened(path) as file:
         content = b""
-        while len(content) < HEAD and (more := file.read(HEAD - len(content))):
+        while len(content) < size and (more := file.read(size - len(content))):
             content += more
     ends = max(content.rfind(b"\n"), content.rfind(b"\r"))
-    if len(content) < HEAD or b"\0" in content:
+    if len(content) < size or b"\0" in content:
         return content
-    if ends < 0:
+    if ends < 0 and size == HEAD:
         problem = f"a line at the start is longer than {HEAD} bytes, so this is no table of text"
         raise DataError(f"Reading {path}: {problem}; check the file and its line ends.")
     return content[: ends + 1]
@@ -209,7 +211,7 @@ def microseconds(column: Any, order: str) -> Array:
     time = pc.coalesce(*(pc.strptime(whole, format=f, unit="s", error_is_null=True) for f in forms))
     fraction = pc.cast(pc.binary_join_element_wise("0.", pc.struct_field(parts, "fraction"), ""), pa.float64())
     seconds = pc.cast(pc.cast(time, pa.int64()), pa.float64())
-    return (to_numpy(seconds) + 0.0) / TIMESTAMP_SCALE + np.nan_to_num(to_numpy(fraction)) / TIMESTAMP_SCALE
+    return to_numpy(seconds) / TIMESTAMP_SCALE + np.nan_to_num(to_numpy(fraction)) / TIMESTAMP_SCALE
 
 
 # Between NumPy and Arrow through bare buffers: the ways of pyarrow import pandas, which costs half a second.

@@ -156,10 +156,9 @@ def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequ
         if roles[i] is None and before and all(numbered):  # batch2/motor7: the batch is part of the name
             roles[i] = UNIT
         elif roles[i] is None:
-            few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i]) and i != varying[-1]
             labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
             free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
-            roles[i] = CONDITION if (before or few) and CONDITION not in roles else free
+            roles[i] = CONDITION if before and CONDITION not in roles else free
 
 
 def _contiguous(roles: Roles) -> Roles:

@@ -48,7 +48,8 @@ def file_fields(path: Path, dialect: Dialect) -> list[str]:
     lines = lines_of(head_of(path, 1000 * needed), dialect.encoding, path)
     lines = (lines if len(lines) > needed else lines_of(head_of(path), dialect.encoding, path))[dialect.skip_rows :]
     if not lines or not lines[0].strip():
-        raise DataError(f"Reading {path}: the file is empty or starts with an empty line; remove it or restore it.")
+        problem = f"the file is empty, or has no line {dialect.skip_rows + 1}, where its columns should begin"
+        raise DataError(f"Reading {path}: {problem}; restore it, or correct skip_rows.")
     if "\0" in lines[0]:
         problem = "holds NUL bytes, so it is binary or UTF-16"
         raise DataError(f"Reading {path}: {problem}; convert it to text in UTF-8, or name the encoding.")

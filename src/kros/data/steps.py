@@ -194,15 +194,15 @@ class Offset(Step):
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
-        column, reference = self.columns((self.channel, self.reference), channels)
+        columns = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
             needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
             actual = f"the episode has {len(recording.values)}"
             raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
-        window = recording.values[self.start : self.stop]
-        check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
+        window = recording.values[self.start : self.stop, columns]
+        check_finite(window, recording.key, [channels[i] for i in columns], first=self.start)
         values = recording.values.copy()
-        values[:, column] += np.mean(window[:, reference] - window[:, column])
+        values[:, columns[0]] += np.mean(window[:, 1] - window[:, 0])
         return replace(recording, values=values)
 
 
@@ -339,7 +339,7 @@ def lowpass(values: Float, cutoff: float) -> Float:
     from scipy.signal import convolve, firwin
 
     taps = firwin(2 * half + 1, 2 * cutoff, window="hamming")[:, None]
-    padded = np.concatenate([2 * values[0] - values[half:0:-1], values, 2 * values[-1] - values[-2 : -half - 2 : -1]])
+    padded = np.pad(values, ((half, half), (0, 0)), "reflect", reflect_type="odd")
     return np.asarray(convolve(padded, taps, mode="valid"))
 
 

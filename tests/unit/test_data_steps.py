@@ -139,6 +139,11 @@ def test_differentiate_adds_a_state_with_the_derivative() -> None:
     result = moved.read(KEY)
     np.testing.assert_allclose(result[100:-100, 2], 2 * np.cos(2 * time)[100:-100], atol=1e-2)
     np.testing.assert_array_equal(result[:, 3], time)
+    true = prepare(population(values, 0.01), [steps.Differentiate("x", "v", 5.0, "deg/s", of="y")])
+    assert [(c.name, c.of) for c in true.truths] == [("v", "y")]
+    of_state, truth = true.read_with_truths(KEY)
+    np.testing.assert_array_equal(truth[:, 0], result[:, 2])
+    np.testing.assert_array_equal(of_state, values)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +156,7 @@ def test_differentiate_adds_a_state_with_the_derivative() -> None:
         (steps.Trim(start=-1), "0 <= start < stop and tail >= 0"),
         (steps.Resample(0.0), r"period_s > 0, found 0\.0"),
         (steps.Differentiate("x", "y", 1.0), "would add 'y', which is there already"),
+        (steps.Differentiate("x", "v", 1.0, of="u"), "needs as `of` a state without a truth, found 'u'"),
     ],
 )
 def test_steps_that_do_not_fit_are_refused_before_reading(step: steps.Step, message: str) -> None:

@@ -331,7 +331,9 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"{problem}; declare measured = true for at least one.")
     if not population.inputs:
         roles = [(c.name, c.role.value) for c in population.columns]
-        raise DataError(f"No channel has the role 'input', found {roles}: models need what drives a machine; declare it.")
+        raise DataError(
+            f"No channel has the role 'input', found {roles}: models need what drives a machine; declare it."
+        )
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
     if len(units) < 2 and not allow_single:

@@ -318,7 +318,9 @@ class Differentiate(Step):
             raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
         taken = [c.of for c in channels if c.of]
         if self.of and (self.of in taken or self.of not in [c.name for c in channels if c.role is Role.STATE]):
-            raise ConfigError(f"Step 'differentiate' needs as `of` a state without a truth, found {self.of!r}; name one.")
+            raise ConfigError(
+                f"Step 'differentiate' needs as `of` a state without a truth, found {self.of!r}; name one."
+            )
         added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
         role, at = (Role.TRUTH, len(channels)) if self.of else (Role.STATE, _n_states(channels))
         channels = (*channels[:at], Channel(self.name, role, self.unit, of=self.of), *channels[at:])

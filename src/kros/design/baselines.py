@@ -11,9 +11,9 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data import EpisodeBatch
+from ..data.batch import hold_missing
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
-from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
 from ..observer import Seen
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed

@@ -168,11 +168,6 @@ class RunFolder:
         """Name of the deployed observer, where there is one."""
         return self._record("observers/observers.json").get("deployed")
 
-    @property
-    def disturbed(self) -> dict[str, Any]:
-        """Errors on disturbed measurements; empty where the study does not ask for them."""
-        return self._record("disturbed/disturbed.json")
-
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Errors of all observers and models."""

@@ -32,7 +32,6 @@ class Drawing:
     zoom: int = 300  # samples at constant speed that are enlarged
     settled: float = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
     diverged: float = 1e3  # ranges of the signal: a larger error is not drawn
-    diverged_percent: float = 400.0  # error on disturbed measurements that is not drawn
     segment: int = 1024  # samples of a spectrum
     concentrated: float = 0.8  # concentration below which the segments of a unit disagree on its phase
 

@@ -11,6 +11,7 @@ from typing import Any
 from ..core.artifacts import load_artifact, plain, read_json
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
+from ..observer.sensor_gains import sensor_gains
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel
 from .config import Stage
@@ -171,14 +172,15 @@ def _deployment(context: Context) -> dict[str, Any]:
         "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
         "functions": list(observer.lifting.functions),
         "states": observer.lifting.n_states + observer.controller.n_states,
-        "sensor": observer.about.get("sensor", {}),
+        "sensor": observer.about["sensor"],
+        "sensor_gains": sensor_gains(observer, observer.about["largest_in_training"]),
     }
     return {"deployment": content}
 
 
 def _evaluation(context: Context) -> dict[str, Any]:
-    """Errors on held-out episodes, disturbed or not, of the load, and of recorded states where truth is recorded."""
-    store, evaluated = context.store, context.evaluation
+    """Errors on held-out episodes, of the load, and of recorded states where truth is recorded."""
+    evaluated = context.evaluation
     free = {name: {"freerun_error_percent": errors} for name, errors in evaluated["free_run"].items()}
     entries: dict[str, Any] = {
         "models": {name: entry | free[name] for name, entry in _models(context)["models"].items()},
@@ -186,8 +188,6 @@ def _evaluation(context: Context) -> dict[str, Any]:
         "evaluation": evaluated["rows"],
         "intervals": interval_rows(evaluated["rows"]),
     }
-    if store.holds("disturbed", "disturbed.json"):
-        entries["robustness"] = load_artifact(store.path("disturbed"), "disturbed")[0]["robustness"]
     return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if "recorded" in evaluated else {})
 
 

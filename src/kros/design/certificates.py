@@ -28,7 +28,6 @@ from ..observer.simulate import run_observers
 from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
-from ..synthesis.worst_case.unit_check import unit_ratios
 from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
@@ -231,7 +230,7 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
 
 
 def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
-    """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
+    """Return what holds for an observer on every member of the set."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
     facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
@@ -245,9 +244,7 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
         errors, mean = error_maps(task, design, problem)
         facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))
         bound = certify_errors(problem, errors, mean)[0]
-        if observer.bank is None:
-            facts |= of_units(task, design, problem)
-        else:
+        if observer.bank is not None:
             facts["constant_h2"] = float(np.linalg.norm(mean))
             facts["worst_case_h2_attained"] = attained(problem, errors, mean)
             require_useful(problem, observer, bound)
@@ -274,12 +271,3 @@ def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tu
     estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
     weight = problem.performance.frequency_response([0.0])[0].real
     return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
-
-
-def of_units(task: DesignTask, design: Design, problem: ObserverProblem) -> dict[str, Any]:
-    """Return whether the bound holds for the models of all units."""
-    ratios = unit_ratios(problem, design.synthesis.controller, task.models.systems(task.covered))
-    of_norm, of_density = (float(ratio.max(initial=0.0)) for ratio in ratios)
-    if of_norm > 1:
-        log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, of_norm)
-    return {"bound_holds": of_norm <= 1, "unit_to_h2_bound_max": of_norm, "unit_to_density_max": of_density}

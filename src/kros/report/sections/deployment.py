@@ -16,9 +16,9 @@ _ERRORS = {
     "bounded": "any error of at most this size, such as rounding",
 }
 _GAINS = (
-    "From gains of the observer's linear part, beyond what the recordings already contain: the H2 norm for white noise, "
-    "the gain at zero frequency for an offset, the sum of the absolute impulse response for bounded errors. An estimate "
-    "at its limit errs less."
+    "The table is computed from gains of the observer's linear part: the H2 norm for white noise, the gain at zero "
+    "frequency for an offset, the sum of the absolute impulse response for bounded errors. They come on top of what the "
+    "recordings already contain."
 )
 
 
@@ -43,8 +43,7 @@ def deployment(facts: Facts) -> Section | None:
 def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
     """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
     rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
-    columns = [Column("error of", [axis_label(c, facts.unit(c)) for c, _, _ in rows])]
-    columns += [Column("kind", [_ERRORS[kind] for _, kind, _ in rows])]
+    columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
     for state in (s for s in entry.get("estimates", ()) if s not in entry["measured"]):
         sizes = [0.01 * entry["largest"][c] / of[state] if of[state] else None for c, _, of in rows]
         columns.append(Column(words(state), sizes))

@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, SynthesisError
-from ..data import EpisodeBatch
 from ..data.batch import hold_missing
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
@@ -21,7 +20,7 @@ from ..observer.baselines.extended_kalman import ExtendedKalman, start_covarianc
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
-from ..observer.screen import Screen, Screened
+from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
 
@@ -56,16 +55,11 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    restarts: bool = True
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
-    def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
-        """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        return self.estimate(batch.keys, batch.measurements(self.measured), batch.inputs, parameters)
-
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
-        """Estimate episodes from measurements and inputs, shape (n_samples, batch, q) and (..., m), NaN where lost."""
+        """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
         units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
             units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
@@ -75,27 +69,10 @@ class Baseline:
             estimator, some = self.by_unit[unit], samples.of(rows)
             if isinstance(estimator, ExtendedKalman):
                 parts.append(estimator.run(some.y, some.u, values, some.starts))
-            elif self.restarts:
-                parts.append(restarted(estimator, some, values))
             else:
-                parts.append(estimator.run(some.y, some.u, values))
+                parts.append(estimator.run(hold_missing(some.y), some.u, values))
         estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
-
-
-def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, missing measurements held, every member again from each sample at which it starts again."""
-    n_samples, batch = samples.starts.shape
-    estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
-    for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
-        members = np.flatnonzero(samples.starts[begin])
-        again = samples.starts[begin + 1 :, members]
-        lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
-        rows = slice(begin, int(np.max(lasts)) + 1)
-        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
-        y, u = hold_missing(samples.y[rows, members]), samples.u[rows, members]
-        estimate[begin + 1 : rows.stop, members] = estimator.run(y, u, part)[1:]
-    return estimate
 
 
 def make_extended(
@@ -220,7 +197,7 @@ def make_mean_profile(
 
     by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
     facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
-    return Baseline(by_unit, measured, estimated, facts, restarts=False, seen=training.seen)
+    return Baseline(by_unit, measured, estimated, facts, seen=training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:

@@ -75,9 +75,7 @@ class Baseline:
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
 
-def make_extended(
-    training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
-) -> Baseline:
+def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
     """Tune the extended Kalman filter of a nominal model: process noise of many sizes, all run side by side."""
     batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
@@ -90,20 +88,20 @@ def make_extended(
         models.B[row],
         models.measured,
         models.recorded_inputs,
-        np.stack([10**level * shape for level in settings.levels]),
+        np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
-    short = batch.head(settings.extended_samples)
+    short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
     first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
     if not np.isfinite(bounded[first]).all():
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
-    facts = {"status": "tuned", "process_noise_level": 10 ** settings.levels[first]}
+    facts = {"status": "tuned", "process_noise_level": 10 ** DEFAULT.levels[first]}
     tuned = {"": replace(filters, Q=filters.Q[first])}
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
@@ -176,27 +174,25 @@ def make_mean_profile(
     measured: tuple[int, ...],
     population: Population,
     keys: Iterable[EpisodeKey],
-    settings: BaselineSettings = DEFAULT,
 ) -> Baseline:
     """Average the states of training episodes that have the same motions, over units, and without each unit."""
-    n, same = len(population.states), settings.same_motion
+    n, same = len(population.states), DEFAULT.same_motion
     estimated = tuple(i for i in range(n) if i not in measured)
     if not population.inputs or not estimated:
         raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
     motions = different_motions(population, keys, same)
-    means, closest, episodes = unit_means(training, list(motions.values()), estimated, same)
-    for key, of_units, apart in zip(motions, means, closest, strict=True):
+    means = unit_means(training, list(motions.values()), estimated, same)
+    for key, of_units in zip(motions, means, strict=True):
         if len(of_units) < 2:
             reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
-            distance = f"{100 * apart:.3g} % of the largest (RMS), at most {100 * same:g} % is allowed"
-            raise DataError(f"Mean profile: {reason}; the nearest inputs differ by {distance}.")
+            raise DataError(f"Mean profile: {reason}; they may differ by {100 * same:g} % of the largest (RMS).")
 
     def without(left_out: str) -> MeanProfile:
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
         return MeanProfile(n, estimated, list(motions.values()), states)
 
     by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
-    facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
+    facts = {"status": "averaged", "motions": len(motions), "left_out": "the unit under test"}
     return Baseline(by_unit, measured, estimated, facts, seen=training.seen)
 
 
@@ -213,16 +209,14 @@ def different_motions(population: Population, keys: Iterable[EpisodeKey], same: 
 
 def unit_means(
     training: TrainingSet, motions: Sequence[Array], estimated: Sequence[int], same: float
-) -> tuple[list[dict[str, Array]], Array, int]:
-    """Return the mean states of every motion by unit, how near inputs came to it, and the episodes that were used."""
-    sizes, closest, used = largest_of(motions), np.full(len(motions), np.inf), 0
+) -> list[dict[str, Array]]:
+    """Return the mean states of every motion by unit."""
+    sizes = largest_of(motions)
     profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
     for part in training.one_by_one():
         apart = np.array([difference(motion, part.inputs[:, 0], sizes) for motion in motions])
-        closest, at = np.minimum(closest, apart), int(apart.argmin())
+        at = int(apart.argmin())
         if apart[at] <= same:
             states = held(part.states[:, 0, list(estimated)], len(motions[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
-            used += 1
-    means = [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]
-    return means, closest, used
+    return [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]

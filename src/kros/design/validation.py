@@ -36,6 +36,9 @@ class TrainingSettings:
     short: int = 2_000  # samples below which more episodes take part
 
 
+TRAINING = TrainingSettings()
+
+
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
     """Training episodes of some units, as the sensor shows them, with each unit's lifting parameters."""
@@ -45,17 +48,16 @@ class TrainingSet:
     parameters: dict[str, dict[str, float]]
     seen: Seen | None = None  # sizes in all training episodes
     sensor: Sensors = field(default_factory=dict)
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
 
     @classmethod
     def of(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
         """Take some of the first units, and of each some episodes from the first to the last."""
-        facts, settings = identified.facts, TrainingSettings()
-        units = [u for u in facts.pooled if u in models.unit_ids][: settings.units]
+        facts = identified.facts
+        units = [u for u in facts.pooled if u in models.unit_ids][: TRAINING.units]
         episodes = [facts.keys("train", u, facts.identify_on) for u in units]
         recorded = bool(episodes and episodes[0])
-        length = len(identified.population.read(episodes[0][0])) if recorded else settings.short
-        count = settings.episodes * max(1, round(settings.short / length))
+        length = len(identified.population.read(episodes[0][0])) if recorded else TRAINING.short
+        count = TRAINING.episodes * max(1, round(TRAINING.short / length))
         return cls._of(identified, models, units, [k for keys in episodes for k in spread(keys, count)], sensor)
 
     @classmethod
@@ -96,7 +98,7 @@ class TrainingSet:
 
     def read(self) -> EpisodeBatch:
         """Read the episodes, cut short."""
-        return self._shown(self.keys, self.settings.samples)
+        return self._shown(self.keys, TRAINING.samples)
 
     def read_whole(self) -> EpisodeBatch:
         """Read the episodes."""

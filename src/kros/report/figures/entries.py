@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...identify import ModelSet
-from ...uncertainty import Form, UncertainModel
-from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ...uncertainty import Form
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
@@ -27,17 +27,6 @@ def short(name: str) -> str:
     """Return a signal's name for a title; of a formula the outer function."""
     text = name if len(name) <= 16 or "(" not in name else f"{name.partition('(')[0]}(…)"
     return shorten(words(text), 18)
-
-
-def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
-    """Return the residuals of all units relative to the weights of an uncertain model."""
-    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.points)]
-    scale = model.input_scale / model.output_scale[:, None]
-    responses = models.systems(model.unit_ids).frequency_response(freqs) * scale
-    nominal_response = model.scaled_nominal().frequency_response(freqs)
-    units = dict(zip(model.unit_ids, responses, strict=True))
-    nominal = model.nominal_id, nominal_response
-    return unit_residuals(model.form, nominal, units, model.weight, freqs, model.sample_period_s)
 
 
 def differing(residuals: UnitResiduals) -> list[int]:

@@ -203,14 +203,11 @@ def references(channels: Sequence[Channel]) -> dict[str, int]:
 
 
 def steady_window(signals: Signals, shown: Shown) -> slice:
-    """Return a window in the longest stretch of the highest steady reference, else in the middle of the episode."""
+    """Return a window that begins where the reference is fastest, in the middle of the episode where there is none."""
     columns, samples = references(signals.channels), len(shown.time_s)
     size = max(min(signals.window, samples), 2)
-    speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(samples)
-    start, stop = max(steady_stretches(speed), key=lambda r: r[1] - r[0], default=(0, 0))
-    middle = (start + stop) // 2 if stop - start > size // 2 else samples // 2
-    first = min(max(middle - size // 2, 0), samples - size)
-    return slice(first, first + size)
+    first = np.abs(shown.inputs[:, columns["velocity"]]).argmax() if "velocity" in columns else (samples - size) // 2
+    return slice(min(int(first), samples - size), min(int(first), samples - size) + size)
 
 
 def steady_stretches(speed: Array) -> list[tuple[int, int]]:

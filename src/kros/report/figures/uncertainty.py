@@ -9,7 +9,7 @@ import numpy as np
 from ...core.errors import ConfigError
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
@@ -28,7 +28,7 @@ from ..canvas import (
 from ..names import best_models, model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
-from .entries import beside, differing, entries_figure, entry_names
+from .entries import differing, entries_figure, entry_names
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -187,4 +187,4 @@ def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
     if name not in models.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
     model, identified = models.sets[name], models.models.models(name)
-    return weights_figure({name: (model, identified, beside(model, identified))})
+    return weights_figure({name: (model, identified, residuals_beside_weights(identified, model))})

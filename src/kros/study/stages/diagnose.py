@@ -24,7 +24,7 @@ from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, residual
 from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.nominal import choose_nominal
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
@@ -52,7 +52,7 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
     tasks: list[Task] = [(folder / k / "noise", _noise(context, k, sets[k])) for k in models.edmd_kinds if k in sets]
-    tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
+    tasks += [(folder / k / "units", partial(residuals_beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
     work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
@@ -103,19 +103,6 @@ def _compared(
     scale = models.output_scale[:, None] / models.input_scale
     freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
     return noise_share(samples, scale, freqs, dt, form, units.index(nominal))
-
-
-def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
-    """Return the residuals of all covered units beside the weights of a study."""
-    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // DEFAULT.points)]
-    return unit_residuals(
-        uncertain.form,
-        (uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)),
-        dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True)),
-        uncertain.weight,
-        freqs,
-        models.sample_period_s,
-    )
 
 
 def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:

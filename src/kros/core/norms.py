@@ -26,7 +26,7 @@ from .errors import DimensionError, KrosError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
 from .precise import precise_gain, precise_h2_norm
-from .rounding import EPS, ITERATED
+from .rounding import AGREED, EPS, ITERATED
 
 Array = npt.NDArray[Any]
 
@@ -125,7 +125,7 @@ def balanced(system: StateSpace) -> StateSpace:
     return StateSpace(system.A * size / size[:, None], system.B / size[:, None], system.C * size, system.D, system.dt)
 
 
-def hinf_norm(system: Any, tol: float = 1e-6) -> float:
+def hinf_norm(system: Any, tol: float = AGREED) -> float:
     r"""H-infinity norm (3)-(4): largest gain over all frequencies.
 
     The level :math:`\gamma` is attained exactly where the Hamiltonian matrix of the bounded-real lemma has eigenvalues

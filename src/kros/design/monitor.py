@@ -63,7 +63,11 @@ def fit_monitor(
     if len(units) < LEAST_SCORES:
         log.info("%s has no monitor: it needs %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
-    size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged in every], axis=0))
+    size = np.sqrt(
+        np.mean(
+            [np.mean(np.minimum(nu[judged] ** 2, np.sqrt(np.finfo(float).max)), axis=0) for nu, judged in every], axis=0
+        )
+    )
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()

@@ -25,8 +25,8 @@ def entry_names(form: Form, models: ModelSet) -> Names:
 
 def short(name: str) -> str:
     """Return a signal's name for a title; of a formula the outer function."""
-    text = name if len(name) <= 16 or "(" not in name else f"{name.partition('(')[0]}(…)"
-    return shorten(words(text), 18)
+    text = name if len(name) <= DRAWING.label or "(" not in name else f"{name.partition('(')[0]}(…)"
+    return shorten(words(text), DRAWING.label)
 
 
 def differing(residuals: UnitResiduals) -> list[int]:
@@ -71,7 +71,7 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             )
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, label="fitted weight")
             _mark_unit(panel, residuals, levels[..., i, j], alarm)
-            frequency_axis(panel, freqs, "", 4)
+            frequency_axis(panel, freqs, "")
             order = f"order {residuals.entry_orders[i, j]}"
             note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")

@@ -139,10 +139,10 @@ def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: S
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
         line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
-        note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
-    frequency_axis(axes, freqs_hz, "", 4)
+        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone.light)
+    frequency_axis(axes, freqs_hz, "")
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
-    axes.set_ylim(low, high + 0.2 * (high - low) * len(columns))
+    axes.set_ylim(low, high + (high - low) * len(columns) / 4)
 
 
 def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
@@ -155,7 +155,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     axes.plot(freqs, levels[first], color=Tone.INK.light)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
     axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
-    frequency_axis(axes, freqs, "", 4)
+    frequency_axis(axes, freqs, "")
 
 
 def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:

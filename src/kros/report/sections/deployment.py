@@ -45,7 +45,7 @@ def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
     rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
     columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
     for state in (s for s in entry.get("estimates", ()) if s not in entry["measured"]):
-        sizes = [0.01 * entry["largest"][c] / of[state] if of[state] else None for c, _, of in rows]
+        sizes = [entry["largest"][c] / (100 * of[state]) if of[state] else None for c, _, of in rows]
         columns.append(Column(words(state), sizes))
     return build("Error of a measurement that costs 1 % of the largest value of an estimate", columns)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.errors import ConfigError
-from ...data.population import OUTLIERS, EpisodeKey, Population, Role
+from ...data.population import Population, Role
 from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
@@ -20,20 +20,8 @@ _RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, op
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
     """Return one held-out episode of one unit in every condition, the condition of the models first."""
-    try:
-        unit = run.shown[0].key.unit
-        episodes = [s for s in run.shown if s.key.unit == unit]
-    except NotShownError:
-        groups = run.facts["groups"]
-        unit = next((u for u, group in groups.items() if group != OUTLIERS), next(iter(groups)))
-        keys = [EpisodeKey(*row) for row in reversed(run.facts["test"])]
-        episodes = [_read(run, key) for key in {k.condition: k for k in keys if k.unit == unit}.values()]
+    episodes = [s for s in run.shown if s.key.unit == run.shown[0].key.unit]
     return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
-
-
-def _read(run: RunFolder, key: EpisodeKey) -> Shown:
-    states, inputs = run.population.read_parts(key)
-    return Shown(key, np.arange(len(states)) * run.sample_period_s, states, inputs, {}, {})
 
 
 def signals(run: RunFolder) -> tuple[Figure, str]:

@@ -98,7 +98,7 @@ def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
     """Run the observer on episodes as the sensor shows them, and return those in which something is judged."""
-    batch = training.read_whole()
+    batch = training.read(None)
     y = batch.measurements(observer.measured)
     nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
     episodes = [(nu[:n, i].copy(), judged[:n, i].copy()) for i, n in enumerate(batch.lengths)]

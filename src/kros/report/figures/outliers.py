@@ -48,7 +48,7 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
-            note(axes, score.unit, (place, score.score_db), (8, 4), xycoords="data", va="bottom", color=tone.light)
+            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone.light)
     if np.isfinite(model.threshold_db):
         axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"

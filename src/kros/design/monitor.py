@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -91,9 +90,8 @@ def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[
     units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
     for unit, condition in (group for group in groups if group[0] in units):
         keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
-        parts: dict[str, Any] = {"population": training.population.select([unit], [condition])}
-        parts |= {"parameters": {unit: training.parameters.get(unit, {})}}
-        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), **parts)
+        population = training.population.select([unit], [condition])
+        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), population=population)
 
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:

@@ -14,16 +14,15 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms
+from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen
 from ..observer.sensor import Sensors, in_units
-from ..observer.simulate import run_observers
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
-SIDE_BY_SIDE = 20  # observers, which keeps a study of twelve units below 200 MB
 
 
 @dataclass(frozen=True)
@@ -104,9 +103,8 @@ class TrainingSet:
 
 def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     """Return the errors of observers of one model of every recorded state, shape (observer, n), see `compare`."""
-    values, y = observers[0].own(batch.parameters), batch.measurements(observers[0].measured)
-    parts = (observers[start : start + SIDE_BY_SIDE] for start in range(0, len(observers), SIDE_BY_SIDE))
-    return np.concatenate([compare(run_observers(some, y, batch.inputs, values), batch) for some in parts])
+    run, y = observers_run(observers), batch.measurements(observers[0].measured)
+    return np.concatenate([compare(some, batch) for some in run(batch.keys, y, batch.inputs, batch.parameters)])
 
 
 def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:

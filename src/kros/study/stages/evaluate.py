@@ -53,12 +53,10 @@ def run(context: Context) -> None:
         "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": band,
-        "roles": roles,
         "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in episodes.shown)],
         "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
         **episodes.recorded_rows(roles),
     }
-    content |= {"observers": list(estimates), "models": list(kinds), "states": population.states}
     arrays = _arrays(episodes, estimates, free_runs)
     save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
     run_load(context, observers)
@@ -66,9 +64,7 @@ def run(context: Context) -> None:
 
 def estimation(context: Context, episodes: HeldOut) -> Pieces:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    states = context.population.states
-    limits = sides(context.facts.limits, states)
-    makers = baseline_makers(context, episodes)
+    limits, makers = sides(context.facts.limits, context.population.states), baseline_makers(context, episodes)
     work: Pieces = {(name,): partial(of_baseline, episodes, make, limits) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):
         work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
@@ -94,7 +90,7 @@ def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
     by_name: dict[str, Outcome | str] = {}
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
-    return {name: by_name[name] for name in dict.fromkeys((*load_observers(context), *by_name))}
+    return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
 
 
 def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[], Baseline]]:

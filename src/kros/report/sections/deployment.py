@@ -17,7 +17,7 @@ _ERRORS = {
 }
 _GAINS = (
     "The table is computed from gains of the observer's linear part: the H2 norm for white noise, the gain at zero "
-    "frequency for an offset, the sum of the absolute impulse response for bounded errors. They come on top of what the "
+    "frequency for an offset, the sum of the absolute impulse response for bounded errors. They add to what the "
     "recordings already contain."
 )
 

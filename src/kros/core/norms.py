@@ -204,7 +204,9 @@ def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
     best = int(np.argmax(gains))
     bounds = nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
     options = {"xatol": ITERATED * bounds[1]}
-    peak = minimize_scalar(lambda at: -_gains(system, np.array([at]))[0], bounds=bounds, options=options)
+    peak = minimize_scalar(
+        lambda at: -_gains(system, np.array([at]))[0], bounds=bounds, method="bounded", options=options
+    )
     return max((float(peak.x), float(-peak.fun)), (float(nu[best]), float(gains[best])), key=lambda pair: pair[1])
 
 

@@ -38,15 +38,10 @@ def observers_run(observers: Sequence[Observer]) -> Run:
 
 def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
-    groups: list[tuple[Any, list[Observer]]] = []
-    for observer in observers:
-        model = observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
-        group = next((g for of, g in groups if len(g) < together and of == model), None)
-        if group is None:
-            groups.append((model, [observer]))
-        else:
-            group.append(observer)
-    return [group for _, group in groups]
+    groups: dict[Any, list[Observer]] = {}
+    for o in observers:
+        groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
+    return [g[start : start + together] for g in groups.values() for start in range(0, len(g), together)]
 
 
 @dataclass(frozen=True, eq=False)

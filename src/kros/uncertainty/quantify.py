@@ -30,6 +30,7 @@ from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import QuantifySettings
+from .unit_residuals import UnitResiduals, unit_residuals
 
 Array = npt.NDArray[Any]
 
@@ -201,3 +202,11 @@ def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
     peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
     peaks[uncertain.nominal] = -np.inf
     return uncertain.unit_ids[int(np.argmax(peaks))]
+
+
+def residuals_beside_weights(models: ModelSet, uncertain: UncertainModel, points: int = 240) -> UnitResiduals:
+    """Return the residuals of all covered units beside the weights, at about so many frequencies."""
+    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // points)]
+    nominal = uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)
+    units = dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True))
+    return unit_residuals(uncertain.form, nominal, units, uncertain.weight, freqs, models.sample_period_s)

@@ -229,7 +229,7 @@ def _reduced(plant: GeneralizedPlant, max_states: int) -> tuple[GeneralizedPlant
 def truncate(plant: GeneralizedPlant, n_states: int) -> tuple[GeneralizedPlant, float]:
     """Balanced truncation of a stable plant, and the sum of the discarded Hankel singular values over the largest."""
     B, C = np.hstack([plant.B1, plant.B2]), np.vstack([plant.C1, plant.C2])
-    roots = gramian_root(plant.A, B, plant.dt), gramian_root(plant.A.T, C.T, plant.dt)
+    roots = gramian_root(plant.A, B), gramian_root(plant.A.T, C.T)
     left, right, values = balancing(*roots, _NEGLIGIBLE)
     k = min(n_states, len(values))
     return plant.transformed(x=(left[:k], right[:, :k])), float(values[k:].sum() / values[0])

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ...core.artifacts import load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
 from ..inputs import check_scale
@@ -155,8 +155,6 @@ class OutlierModel:
     def load(cls, folder: Path) -> OutlierModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "outlier_model")
-        axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m"}
-        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
         facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"]), "threshold_db": threshold}

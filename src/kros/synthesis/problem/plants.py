@@ -77,6 +77,15 @@ def generalized_plant(problem: ObserverProblem) -> GeneralizedPlant:
     return split(system, sum(inputs.values()), sum(sizes), n_w1=m, n_z1=sizes[0])
 
 
+def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | None) -> tuple[StateSpace, StateSpace]:
+    """Return the disturbances at input and state: what the perturbation does, ``W_L w2``, and the remainder."""
+    n, m, dt = problem.nominal.n_states, problem.nominal.n_inputs, problem.nominal.dt
+    nothing = gain(np.zeros((n, 0)), dt) if remainder is None else remainder
+    if problem.location.at_input:
+        return d, nothing
+    return gain(np.zeros((m, 0)), dt), gain(np.hstack([np.eye(n)] * 2), dt) @ block_diagonal([d, nothing])
+
+
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
     """White noise (nu_d, nu_r, n, v) through shaping filters at the input and at the state."""
     q, n = len(problem.C), problem.nominal.n_states

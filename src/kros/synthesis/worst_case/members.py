@@ -3,7 +3,7 @@ r"""Lower bound of the worst case over the set: no observer does better on membe
 A constant contraction :math:`\Delta_i` gives a member of the set. On it the error is driven by the system ``D_i = W_L
 Delta_i (I - N Delta_i)^-1 M``, and the least error of any observer is the optimum of a Riccati equation. The worst case
 over the set is at least that, and at least the mean over some members: as the same observer meets all of them, the mean
-is the optimum for ``[D_1 ... D_k] / sqrt(k)``, driven by independent white noises. Nothing here depends on a grid. State
+is the optimum for ``[D_1 ... D_k] / sqrt(k)``, driven by independent white noises. Nothing depends on a grid. State
 injection contains input injection (``K_state = B K_input``), and an observer's ``W_p x_hat`` is one of the causal
 estimates of ``W_p x`` over which a predictor is the best.
 

@@ -156,7 +156,7 @@ def test_error_system_is_the_formula():
     for injection in Injection.INPUT, Injection.STATE:
         case = problem(1, injection)
         A, B, C, W_p = case.scaled
-        K = worst_case_h2(case).controller
+        K = gain(np.linspace(0.01, 0.04, case.correction_size)[:, None], DT)
         freqs = np.array([0.01, 1.0, 30.0, 400.0])
         loop = case.error_system(K).frequency_response(freqs)
         J = B if injection is Injection.INPUT else np.eye(4)
@@ -169,12 +169,11 @@ def test_error_system_is_the_formula():
             )
 
 
-@pytest.mark.parametrize("injection", [Injection.STATE, Injection.INPUT])
 @pytest.mark.parametrize("seed", [0, 1])
-def test_certificate_covers_random_members_of_the_set(injection, seed):
+def test_certificate_covers_random_members_of_the_set(seed):
     """Simulate the definition itself: random plants G (I - W_L Delta W_R)^-1 per frequency, error density summed over
     a fine grid."""
-    case = problem(seed, injection)
+    case = problem(seed)
     found = worst_case_h2(case)
     assert found.status is Status.CERTIFIED
     assert found.lower_bound <= found.worst_case_h2

@@ -44,7 +44,7 @@ def unit_ratios(problem: ObserverProblem, controller: StateSpace, units: StateSp
 
 def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p: Array) -> StateSpace:
     """Return the system from w1 to ``W_p (x - x_hat)`` for one unit, given in physical units, without noise."""
-    A, B, C, _ = problem.scaled
+    A, B, C, W_p = problem.scaled
     x, u = problem.output_scale, problem.input_scale
     n, eye, dt = len(A), np.eye(len(A)), problem.nominal.dt
     A_p, B_p = A_p * x / x[:, None], B_p * u / x[:, None]
@@ -53,14 +53,12 @@ def unit_error(problem: ObserverProblem, controller: StateSpace, A_p: Array, B_p
         "error": StateSpace(A, eye, eye, np.zeros((n, n)), dt),
         "K": problem.to_scaled(controller),
         "W_u": problem.input_weight,
-        "W_p": problem.performance,
     }
-    w1, z1 = problem.input_weight.n_inputs, problem.performance.n_outputs
+    w1 = problem.input_weight.n_inputs
     wires = {
         "unit": {"W_u": B_p},
         "error": {"unit": A_p - A, "W_u": B_p - B, "K": -problem.injection_matrix},
         "K": {"error": C},
         "W_u": {"w1": np.eye(w1)},
-        "W_p": {"error": eye},
     }
-    return interconnect(blocks, wires, {"w1": w1}, {"z1": {"W_p": np.eye(z1)}})
+    return interconnect(blocks, wires, {"w1": w1}, {"z1": {"error": W_p}})

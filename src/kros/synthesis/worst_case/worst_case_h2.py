@@ -1,11 +1,10 @@
 r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati equation.
 
 K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a
-given spectrum is a Kalman predictor (state injection) or an H2 controller (input injection). The observer is designed
-for the average spectrum of the set and certified on the set itself; where it guarantees less than no correction,
-nothing is corrected.
+given spectrum is a Kalman predictor, which corrects the state. The observer is designed for the average spectrum of the
+set and certified on the set itself; where it guarantees less than no correction, nothing is corrected.
 
-*State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
+With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
 the shaped disturbance of the state, the error is ``e = xi + r``, ``xi+ = A xi + B d - y^c``, ``y = C e + n``. The
 correction has full authority over the state, so the optimum keeps the predicted error at zero:
 
@@ -13,8 +12,7 @@ correction has full authority over the state, so the optimum keeps the predicted
     x_d^+ = A_d x_d^ + L_d y,    x_r^+ = A_r x_r^ + L_r y
 
 with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters
-only. A performance weight with states of its own makes past errors matter, which a predictor cannot mend: then, as for
-input injection, the H2 controller of the whole plant is taken.
+only.
 
 The lower bound is in `members`.
 """
@@ -32,9 +30,8 @@ from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, gain
 from ...uncertainty.weights.magnitude import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
-from ..problem.plants import penalise, shaped_plant
+from ..problem.plants import shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.h2 import h2
 from ..riccati.kalman import predictor
 from .certificate import certified
 from .disturbance import Fit, average_disturbance
@@ -54,6 +51,7 @@ def worst_case_h2(
     Parameters
     ----------
     problem : ObserverProblem
+        Its correction enters at the state, whatever its `injection`.
     max_order : int
         Highest order of each shaping filter; the smallest within `tolerance_db` is taken.
     tolerance_db : float, dB
@@ -87,6 +85,7 @@ def worst_case_h2(
     >>> observer.lower_bound <= observer.worst_case_h2, observer.gap_percent < 5
     (True, True)
     """
+    problem = replace(problem, injection=Injection.STATE)
     problem.require_sound()
     shaped = average_disturbance(problem, partial(fit, max_order=max_order, tolerance_db=tolerance_db))
     start = time.perf_counter()
@@ -115,8 +114,6 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
 def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:
     """Return the filter that is H2-optimal for shaped disturbances of input and state, in physical units."""
     plant = shaped_plant(problem, d, r)
-    if problem.injection is Injection.INPUT or problem.performance.n_states:
-        return problem.to_physical(h2(penalise(plant, problem.correction_penalty)).controller)
     A, B, _, _ = problem.scaled
     n, kd, kr = len(A), d.n_states, r.n_states
     noises = plant.B1 @ plant.B1.T, plant.D21 @ plant.D21.T, plant.B1 @ plant.D21.T

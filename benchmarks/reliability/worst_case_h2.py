@@ -227,7 +227,7 @@ def other_observers(
 def value_of(problem: ObserverProblem, K: StateSpace) -> float:
     """Certified value; infinite where there is none."""
     try:
-        return certify(problem, K, 1e-3)[0]
+        return certify(problem, K)[0]
     except SynthesisError:
         return np.inf
 

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.rounding import ITERATED, ROUNDING, TINY
+from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 
 Array = npt.NDArray[Any]
 
@@ -136,7 +136,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
         step = _line_search(float(programme.c @ direction) / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
-        if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), TINY) and decrement > _CENTRED:
+        if moved <= 4 * EPS * max(np.abs(x).max(initial=0.0), TINY) and decrement > _CENTRED:
             break
         x = x + step * direction
         mu = mu * _SHRINK if decrement < _CENTRED else mu
@@ -192,7 +192,7 @@ class _Programme:
 def _solve(hessian: Array, gradient: Array) -> Array:
     """Newton direction in units in which the Hessian has a unit diagonal, with one step of refinement."""
     scale = 1 / np.sqrt(np.diag(hessian))
-    scaled = hessian * scale[:, None] * scale + 1e-14 * np.eye(len(hessian))
+    scaled = hessian * scale[:, None] * scale + 100 * EPS * np.eye(len(hessian))
     right = gradient * scale
     direction = np.linalg.solve(scaled, right)
     direction += np.linalg.solve(scaled, right - scaled @ direction)

@@ -36,7 +36,7 @@ import numpy.typing as npt
 from ...core.linalg import balancing
 from ...core.lti import StateSpace
 from ...core.norms import gramian, h2_norm
-from ...core.rounding import TINY
+from ...core.rounding import EPS, TINY
 from ..generalized_plant import GeneralizedPlant
 from ..riccati.h2 import h2
 from .barrier import Block
@@ -78,7 +78,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
     E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
     X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
-    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > 1e-28 * np.diag(X), 0.0, np.diag(X)))
+    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > EPS**2 * np.diag(X), 0.0, np.diag(X)))
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
     size = h2_norm(plant.channel(rows, slice(None)).close(K))
     scale = np.ones(plant.sizes[3])

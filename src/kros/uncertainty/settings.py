@@ -54,7 +54,7 @@ class FitRule:
     pull: float = 1e-3  # towards the start, nepers: small, and it makes optima unique
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
     rounds: int = 5  # fits, each with the frequencies and units missed by the one before
-    deficit: float = 1.02  # ratio up to which a weight is lifted; beyond it is fitted again
+    deficit: float = 1.02  # ratio beyond which a weight is fitted again, before it is lifted
 
 
 @dataclass(frozen=True)

@@ -90,8 +90,10 @@ def disturbed(problem: ObserverProblem, d: StateSpace, remainder: StateSpace | N
 
 def shaped_plant(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> GeneralizedPlant:
     """White noise (nu_d, nu_r, n, v) through shaping filters at the input and at the state."""
-    q, n = len(problem.C), problem.nominal.n_states
-    return shape_inputs(problem.error_plant(), block_diagonal([d, r, gain(np.eye(q + n), problem.nominal.dt)]))
+    plant = problem.error_plant()
+    _, _, n_u, n_z, n_y = plant.sizes
+    rest = gain(np.eye(n_y + problem.nominal.n_states + n_u), plant.dt)  # n, v, u
+    return split(plant.open_loop() @ block_diagonal([d, r, rest]), d.n_inputs + r.n_inputs + rest.n_inputs - n_u, n_z)
 
 
 def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
@@ -109,13 +111,6 @@ def mixed_plant(problem: ObserverProblem) -> GeneralizedPlant:
     size[n] = noise
     plant = whole.transformed(w=np.diag(size)).channel(np.r_[z1, penalty, z2], np.r_[w1, n, w2])
     return replace(plant, n_w1=len(w1) + len(n), n_z1=len(z1) + len(penalty))
-
-
-def shape_inputs(plant: GeneralizedPlant, weight: StateSpace) -> GeneralizedPlant:
-    """Put a filter in front of the disturbances: w = weight * nu."""
-    _, _, n_u, n_z, _ = plant.sizes
-    shaped = plant.open_loop() @ block_diagonal([weight, gain(np.eye(n_u), plant.dt)])
-    return split(shaped, weight.n_inputs, n_z, n_z1=plant.n_z1)
 
 
 def penalise(plant: GeneralizedPlant, penalty: float) -> GeneralizedPlant:

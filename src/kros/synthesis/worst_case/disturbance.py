@@ -31,11 +31,11 @@ def average_disturbance(problem: ObserverProblem, fit: Fit) -> tuple[StateSpace,
     power = np.real(np.einsum("fii->fi", uncertain_ball(problem, freqs).average()))  # of w2
     if is_diagonal(problem.W_L):
         left = np.abs(problem.W_L.frequency_response(freqs)) ** 2
-        shaped = _filters(np.sum(left, axis=-1) * power, freqs, problem.nominal.dt, fit)
+        shaped = filters(np.sum(left, axis=-1) * power, freqs, problem.nominal.dt, fit)
     else:
-        shaped = problem.W_L @ _filters(power, freqs, problem.nominal.dt, fit)
+        shaped = problem.W_L @ filters(power, freqs, problem.nominal.dt, fit)
     rest = _remainder(problem, freqs)
-    return disturbed(problem, shaped, None if rest is None else _filters(rest, freqs, problem.nominal.dt, fit))
+    return disturbed(problem, shaped, None if rest is None else filters(rest, freqs, problem.nominal.dt, fit))
 
 
 def design_grid(problem: ObserverProblem, count: int = 400) -> Array:
@@ -71,7 +71,7 @@ def _remainder(problem: ObserverProblem, freqs_hz: Array) -> Array | None:
     return np.sum(np.abs(left) ** 2, axis=-1) * energy[:, None]
 
 
-def _filters(power: Array, freqs_hz: Array, dt: float, fit: Fit) -> StateSpace:
+def filters(power: Array, freqs_hz: Array, dt: float, fit: Fit) -> StateSpace:
     """Return one filter a channel, whose magnitude touches the root of its power, shape (f, channels), from above."""
     systems = []
     for column in power.T:

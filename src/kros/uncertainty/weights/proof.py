@@ -57,8 +57,8 @@ class Certificate:
 
     @property
     def bound(self) -> float:
-        """What no ratio exceeds, by level sets; the largest one that was evaluated, on a grid."""
-        return self.peak * (1 + PROOF.margin) if self.method is Method.LEVEL_SETS else self.peak
+        """What no ratio exceeds, by level sets; on a grid the same above the largest one that was evaluated."""
+        return self.peak * (1 + PROOF.margin)
 
 
 def certify(ratio: Ratio, freqs_hz: Array, known: Array, pencils: list[Descriptor], dt: float) -> Certificate:

@@ -45,8 +45,8 @@ class FitRule:
     covered: int = 300  # frequencies at which optimal covers are computed, between which they are interpolated
     units: int = 4  # largest residuals of a frequency in cover and fit; the check has all
     temperatures: tuple[float, ...] = (0.1, 0.03, 0.01, 0.003)  # nepers, of smoothed maxima; the last is 0.03 dB
-    steps: int = 12  # at most, at each temperature
-    scalings: int = 40  # of rows, then columns, of a cover at each of its orders
+    steps: int = 12  # at most, at each temperature, and of the search of a cover at each of its orders
+    squarings: tuple[int, ...] = (1, 3, 6)  # s of the orders 2^s + 1 of the smoothed maximum of covers
     missed_db: float = 0.05  # cost between the points of the fit that brings further ones
     farthest: float = 1.5  # nepers: largest change of a parameter in a step of the joint fit
     damping: float = 1e-2  # of its first step at a temperature

@@ -10,9 +10,9 @@ maximum over units and singular values is smoothed by a Schatten norm of order 2
 
     log s  ~  1 / (2 q) log sum_k tr (M_k M_k^H)^q,     M_k = exp(-x_l) E_k exp(-x_r)
 
-At its optimum all rows of the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`, have the same sum, and all columns.
-Sinkhorn's scaling brings them there, for all frequencies at once and with q rising to 65, and s is then recomputed
-without smoothing. A finite number of scalings keeps entries finite where residuals are triangular.
+whose gradient is the marginals of `Y * conj(M)`, `Y = (M M^H)^(q-1) M`; Newton's method runs over all frequencies at
+once with q rising to 65, and s is then recomputed without smoothing. A weak pull towards equal entries keeps the
+optimum finite where residuals are triangular, and picks the smooth one where it is not unique.
 
 Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with `||Delta_k|| <= 1` at every frequency.
 """
@@ -26,12 +26,14 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace
-from ...core.rounding import ROUNDING, TINY
 from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
-from ..settings import FIT
+from ..settings import FIT, PROOF
 from .proof import Method
 
 Array = npt.NDArray[Any]
+
+_TINY = np.finfo(float).tiny
+_STEP = np.cbrt(np.finfo(float).eps)  # nepers, of differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +53,7 @@ class Cover:
 
     def ratio(self, E: Array) -> Array:
         """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
-        left, right = (1 / np.maximum(v.T, TINY) for v in (self.left, self.right))
+        left, right = (1 / np.maximum(v.T, _TINY) for v in (self.left, self.right))
         return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
 
 
@@ -87,15 +89,15 @@ class Weight:
 def optimal_cover(E: Array) -> Cover:
     """Return the cover of residuals (unit, frequency, p', m') of least mean log magnitudes."""
     p = E.shape[2]
-    x = _optimal_shape(entries_first(E), p)
+    x = _descend(entries_first(E), p)
     right = np.exp(x[p:] - x[p:].mean(axis=0)).T
     right = right / right[:, [int(np.argmax(np.median(right, axis=0)))]]
     shape = Cover(np.exp(x[:p]).T, right)
     return Cover(shape.left * shape.ratio(E).max(axis=0)[:, None], right)
 
 
-def _optimal_shape(first: Array, p: int) -> Array:
-    """Return the optimal x, shape (p' + m', frequency), between chosen frequencies by interpolation."""
+def _descend(first: Array, p: int) -> Array:
+    """Minimise the smoothed cost over x of shape (p' + m', frequency)."""
     size = sigma_max_first(first).max(axis=0)
     alive = np.flatnonzero(size > 0)
     n = first.shape[0] + first.shape[1]
@@ -106,21 +108,57 @@ def _optimal_shape(first: Array, p: int) -> Array:
     leading = np.argsort(-sigma_max_first(E), axis=0)[: FIT.units]  # all others are covered by the scale
     E = E[:, :, np.unique(leading)]
     x = np.zeros((n, len(chosen)))
-    for squarings in range(0, 8, 2):
-        for rows in FIT.scalings * (slice(0, p), slice(p, n)):
-            step = _scaling(E * np.exp(-x[:p, None, None]) * np.exp(-x[None, p:, None]), squarings)
-            x[rows] += step[rows]
+    for squarings in FIT.squarings:
+        for _ in range(FIT.steps):
+            before, x = x, _newton(_Smooth(E, p, squarings), x)
+            if np.abs(x - before).max() < PROOF.rounding:
+                break
     return np.array([np.interp(np.arange(len(size)), chosen, row) for row in x])
 
 
-def _scaling(M: Array, squarings: int) -> Array:
-    """Return Sinkhorn's step towards equal rows and columns of the marginals, for q = 1 + 2^squarings."""
-    M = M / np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
-    wide = len(M) <= M.shape[1]
-    power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
-    for _ in range(squarings):
-        power = multiply(power, power)
-    marginal = ((multiply(power, M) if wide else multiply(M, power)) * np.conj(M)).real.sum(axis=2)
-    marginal = np.maximum(marginal / marginal.sum(axis=(0, 1)), ROUNDING)  # (p', m', frequency)
-    sides = marginal.sum(axis=1) * len(marginal), marginal.sum(axis=0) * marginal.shape[1]
-    return np.log(np.concatenate(sides)) / (2 + 2 * 2**squarings)
+@dataclass(frozen=True, eq=False)
+class _Smooth:
+    """The smoothed cost of residuals (p', m', unit, frequency)."""
+
+    E: Array
+    p: int
+    squarings: int
+
+    def cost(self, x: Array) -> tuple[Array, Array]:
+        """Return the cost, shape (frequency,), and its gradient, shape of x."""
+        p, m = self.p, len(x) - self.p
+        M = self.E * np.exp(-x[:p])[:, None, None, :] * np.exp(-x[p:])[None, :, None, :]
+        # no smaller than the largest singular value, and at most four times
+        top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
+        M = M / top
+        wide = p <= m
+        power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
+        for _ in range(self.squarings):
+            power = multiply(power, power)
+        Y = multiply(power, M) if wide else multiply(M, power)
+        marginal = (Y * np.conj(M)).real.sum(axis=2)  # over units: (p', m', frequency)
+        total = marginal.sum(axis=(0, 1))
+        log_s = np.log(top) + np.log(total) / (2 * (2**self.squarings + 1))
+        cost = x[:p].mean(axis=0) + x[p:].mean(axis=0) + log_s + FIT.pull / 2 * (x**2).sum(axis=0)
+        gradient = np.concatenate([1 / p - marginal.sum(axis=1) / total, 1 / m - marginal.sum(axis=0) / total])
+        return cost, gradient + FIT.pull * x
+
+
+def _newton(smooth: _Smooth, x: Array) -> Array:
+    """Take one Newton step, shortened where the cost does not fall; the Hessian from differences of the gradient."""
+    cost, gradient = smooth.cost(x)
+    ahead = (x + _STEP * unit[:, None] for unit in np.eye(len(x)))
+    hessian = np.stack([(smooth.cost(other)[1] - gradient).T / _STEP for other in ahead], axis=-1)
+    hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + FIT.pull / 1000 * np.eye(len(x))
+    step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
+    step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), _TINY))
+    slope = (gradient * step).sum(axis=0)
+    best, length = x, np.ones(x.shape[1])
+    pending = np.ones(x.shape[1], bool)
+    while pending.any() and length.min() > 1e-4:
+        trial = x + length * step
+        better = pending & (smooth.cost(trial)[0] <= cost + length * slope / 10)
+        best = np.where(better, trial, best)
+        pending &= ~better
+        length = np.where(pending, length / 3, length)
+    return best

@@ -263,10 +263,7 @@ class Drives:
         scale = TorqueScale.calibrated(errors[0][:, loaded], self.loads[0][:, loaded], self.dt)
         load = scale.load(errors[1])
         row = self.judged(f"{kind}, from the recorded current", load, load, None)
-        return [
-            row
-            | {"torque constant": round(scale.torque_constant, 3), "residual_percent": round(scale.residual_percent, 1)}
-        ]
+        return [row | {"torque constant": round(scale.torque_constant, 3)}]
 
     def judged(self, name: str, estimate: Array, seen: Array, level_s: float | None) -> dict[str, Any]:
         """Errors and ripple of an estimate; `seen` is what lacks its level, and is judged against the seen part of the truth."""

@@ -227,7 +227,7 @@ def main(
 
 @app.command()
 def init(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV or Parquet files.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of CSV files.")],
     measured: Annotated[Names, _option("State that is available at run time; repeatable.", metavar="NAME")] = None,
     input_: Annotated[Names, _option("Input; repeatable.", "--input", metavar="NAME")] = None,
     out: Annotated[Path, _option("New study file.")] = Path("study.toml"),

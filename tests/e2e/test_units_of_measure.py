@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from kros.data import write_parquet
+from kros.data import prepare, write_parquet
+from kros.data.steps import Step
 from kros.identify import ModelSet
 from kros.observer import Observer
 from kros.plants import DcMotorPopulation
@@ -20,30 +21,27 @@ WITHIN = 1e-5  # searches stop where they stop; 1 % is what is promised
 
 
 @dataclass(frozen=True)
-class Multiplied:
-    """A source in other units."""
+class Multiplied(Step):
+    """Other units, and without what states really were."""
 
-    source: object
     factors: tuple[float, ...]
 
-    def __call__(self, key):
-        return self.source(key)[:, : len(self.factors)] * np.array(self.factors)
+    def apply(self, recording, channels, period_s):
+        return replace(recording, values=recording.values[:, : len(self.factors)] * np.array(self.factors))
+
+    def describe(self, signals):
+        channels = zip(signals.channels, self.factors, strict=False)
+        return replace(signals, channels=tuple(replace(c, unit=c.unit if f == 1 else "") for c, f in channels))
 
 
 @pytest.fixture(scope="module")
 def motors():
     population = DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.4, seed=2).simulate().population
-    return replace(population, metadata={}, truths=())
+    return replace(population, metadata={})
 
 
 def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
-    scaled = replace(
-        population,
-        source=Multiplied(population.source, factors),
-        channels=tuple(
-            replace(c, unit=c.unit if f == 1 else "") for c, f in zip(population.channels, factors, strict=True)
-        ),
-    )
+    scaled = prepare(population, [Multiplied(factors)])
     write_parquet(scaled, folder / "recordings")
     raw = {
         "data": {"source": str(folder / "recordings"), "reader": "parquet"},

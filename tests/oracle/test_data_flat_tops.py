@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from kros.data import EpisodeKey
 from kros.data.flat_tops import ends_of, found_limit
 from kros.data.survey import survey
 from kros.plants import PLANTS
@@ -72,7 +73,10 @@ LIMITS = {
 def look(signal, episodes=6):
     pairs = [signal(k) for k in range(episodes)]
     inputs = [np.reshape(u, (len(T), -1)) for _, u in pairs]
-    ends = [ends_of(str(k), "0", x, u) for k, ((x, _), u) in enumerate(zip(pairs, inputs, strict=True))]
+    ends = [
+        ends_of(EpisodeKey(str(k), "default", "0"), x, u)
+        for k, ((x, _), u) in enumerate(zip(pairs, inputs, strict=True))
+    ]
     return found_limit(ends, np.ptp(np.concatenate(inputs), axis=0))
 
 

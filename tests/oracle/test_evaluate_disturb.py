@@ -6,6 +6,7 @@ import pytest
 from kros.core.lti import StateSpace, gain
 from kros.core.norms import gramian
 from kros.data import EpisodeBatch
+from kros.data.batch import hold_missing
 from kros.data.population import EpisodeKey
 from kros.evaluate.disturb import (
     Disturbance,
@@ -13,7 +14,6 @@ from kros.evaluate.disturb import (
     Measured,
     disturbed_errors,
     disturbed_rows,
-    hold_missing,
     standard_disturbances,
 )
 from kros.evaluate.errors import error_percent

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from kros.core.errors import IdentificationError
+from kros.data import prepare
 from kros.data.prepare import scale_population
 from kros.data.recording import check_episode, is_constant
+from kros.data.steps import Step
 from kros.identify import Factor, PhaseSpec, combine, edmd, smallest_stabilising_alpha
 from kros.identify.calibration import find_segments
 from kros.identify.factors import Ranges, lifted_factor, reduce_episode, require_excitation
@@ -29,34 +31,26 @@ QUICK = RefineOptions(
 
 
 @dataclass(frozen=True)
-class Multiplied:
-    """A source in other units."""
+class Multiplied(Step):
+    """Other units, and without what states really were."""
 
-    source: object
-    factors: np.ndarray
+    factors: tuple[float, ...] = (1.0,) * len(CHANNELS)
 
-    def __call__(self, key):
-        return self.source(key) * self.factors
+    def apply(self, recording, channels, period_s):
+        return replace(recording, values=recording.values[:, : len(self.factors)] * np.array(self.factors))
 
-
-@dataclass(frozen=True)
-class Recorded:
-    """A source without what states really were."""
-
-    source: object
-
-    def __call__(self, key):
-        return self.source(key)[:, : len(CHANNELS)]
+    def describe(self, signals):
+        return replace(signals, channels=signals.channels[: len(self.factors)])
 
 
 @pytest.fixture(scope="module")
 def motors():
     whole = DcMotorPopulation(n_units=3, n_episodes=2, seconds=1.0, seed=2).simulate().population
-    return replace(whole, truths=(), source=Recorded(whole.source))
+    return prepare(whole, [Multiplied()])
 
 
 def in_units(population, factors):
-    return replace(population, source=Multiplied(population.source, np.array([factors.get(n, 1.0) for n in CHANNELS])))
+    return prepare(population, [Multiplied(tuple(factors.get(n, 1.0) for n in CHANNELS))])
 
 
 def lifting_of(factors):

@@ -10,10 +10,13 @@ from batches import run_with_status
 from recorded_plant import DT, FEW, LIFTING, plant
 
 import kros
+from kros.core.errors import ConfigError
 from kros.data import EpisodeBatch
+from kros.data.population import EpisodeKey
 from kros.lifting import Lifting
 from kros.observer import Observer, Recordings, identify_estimator, run_observer
 from kros.observer.estimator.bank import Bank
+from kros.observer.estimator.certificate import noise_response
 from kros.observer.estimator.channels import FAMILIES, channels_of
 from kros.observer.estimator.reduction import reduced
 from kros.observer.estimator.regression import Design, Moments, Readout, Whitening, interpolated
@@ -146,17 +149,25 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     )
 
 
+def test_few_episodes_of_the_regression_leave_no_group_without_moments():
+    recordings, _ = plant(units=5, episodes=7, spread=0.1)
+    settings = FEW.model_copy(update={"episodes": 4})
+    readout = Readout.of(design(recordings, settings=settings))
+    assert set(readout.others) == set(readout.design.groups.values())
+    assert readout.episode_errors().shape == (35, 3)
+
+
 def test_a_declared_bias_is_an_error_of_the_regression_and_hardly_felt_then():
     recordings, batches = plant(units=3, spread=0.1)
     biased = replace(recordings, bias=np.array([0.5]))
     made = design(biased)
-    bank, X = made.bank, made.sample()[0]
+    bank, X = made.bank, made.sample[0]
     expected = np.zeros_like(X)
     of_y = np.flatnonzero(bank.channel == 0)
     now = of_y[: -len(bank.starts)]  # without the values of the first sample
     delays = bank.channels - 1 + np.arange(bank.delayed * (len(bank.taps) - 2))
     expected[:, np.setdiff1d(of_y, delays)] = 0.5
-    moved = made.sample(biased.bias)[0] - X
+    moved = made.thinned(biased.bias)[0] - X
     np.testing.assert_allclose(moved[:, now], expected[:, now], atol=1e-12)
     batch, errors = next(iter(batches.values())), []
     for one in (recordings, biased):
@@ -209,6 +220,37 @@ def test_batches_and_single_machines_are_alike_with_and_without_gaps(motors):
         running = observer.start(y[0, machine])
         rows = [np.asarray(running.step(y[k, machine], batch.inputs[k, machine])) for k in range(299)]
         np.testing.assert_allclose(rows, wanted[1:, machine], atol=1e-8 * np.abs(wanted).max())
+
+
+@pytest.mark.parametrize("reference", [False, True])
+def test_a_position_that_goes_on_for_ever_changes_nothing(reference):
+    """The same motion a thousand turns on gives the same estimates, with and without losses, and no gain at rest."""
+    population = kros.plants.DcMotorPopulation(n_units=3, n_episodes=3, seconds=1.0, seed=3).simulate().population
+    names, inputs = population.states, (*population.inputs, "reference")[: 1 + reference]
+
+    def read(key: EpisodeKey) -> EpisodeBatch:
+        batch = EpisodeBatch.read(population, [key])
+        rng = np.random.default_rng(int(key.episode))
+        along = batch.states[:, :, :1] + rng.normal(size=batch.inputs.shape)
+        return replace(batch, inputs=np.concatenate([batch.inputs, along], axis=-1)[..., : len(inputs)])
+
+    recordings = Recordings.of(list(population.keys()), read)
+    free = FEW.model_copy(update={"unbounded": {names[0]: inputs[1:]}})
+    observer = identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=free).observer
+    batch, turns = read(recordings.keys[0]), 2 * np.pi * 1000
+    y, moved = batch.measurements([0]), batch.inputs + np.array([0.0, turns])[: len(inputs)]
+    lost = np.where(np.random.default_rng(0).random(y.shape) < 0.5, np.nan, y)
+    for shown in (y, lost):
+        here = run_observer(observer, shown, batch.inputs)[..., :3]
+        there = run_observer(observer, shown + turns, moved)[..., :3] - [turns, 0, 0]
+        np.testing.assert_allclose(there, here, atol=1e-6 * np.abs(batch.states).max())
+    response = noise_response(observer)
+    if not reference:
+        still = response.C @ np.linalg.solve(np.eye(len(response.A)) - response.A, response.B) + response.D
+        np.testing.assert_allclose(still[1:], 0.0, atol=1e-9)
+    wrong = FEW.model_copy(update={"unbounded": {names[1]: ()}})
+    with pytest.raises(ConfigError, match="unbounded should map measured states"):
+        identify_estimator("motor", Lifting(names), (0,), inputs, recordings, 1e-3, settings=wrong)
 
 
 def test_units_of_measure_change_nothing():

@@ -24,7 +24,6 @@ from kros.observer.baselines.difference import FilteredDifference
 from kros.observer.baselines.extended_kalman import ExtendedKalman, start_covariance
 from kros.observer.certificate.error import error_system
 from kros.observer.screen import screened
-from kros.observer.simulate import run_observers
 from kros.synthesis import Injection
 
 DT, N, AT = 0.001, 2700, 200
@@ -267,8 +266,6 @@ def test_reset_leaves_nothing_of_the_past():
 
 def test_what_does_not_fit_is_named():
     o, (y, u) = observer(), recordings(5)
-    with pytest.raises(DimensionError, match="limits or ranges"):
-        run_observers([o, observer(seen=None)], y, u)
     running = o.start([0.0])
     for make in (
         lambda: o.start([0.0], {"phse": 1.0}),
@@ -291,7 +288,7 @@ def test_what_does_not_fit_is_named():
         running.step([0.0], 0.0)
     with pytest.raises(DimensionError, match="expected 1 measurements"):
         run_observer(o, np.zeros((5, 1, 2)), u)
-    with pytest.raises(DimensionError, match="expected inputs"):
+    with pytest.raises(DimensionError, match="the inputs"):
         run_observer(o, y, u[..., :1])
     with pytest.raises(DimensionError, match="at least one sample"):
         run_observer(o, y[:0], u[:0])

@@ -107,7 +107,7 @@ def test_scan_refuses_a_state_that_rests_in_every_episode(later: float) -> None:
 
 
 def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    episodes = {"a": [values(0), values(1)], "b": [values(2)]}
+    episodes = {"a": [values(0), values(1)], "b": [values(2), values(3)]}
     episodes["a"][1][3, 0] = np.nan
     episodes["b"][0][4, 1] = np.nan
     bad = population(episodes)
@@ -115,7 +115,7 @@ def test_scan_drops_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
         scan_digests(bad)
     with caplog.at_level(logging.WARNING):
         kept = scan_digests(bad, on_nan="drop_episode")
-    assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0")]
+    assert [key for key, _ in kept] == [EpisodeKey("a", "default", "0"), EpisodeKey("b", "default", "1")]
     assert [r.message.split(":")[1] for r in caplog.records] == [
         " Episode 1 of unit a (default)",
         " Episode 0 of unit b (default)",

@@ -72,5 +72,5 @@ def test_unknown_reader_and_options(folders: Path) -> None:
         read(folders / "csv", "csv")
     with pytest.raises(ConfigError, match="a CSV mapping is given"):
         read(folders / "parquet", "parquet", mapping=MAPPING)
-    with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): key 'from' is unknown"):
+    with pytest.raises(ConfigError, match=r"data\.prepare\[0\] \(step 'trim'\): from: unexpected keyword argument"):
         read(folders / "parquet", "parquet", prepare=[{"step": "trim", "from": 3}])

@@ -139,6 +139,11 @@ def test_differentiate_adds_a_state_with_the_derivative() -> None:
     result = moved.read(KEY)
     np.testing.assert_allclose(result[100:-100, 2], 2 * np.cos(2 * time)[100:-100], atol=1e-2)
     np.testing.assert_array_equal(result[:, 3], time)
+    true = prepare(population(values, 0.01), [steps.Differentiate("x", "v", 5.0, "deg/s", of="y")])
+    assert [(c.name, c.of) for c in true.truths] == [("v", "y")]
+    of_state, truth = true.read_with_truths(KEY)
+    np.testing.assert_array_equal(truth[:, 0], result[:, 2])
+    np.testing.assert_array_equal(of_state, values)
 
 
 @pytest.mark.parametrize(
@@ -151,6 +156,7 @@ def test_differentiate_adds_a_state_with_the_derivative() -> None:
         (steps.Trim(start=-1), "0 <= start < stop and tail >= 0"),
         (steps.Resample(0.0), r"period_s > 0, found 0\.0"),
         (steps.Differentiate("x", "y", 1.0), "would add 'y', which is there already"),
+        (steps.Differentiate("x", "v", 1.0, of="u"), "needs as `of` a state without a truth, found 'u'"),
     ],
 )
 def test_steps_that_do_not_fit_are_refused_before_reading(step: steps.Step, message: str) -> None:
@@ -176,10 +182,13 @@ def test_steps_from_toml() -> None:
         ({"start": 3}, "found None"),
         ("trim", "found None"),
         ({"step": "scale", "channels": ["x", 3], "factor": 2}, r"channels\.1: input should be a valid string, found 3"),
-        ({"step": "trim", "begin": 3}, r"\(step 'trim'\): key 'begin' is unknown; the keys are start, stop, tail"),
+        (
+            {"step": "trim", "begin": 3},
+            r"\(step 'trim'\): begin: unexpected keyword argument, found 3; the keys are start, stop, tail",
+        ),
         ({"step": "trim", "start": 1.5}, r"start: input should be a valid integer.*, found 1\.5"),
         ({"step": "trim", "stop": "end"}, "stop: input should be a valid integer.*, found 'end'"),
-        ({"step": "scale", "factor": 2}, "key 'channels' is missing"),
+        ({"step": "scale", "factor": 2}, "channels: field required"),
         ({"step": "scale", "channels": "x", "factor": 2}, "channels: input should be a valid tuple, found 'x'"),
     ],
 )

@@ -4,8 +4,6 @@ import json
 import string
 import subprocess
 import sys
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +15,7 @@ from hypothesis import strategies as st
 
 from kros.core.errors import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, from_arrays, write_parquet
-from kros.data.readers.parquet import group_file, read_parquet, write_group, write_index
+from kros.data.readers.parquet import group_file, read_parquet
 
 CHANNELS = (Channel("x", Role.STATE, "m", measured=True), Channel("y/z", Role.STATE), Channel("u", Role.INPUT, "V"))
 
@@ -103,19 +101,6 @@ def test_file_names_differ_and_are_portable(one: tuple[str, str], other: tuple[s
     for name in names:
         assert len(name) <= 208
         assert set(name) <= set(string.ascii_letters + string.digits + "%@._-~")
-
-
-def test_groups_written_by_other_processes(tmp_path: Path) -> None:
-    write_parquet(population(), tmp_path / "expected")
-    folder = tmp_path / "out"
-    folder.mkdir()
-    groups = [(unit, condition) for unit, condition, _ in population().groups()]
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
-        tasks = [pool.submit(write_group, population().select([u], [c]), u, c, folder) for u, c in groups]
-        write_index(population(), [task.result() for task in tasks], folder)
-    assert_same(read_parquet(folder), population())
-    for path in folder.iterdir():
-        assert path.read_bytes() == (tmp_path / "expected" / path.name).read_bytes()
 
 
 def broken() -> Population:

@@ -12,7 +12,7 @@ import pytest
 
 import kros
 from kros.core.errors import ConfigError, IdentificationError
-from kros.data import Population
+from kros.data import Population, from_arrays
 from kros.data.population import EpisodeKey
 from kros.identify.identified import IdentifiedModels
 from kros.plants import PLANTS
@@ -72,13 +72,14 @@ def drives(unsteady: str, condition: str) -> Population:
     keys = {EpisodeKey(k.unit, condition if k.unit == unsteady else k.condition, k.episode): k for k in whole.episodes}
     velocity = (whole.states + whole.inputs).index("target_velocity")
 
-    def source(key: EpisodeKey) -> np.ndarray:
-        values = whole.source(keys[key]).copy()
+    def read(key: EpisodeKey) -> np.ndarray:
+        values = whole.read(keys[key]).copy()
         if key.unit == unsteady:
             values[:, velocity] += np.random.default_rng(int(key.episode)).normal(size=len(values))
         return values
 
-    return replace(whole, episodes=tuple(keys), source=source)
+    data = {key: read(key) for key in keys}
+    return from_arrays(data, whole.channels, whole.sample_period_s, units=whole.units, metadata=whole.metadata)
 
 
 def test_a_condition_whose_units_cannot_be_calibrated_has_no_models():

@@ -9,6 +9,5 @@ MAX_JSON_BYTES = 1 << 29  # an index of a million episodes takes some 30 MB
 MAX_TOML_BYTES = 1 << 22
 MAX_ARRAYS_BYTES = 1 << 33  # of one .npz
 MAX_TEXT_BYTES = 1 << 32  # of one recording as text, unpacked
-MAX_LINE_BYTES = 1 << 20  # of the header and of the lines before it
 MAX_SAMPLES = 10**8  # of one episode
 MAX_VALUE = 1e50  # of a sample, a time, a sampling period and its inverse: products of six are finite

@@ -15,6 +15,9 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rounding import ITERATED
+from .population import EpisodeKey
+
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int64]
 
@@ -38,8 +41,7 @@ _RULE = LimitRule()
 class FlatTops:
     """Flat tops of a state at one end of its range in one episode."""
 
-    unit: str
-    episode: str  # the episode's name holds its condition
+    key: EpisodeKey
     top: float  # largest value of the signal, noise apart
     width: float  # of the noise
     # Of every run, shape (runs, 3 + m): mean, samples, whether the signal is far away shortly before or after, inputs.
@@ -59,10 +61,10 @@ class FoundLimit:
     samples: int  # how long
 
 
-def ends_of(unit: str, episode: str, signal: Array, inputs: Array) -> Ends:
+def ends_of(key: EpisodeKey, signal: Array, inputs: Array) -> Ends:
     """Return the flat tops of a signal, shape (n_samples,), with inputs of shape (n_samples, m), at both ends."""
     signal, width = np.ascontiguousarray(signal), _width(signal)
-    return _flat_tops(unit, episode, -signal, inputs, width), _flat_tops(unit, episode, signal, inputs, width)
+    return _flat_tops(key, -signal, inputs, width), _flat_tops(key, signal, inputs, width)
 
 
 def found_limit(ends: Sequence[Ends], ranges: Array) -> FoundLimit | None:
@@ -83,7 +85,7 @@ class _Level(NamedTuple):
     samples: int
 
 
-def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: float) -> FlatTops:
+def _flat_tops(key: EpisodeKey, signal: Array, inputs: Array, width: float) -> FlatTops:
     """Return the flat tops of a signal at its upper end, with noise of a width, and how far the signal goes."""
     place = _RULE.shortest if len(signal) > 2 * _RULE.shortest else 1
     top = float(np.partition(signal, -place)[-place])
@@ -94,7 +96,7 @@ def _flat_tops(unit: str, episode: str, signal: Array, inputs: Array, width: flo
     arrived = np.minimum.accumulate(signal)[starts] < far
     steep = arrived & _steep(signal, starts, stops, far)
     columns = [_means(signal, starts, stops), stops - starts, steep, *(_means(u, starts, stops) for u in inputs.T)]
-    return FlatTops(unit, episode, top, width, np.column_stack(columns).astype(float))
+    return FlatTops(key, top, width, np.column_stack(columns).astype(float))
 
 
 def _level(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
@@ -105,11 +107,11 @@ def _level(tops: Sequence[FlatTops], ranges: Array) -> _Level | None:
     if not near or any(f.top > level + 2 * f.width for f in tops):
         return None
     values, lengths, steep, *inputs = np.concatenate([runs for _, runs in near]).T
-    often = len(lengths) >= _RULE.runs and len({(f.unit, f.episode) for f, _ in near}) >= _RULE.episodes
+    often = len(lengths) >= _RULE.runs and len({f.key for f, _ in near}) >= _RULE.episodes
     if not often or any(np.ptp(u) <= _RULE.varied * size for u, size in zip(inputs, ranges, strict=True)):
         return None
     value = float(np.average(values, weights=lengths * steep))
-    return _Level(value, tuple(dict.fromkeys(f.unit for f, _ in near)), int(lengths.sum()))
+    return _Level(value, tuple(dict.fromkeys(f.key.unit for f, _ in near)), int(lengths.sum()))
 
 
 def _width(signal: Array) -> float:
@@ -121,7 +123,7 @@ def _width(signal: Array) -> float:
 
 def smallest_step(signal: Array) -> float:
     """Return the smallest step between samples, the quantisation of a digital sensor; rounding where there is none."""
-    steps, floor = np.abs(np.diff(signal)), 1e-9 * float(np.abs(signal).max())
+    steps, floor = np.abs(np.diff(signal)), ITERATED * float(np.abs(signal).max())
     smallest = float(np.where(steps > floor, steps, np.inf).min(initial=np.inf))
     return smallest if np.isfinite(smallest) else floor
 

@@ -8,11 +8,11 @@ Episodes are read lazily, one at a time, through a source; the population itself
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from functools import cached_property, lru_cache
-from typing import Any, TypeVar
+from functools import cache, cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,8 +22,6 @@ from ..core.settings import member
 
 DEFAULT_CONDITION = "default"
 OUTLIERS = "outliers"  # units of this group are scored, but take no part in pooled results
-EpisodeSource = Callable[["EpisodeKey"], npt.NDArray[np.float64]]
-Source = TypeVar("Source")
 
 
 class Role(str, Enum):
@@ -108,7 +106,7 @@ class EpisodeKey:
         return f"episode {self.episode} of unit {self.unit} ({self.condition})"
 
 
-@lru_cache(maxsize=1 << 16)
+@cache
 def natural_key(text: str) -> tuple[tuple[int, int, str], ...]:
     """Sort key that orders ``2`` before ``10``."""
     return tuple((0, int(part), "") if part.isdecimal() else (1, 0, part) for part in re.split(r"(\d+)", text) if part)
@@ -131,12 +129,6 @@ Scalings = Mapping[str, Scaling]
 def scaling_of(scalings: Scalings, name: str) -> Scaling:
     """Return the scaling of a channel; one that is not declared is the column of its name, as it is."""
     return scalings.get(name, Scaling(name))
-
-
-def restrict(source: Source, keys: Iterable[EpisodeKey]) -> Source:
-    """Return a source of fewer episodes, cheaper to send to another process, where it has a method `restricted`."""
-    restricted = getattr(source, "restricted", None)
-    return source if restricted is None else restricted(keys)
 
 
 def columns_in_order(channels: Iterable[Any]) -> tuple[Any, ...]:
@@ -171,8 +163,8 @@ class Population:
     units : tuple of Unit
     episodes : tuple of EpisodeKey
         In natural order of unit, condition and episode.
-    source : callable
-        Returns an episode's samples, float64, shape (n_samples, n_channels + n_truths).
+    source
+        Reads episodes, float64, shape (n_samples, n_channels + n_truths); `read` and `from_arrays` make it.
     metadata : mapping
         Facts about the batch, for example ``{"plant": "harmonic-drive", "gear_ratio": 100}``.
     truths : tuple of Channel
@@ -196,7 +188,7 @@ class Population:
     sample_period_s: float
     units: tuple[Unit, ...]
     episodes: tuple[EpisodeKey, ...]
-    source: EpisodeSource
+    source: Any  # kros.data.prepare.PreparedSource
     metadata: Mapping[str, Any] = field(default_factory=dict)
     truths: tuple[Channel, ...] = ()
     scaling: Mapping[str, Scaling] = field(default_factory=dict)
@@ -269,8 +261,7 @@ class Population:
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
         """Read one episode in blocks of at most `rows` samples, each of shape (n, n_channels), in as little memory."""
-        blocks = getattr(self.source, "blocks", None)
-        for values in [self.source(key)] if blocks is None else blocks(key, rows):
+        for values in self.source.blocks(key, rows):
             yield values[:, : len(self.channels)]
 
     def read_parts(self, key: EpisodeKey) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -286,7 +277,7 @@ class Population:
         positions = sorted(i for u in wanted for c in allowed for i in self._positions.get((u, c), ()))
         episodes = tuple(self.episodes[i] for i in positions)
         retained = tuple(unit for unit in self.units if unit.id in wanted)
-        return replace(self, units=retained, episodes=episodes, source=restrict(self.source, episodes))
+        return replace(self, units=retained, episodes=episodes, source=self.source.restricted(episodes))
 
     def groups(self) -> Iterator[tuple[str, str, tuple[EpisodeKey, ...]]]:
         """Iterate over (unit, condition, episodes)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -13,18 +13,16 @@ from pydantic import TypeAdapter, ValidationError
 
 from ..core.artifacts import digest_of
 from ..core.errors import ConfigError, DataError
-from ..core.files import did_you_mean, shortened, stamp_of
+from ..core.files import shortened, stamp_of
 from .population import (
     Channel,
     EpisodeKey,
-    EpisodeSource,
     Population,
     Scalings,
     Unit,
     columns_in_order,
     natural_key,
     part_columns,
-    restrict,
 )
 from .recording import (
     Recording,
@@ -45,7 +43,7 @@ HEAD = 100_000  # samples whose median step is the period
 class PreparedSource:
     """Read a recording, check its time, apply the steps, check the result."""
 
-    recordings: Recordings | EpisodeSource  # of a reader, or samples that are even already
+    recordings: Recordings
     channels: tuple[Channel, ...]  # as recorded: states, inputs, truths
     period_s: float  # as recorded, found in the episode `reference`
     reference: EpisodeKey
@@ -54,7 +52,7 @@ class PreparedSource:
 
     def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
         """Return one prepared episode, shape (n_samples, n_channels)."""
-        recording = self.recorded(key)
+        recording = self.recordings(key)
         self._check_time(recording)
         values, channels = self._prepared(recording)
         check_episode(values, key, channels, gaps=self.gaps)
@@ -63,8 +61,7 @@ class PreparedSource:
     def _check_time(self, recording: Recording) -> None:
         """Refuse uneven time, unless a step makes it even."""
         if not any(step.makes_even for step in self.steps):
-            read = self.recordings
-            file = read.file(read.places[recording.key]) if isinstance(read, Recordings) else None
+            file = self.recordings.file(self.recordings.places[recording.key])
             check_even(recording, self.period_s, self.reference, "" if file is None else f" in {file}")
 
     def _prepared(self, recording: Recording) -> tuple[npt.NDArray[np.float64], tuple[Channel, ...]]:
@@ -77,7 +74,7 @@ class PreparedSource:
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
         """Return one prepared episode in blocks of samples; read whole where steps or the format ask for it."""
-        if isinstance(self.recordings, Recordings) and all(step.samplewise for step in self.steps):
+        if all(step.samplewise for step in self.steps):
             return checked_blocks(self._in_turn(self.recordings.blocks(key, rows)), key, self.channels, gaps=self.gaps)
         values = self(key)
         return (values[k : k + rows] for k in range(0, len(values), rows))
@@ -91,14 +88,9 @@ class PreparedSource:
                 end = block.time_s[-1:]
             yield self._prepared(block)[0]
 
-    def recorded(self, key: EpisodeKey) -> Recording:
-        """Return one episode as recorded."""
-        recording = self.recordings(key)
-        return recording if isinstance(recording, Recording) else Recording(key, recording)
-
     def restricted(self, keys: Iterable[EpisodeKey]) -> PreparedSource:
         """Return the same for fewer episodes."""
-        return replace(self, recordings=restrict(self.recordings, keys))
+        return replace(self, recordings=self.recordings.restricted(keys))
 
 
 def assemble(
@@ -116,13 +108,12 @@ def assemble(
     if channels != columns_in_order(channels):
         roles = [(c.name, c.role.value) for c in channels]
         raise DataError(f"Channels should list states before inputs, and truths last, found {roles}; reorder them.")
-    order = [(tuple((natural_key(name), name) for name in astuple(key)), key) for key in recordings.places]
-    episodes = tuple(key for _, key in sorted(order, key=lambda pair: pair[0]))
+    episodes = tuple(sorted(recordings.places, key=lambda key: [(natural_key(name), name) for name in astuple(key)]))
     facts = {unit.id: unit for unit in units}
     known = tuple(facts.get(unit, Unit(unit)) for unit in dict.fromkeys(key.unit for key in episodes))
-    head = next(recordings.blocks(episodes[0], HEAD)) if sample_period_s is None else None
-    period = sample_period_s if head is None else estimate_period(head)
-    period = check_period(period, "Population")
+    if sample_period_s is None:
+        sample_period_s = estimate_period(next(recordings.blocks(episodes[0], HEAD)))
+    period = check_period(sample_period_s, "Population")
     source = PreparedSource(recordings, channels, period, episodes[0])
     about: dict[str, Any] = {"metadata": dict(metadata or {}), "scaling": dict(scaling or {}), **part_columns(channels)}
     population = Population(sample_period_s=period, units=known, episodes=episodes, source=source, **about)
@@ -131,8 +122,7 @@ def assemble(
 
 def with_gaps(population: Population) -> Population:
     """Return recordings as a machine gives them, with samples that are NaN or infinite, for a running observer."""
-    source = population.source
-    return replace(population, source=replace(source, gaps=True)) if isinstance(source, PreparedSource) else population
+    return replace(population, source=replace(population.source, gaps=True))
 
 
 def prepare(population: Population, steps: Iterable[Step]) -> Population:
@@ -161,17 +151,13 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     >>> prepare(raw, [steps.Trim(start=1), steps.Scale(("x",), 2.0)]).read(raw.episodes[0]).ravel().tolist()
     [2.0, 8.0, 18.0]
     """
-    added, source = tuple(steps), population.source
-    if not added:
-        return population
+    added = tuple(steps)
     signals = Signals(population.columns, population.sample_period_s, population.scaling)
-    if not isinstance(source, PreparedSource):
-        source = PreparedSource(source, signals.channels, signals.period_s, population.episodes[0])
     for step in added:
         signals = step.describe(signals)
     check_structure(signals.channels, population.episodes)
     about: dict[str, Any] = {"scaling": signals.scaling, **part_columns(signals.channels)}
-    source = replace(source, steps=source.steps + added)
+    source = replace(population.source, steps=population.source.steps + added)
     return replace(population, sample_period_s=signals.period_s, source=source, **about)
 
 
@@ -191,53 +177,43 @@ def _parse_step(table: Mapping[str, Any], where: str) -> Step:
         problem, known = error.errors()[0], [f.name for f in fields(STEPS[name])]
         key, actual = ".".join(map(str, problem["loc"])), shortened(repr(problem["input"]))
         text = f"{key}: {problem['msg'].lower()}, found {actual}"
-        if problem["type"] in ("unexpected_keyword_argument", "missing"):
-            what = "is missing" if problem["type"] == "missing" else "is unknown"
-            text = f"key {key!r} {what}{did_you_mean(key, known) or ';'} the keys are {', '.join(known)}"
-        raise ConfigError(f"{where} (step {name!r}): {text}.") from error
+        raise ConfigError(f"{where} (step {name!r}): {text}; the keys are {', '.join(known)}.") from error
 
 
-@dataclass(frozen=True, eq=False)
-class Scaled:
-    """A source whose columns are divided by sizes, shape (n_columns,)."""
+@dataclass(frozen=True)
+class _Divide(Step):
+    """Divide columns by sizes."""
 
-    source: EpisodeSource
-    sizes: npt.NDArray[np.float64]
+    sizes: tuple[float, ...]
+    samplewise: ClassVar[bool] = True
 
-    def __call__(self, key: EpisodeKey) -> npt.NDArray[np.float64]:
-        """Return the samples of an episode, shape (n_samples, n_columns)."""
-        return np.asarray(self.source(key) / self.sizes)
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> Scaled:
-        """Return the same for fewer episodes."""
-        return Scaled(restrict(self.source, keys), self.sizes)
+    def apply(self, recording: Recording, channels: tuple[Channel, ...], period_s: float) -> Recording:
+        """Return the recording in the sizes."""
+        return replace(recording, values=recording.values / np.array(self.sizes))
 
 
 def scale_population(population: Population, sizes: Mapping[str, float]) -> Population:
     """Return the population with channels, and their truths, divided by sizes; their units are then unknown."""
     owners = [c.of or c.name for c in population.columns]
-    source = Scaled(population.source, np.array([float(sizes.get(name, 1.0)) for name in owners]))
+    divided = _Divide(tuple(float(sizes.get(name, 1.0)) for name in owners))
+    source = replace(population.source, steps=(*population.source.steps, divided))
     columns = [replace(c, unit="") if name in sizes else c for c, name in zip(population.columns, owners, strict=True)]
     return replace(population, source=source, **part_columns(columns))
 
 
-def recording_marks(source: Any, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
+def recording_marks(source: PreparedSource, groups: Iterable[Sequence[EpisodeKey]], *declared: Any) -> list[str | None]:
     """Return digests of all that the samples of every group follow from; None where the recordings are in no file.
 
     These are its file, known by path, size and time, its place in the file, and how it is read and prepared.
     """
-    about: list[Any] = []
-    while isinstance(source, PreparedSource):
-        about.append((source.channels, source.period_s, source.steps, source.gaps))
-        source = source.recordings
-    if not isinstance(source, Recordings):
-        return [None for _ in groups]
-    settings = [(f.name, getattr(source, f.name)) for f in fields(source) if f.name != "places"]
-    stamp, how = lru_cache(maxsize=64)(stamp_of), digest_of(about, type(source).__name__, settings, declared)
+    read = source.recordings
+    settings = [(f.name, getattr(read, f.name)) for f in fields(read) if f.name != "places"]
+    about = (source.channels, source.period_s, source.steps, source.gaps)
+    stamp, how = lru_cache(stamp_of), digest_of(about, type(read).__name__, settings, declared)
 
     def mark(keys: Sequence[EpisodeKey]) -> str | None:
-        files = [source.file(source.places[key]) for key in keys]
-        rows = [(key, source.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
+        files = [read.file(read.places[key]) for key in keys]
+        rows = [(key, read.places[key], stamp(f)) for key, f in zip(keys, files, strict=True) if f is not None]
         return digest_of(how, rows) if len(rows) == len(keys) else None
 
     return [mark(keys) for keys in groups]

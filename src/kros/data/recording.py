@@ -21,6 +21,7 @@ import numpy.typing as npt
 from ..core import limits
 from ..core.errors import DataError
 from ..core.files import shortened
+from ..core.rounding import AGREED, ROUNDING
 from .population import OUTLIERS, Channel, EpisodeKey, Population, Role
 
 Float = npt.NDArray[np.float64]
@@ -32,10 +33,10 @@ class CheckRule:
 
     time: float = 1e-3  # largest deviation of one time step, in sampling periods
     period: float = 1e-4  # largest relative difference of the sampling periods of two episodes
-    end: float = 1e-6  # of a sample: how far rounding may move the end of an even grid
+    end: float = AGREED  # of a sample: how far rounding may move the end of an even grid
     samples: int = 3  # fewest: two consecutive states and one more
     wild: float = 1e3  # times the size of a channel, from which on a sample is wild
-    constant: float = 1e-12  # of the largest value: what filters and scales make of a constant
+    constant: float = ROUNDING  # of the largest value: what filters and scales make of a constant
     # sampling periods outside are usual for a time in ms or us that is taken for seconds
     shortest_s: float = 1e-6
     longest_s: float = 0.5
@@ -212,12 +213,9 @@ def is_constant(column: Array, first: float | None = None) -> bool:
     return bool(lower <= column[len(column) // 2] <= upper and np.all((column >= lower) & (column <= upper)))
 
 
-def check_finite(
-    values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0, columns: Iterable[int] | None = None
-) -> None:
+def check_finite(values: Array, key: EpisodeKey, channels: Sequence[Channel], first: int = 0) -> None:
     """Raise NonFiniteError where a channel holds NaN, infinity or what is as good as that."""
-    for column in range(len(channels)) if columns is None else columns:
-        signal = values[:, column]
+    for channel, signal in zip(channels, values.T, strict=True):
         kinds = {
             "NaN": np.isnan(signal),
             f"above {limits.MAX_VALUE:g}": ~usable(signal) & np.isfinite(signal),
@@ -228,15 +226,14 @@ def check_finite(
             what = " and ".join(kind for kind, places in kinds.items() if places.any())
             where = f"sample {first + bad[0]}" if bad.size == 1 else f"samples {first + bad[0]}-{first + bad[-1]}"
             advice = 'fix the source or set data.on_nan = "drop_episode"'
-            name = channels[column].name
-            raise NonFiniteError(f"{title(key)}: channel {name!r} has {bad.size} {what} at {where}; {advice}.")
+            raise NonFiniteError(f"{title(key)}: channel {channel.name!r} has {bad.size} {what} at {where}; {advice}.")
 
 
 class GroupWatch:
     """What only the episodes of one unit and condition show together: channels that never move, and wild samples.
 
     A channel may rest in 99 % of an episode and then move (steps, flags, saturation), so its size is that of its
-    values, and what it moves by in half of the other episodes.
+    values, and what it moves by in half of the episodes.
     """
 
     def __init__(self, channels: Sequence[Channel]) -> None:
@@ -258,10 +255,10 @@ class GroupWatch:
             self._suspects.append((key, int(i), np.stack([far, values[far, i]]), quantiles[:, i]))
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
-        """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, range elsewhere) > 0, and the place."""
+        """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
         for suspect, i, (samples, values), (low, middle, high) in self._suspects:
-            others = sorted(ranges[i] for key, ranges in self._ranges.items() if key != suspect)
-            size = max(high - low, abs(low), abs(high), others[(len(others) - 1) // 2] if others else 0.0)
+            usual = sorted(ranges[i] for ranges in self._ranges.values())[(len(self._ranges) - 1) // 2]
+            size = max(high - low, abs(low), abs(high), usual)
             wild = np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))
             if wild.size:
                 actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
@@ -332,6 +329,11 @@ def check_population(population: Population, allow_single: bool = False) -> None
     if not population.measured:
         problem = f"No state of {list(population.states)} is measured, so an observer has nothing to correct with"
         raise DataError(f"{problem}; declare measured = true for at least one.")
+    if not population.inputs:
+        roles = [(c.name, c.role.value) for c in population.columns]
+        raise DataError(
+            f"No channel has the role 'input', found {roles}: models need what drives a machine; declare it."
+        )
     recorded = {key.unit for key in population.episodes}
     units = [u.id for u in population.units if u.group != OUTLIERS and u.id in recorded]
     if len(units) < 2 and not allow_single:
@@ -340,12 +342,10 @@ def check_population(population: Population, allow_single: bool = False) -> None
         raise DataError(f"A population needs at least two units outside the group {OUTLIERS!r}, {actual}; {advice}.")
 
 
-def usable_episodes(
-    population: Population, keys: Iterable[EpisodeKey], on_nan: str = "error"
-) -> Iterator[tuple[EpisodeKey, Array, str]]:
+def usable_episodes(population: Population, on_nan: str = "error") -> Iterator[tuple[EpisodeKey, Array, str]]:
     """Yield the episodes of one unit and condition that pass all checks, with their samples and digest."""
-    watch = GroupWatch(population.columns)
-    for key in keys:
+    watch, usable = GroupWatch(population.columns), 0
+    for key in population.episodes:
         try:
             values = population.source(key)
             check_episode(values, key, population.columns)
@@ -355,8 +355,12 @@ def usable_episodes(
             logger.warning("Dropped, as data.on_nan asks: %s", error)
             continue
         watch.add(key, values)
+        usable += 1
         yield key, values, digest_of(values)
     watch.check()
+    if not usable:
+        group = f"Unit {key.unit} ({key.condition})"
+        raise DataError(f"{group}: every episode was dropped; fix the source or leave the unit out.")
 
 
 def digest_of(values: Array) -> str:

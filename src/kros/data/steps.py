@@ -194,15 +194,15 @@ class Offset(Step):
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
-        column, reference = self.columns((self.channel, self.reference), channels)
+        columns = self.columns((self.channel, self.reference), channels)
         if len(recording.values) < self.stop:
             needs = f"the offset of {self.channel!r} is calibrated over samples {self.start}-{self.stop - 1}"
             actual = f"the episode has {len(recording.values)}"
             raise DataError(f"{title(recording.key)}: {needs}, {actual}; leave the episode out.")
-        window = recording.values[self.start : self.stop]
-        check_finite(window, recording.key, channels, first=self.start, columns=(column, reference))
+        window = recording.values[self.start : self.stop, columns]
+        check_finite(window, recording.key, [channels[i] for i in columns], first=self.start)
         values = recording.values.copy()
-        values[:, column] += np.mean(window[:, reference] - window[:, column])
+        values[:, columns[0]] += np.mean(window[:, 1] - window[:, 0])
         return replace(recording, values=values)
 
 
@@ -296,7 +296,7 @@ class Resample(Step):
 
 @dataclass(frozen=True)
 class Differentiate(Step):
-    """Add the derivative of a channel, low-passed at `cutoff_hz`, as a new state.
+    """Add the derivative of a channel, low-passed at `cutoff_hz`, as a new state, or as the truth of a state `of`.
 
     The filter has no delay, so it looks ahead: the result is for identification and evaluation, never something a
     running observer could have measured.
@@ -306,24 +306,31 @@ class Differentiate(Step):
     name: str
     cutoff_hz: float
     unit: str = ""
+    of: str = ""
     step: ClassVar[str] = "differentiate"
 
     def describe(self, signals: Signals) -> Signals:
-        """Return the signals with the new state after the others: it has the factor of its channel, and no column."""
+        """Return the signals with the new channel after those alike: it has the factor of its channel, and no column."""
         bound, channels = 0.5 / signals.period_s, super().describe(signals).channels
         needs = f"a cutoff_hz above zero and below the Nyquist frequency of {bound:g} Hz, found {self.cutoff_hz}"
         self._require(0 < self.cutoff_hz < bound, needs)
         if self.name in [c.name for c in channels]:
             raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
-        at = _n_states(channels)
+        taken = [c.of for c in channels if c.of]
+        if self.of and (self.of in taken or self.of not in [c.name for c in channels if c.role is Role.STATE]):
+            raise ConfigError(
+                f"Step 'differentiate' needs as `of` a state without a truth, found {self.of!r}; name one."
+            )
         added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
-        channels = (*channels[:at], Channel(self.name, Role.STATE, self.unit), *channels[at:])
+        role, at = (Role.TRUTH, len(channels)) if self.of else (Role.STATE, _n_states(channels))
+        channels = (*channels[:at], Channel(self.name, role, self.unit, of=self.of), *channels[at:])
         return replace(signals, channels=channels, scaling={**signals.scaling, self.name: added})
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with one more column."""
         smooth = lowpass(recording.values[:, self.columns(self.named, channels)], self.cutoff_hz * period_s)[:, 0]
-        values = np.insert(recording.values, _n_states(channels), np.gradient(smooth, period_s), axis=1)
+        at = len(channels) if self.of else _n_states(channels)
+        values = np.insert(recording.values, at, np.gradient(smooth, period_s), axis=1)
         return replace(recording, values=values)
 
 
@@ -339,7 +346,7 @@ def lowpass(values: Float, cutoff: float) -> Float:
     from scipy.signal import convolve, firwin
 
     taps = firwin(2 * half + 1, 2 * cutoff, window="hamming")[:, None]
-    padded = np.concatenate([2 * values[0] - values[half:0:-1], values, 2 * values[-1] - values[-2 : -half - 2 : -1]])
+    padded = np.pad(values, ((half, half), (0, 0)), "reflect", reflect_type="odd")
     return np.asarray(convolve(padded, taps, mode="valid"))
 
 

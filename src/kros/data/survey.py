@@ -8,43 +8,26 @@ from __future__ import annotations
 import logging
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from dataclasses import astuple, dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import TypeAdapter
 
 from ..core.artifacts import file_digest, load_artifact, loader
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
 from ..core.work import Work
 from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit, smallest_step
-from .population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, split_episodes
+from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .prepare import recording_marks
 from .readers.parquet import GroupRecord, read_parquet, write_group, write_index
 from .recording import CHECK, check_population, refuse_copies, some, title, usable_episodes
 
 Array = npt.NDArray[np.float64]
-_FACTORS = {  # between units of measure that are mixed up, and what they are
-    180 / np.pi: "degrees and radians",
-    30 / np.pi: "revolutions per minute and radians per second",
-    2 * np.pi: "revolutions and radians, or Hz and rad/s",
-    60.0: "minutes and seconds",
-    1000.0: "a unit and its thousandth",
-}
-
-
-@dataclass(frozen=True)
-class AlertRule:
-    """From when on sizes speak for units of measure that are mixed up."""
-
-    near: float = 1.2  # within which a ratio of sizes is one of the factors between units of measure
-    compact: float = 3.0  # by which sizes may differ on either side of it
-
-
-_RULE = AlertRule()
 
 
 def period_alerts(period_s: float) -> tuple[str, ...]:
@@ -53,42 +36,6 @@ def period_alerts(period_s: float) -> tuple[str, ...]:
         return ()
     unusual = f"The sampling period of {period_s:g} s is unusual: check the unit of the column of time (time_scale)"
     return (f"{unusual} and sample_period_s, on which every frequency depends.",)
-
-
-def size_of(values: Array) -> Array:
-    """Return the range of every channel from the 5th to the 95th percentile, shape (n_channels,)."""
-    low, high = np.percentile(values[:: max(1, len(values) // 2000)], (5, 95), axis=0)
-    return np.asarray(high - low)
-
-
-def scale_alerts(sizes: Mapping[EpisodeKey, Array], channels: Sequence[Channel]) -> tuple[str, ...]:
-    """Return which channels have sizes (`size_of`) a factor apart that lies between units of measure, and where."""
-    alerts = []
-    for i, channel in enumerate(channels):
-        for condition in dict.fromkeys(key.condition for key in sizes):
-            episodes = {key: size[i] for key, size in sizes.items() if key.condition == condition and size[i] > 0}
-            of_unit = {u: [size for key, size in episodes.items() if key.unit == u] for u in {k.unit for k in episodes}}
-            text = _two_scales({unit: float(np.median(of)) for unit, of in of_unit.items()})
-            text = text or _two_scales({title(key): float(size) for key, size in episodes.items()})
-            alerts += [f"{channel.name!r} ({condition}) is {text}"] if text else []
-    return tuple(alerts)
-
-
-def _two_scales(sizes: Mapping[str, float]) -> str:
-    """Return the fewer of two groups of sizes, the factor between them and what it may be, or nothing."""
-    names = sorted(sizes, key=lambda name: (sizes[name], name))
-    logs = np.log([sizes[name] for name in names])
-    if len(names) < 2:
-        return ""
-    cut = int(np.diff(logs).argmax()) + 1
-    gap = float(np.median(logs[cut:]) - np.median(logs[:cut]))
-    kinds = [text for factor, text in _FACTORS.items() if abs(gap - np.log(factor)) < np.log(_RULE.near)]
-    if not kinds or max(np.ptp(logs[:cut]), np.ptp(logs[cut:])) > np.log(_RULE.compact):
-        return ""
-    smaller = cut <= len(names) - cut
-    fewer = some(names[:cut] if smaller else names[cut:])
-    factor = f"{np.exp(gap):.3g} times {'smaller' if smaller else 'larger'}"
-    return f"{factor} in {fewer} than in the others: are its units of measure mixed up ({' or '.join(kinds)})?"
 
 
 log = logging.getLogger(__name__)
@@ -138,21 +85,18 @@ class RecordingFacts:
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        facts["limits"] = {name: asdict(limit) for name, limit in self.limits.items()}
-        facts["digests"] = {part: [self.digests.get(k) for k in facts[part]] for part in _PARTS}
-        return facts | {part: [astuple(k) for k in facts[part]] for part in _PARTS}
+        facts["digests"] = {part: [self.digests.get(key) for key in facts[part]] for part in _PARTS}
+        return facts | {part: [astuple(key) for key in facts[part]] for part in _PARTS}
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> RecordingFacts:
         """Read what a study's stage `read`, or a saved result, keeps in its folder ``population``."""
         content, _ = load_artifact(folder, "facts")
-        parts: dict[str, Any] = {part: tuple(EpisodeKey(*row) for row in content[part]) for part in _PARTS}
+        parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
         pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
-        limits = {name: FoundLimit(**{**of, "units": tuple(of["units"])}) for name, of in content["limits"].items()}
-        known: dict[str, Any] = {name: content[name] for name in ("identify_on", "groups", "resolution")}
-        known |= {name: tuple(content[name]) for name in ("dropped", "alerts", "reserve")}
-        return cls(**known, **parts, limits=limits, digests={key: text for key, text in pairs if text})
+        digests = {key: text for key, text in pairs if text}
+        return TypeAdapter(cls).validate_python({**content, **parts, "digests": digests})
 
 
 @dataclass(frozen=True)
@@ -171,7 +115,6 @@ class _EpisodeFacts:
     key: EpisodeKey
     digest: str
     n_samples: int
-    size: Array  # of the channels
     reach: Array  # lowest and highest inputs, shape (2, m)
     ends: dict[str, Ends]  # of the states that are not measured
 
@@ -250,7 +193,7 @@ def _facts(
     if short := [f"{title(e.key)} has {e.n_samples}" for e in episodes if e.n_samples < options.fewest]:
         needs = f"every episode needs at least {options.fewest} samples after preparation"
         raise DataError(f"Recordings: {needs}; {some(short)}. Leave short episodes out, or record longer.")
-    sizes, groups = {e.key: e.size for e in episodes}, {unit: retained.unit(unit).group for unit in part}
+    groups = {unit: retained.unit(unit).group for unit in part}
     pooled = [e for e in episodes if groups[e.key.unit] != OUTLIERS]
     ranges = np.ptp(np.concatenate([e.reach for e in pooled]), axis=0) if pooled else np.zeros(0)
     limits = {name: found_limit([e.ends[name] for e in pooled], ranges) for name in (pooled[0].ends if pooled else ())}
@@ -261,7 +204,7 @@ def _facts(
         test=tuple(k for s in splits.values() for k in s.test),
         resolution={},
         dropped=tuple(str(k) for k in population.episodes if k not in left),
-        alerts=(*period_alerts(retained.sample_period_s), *scale_alerts(sizes, population.columns)),
+        alerts=period_alerts(retained.sample_period_s),
         reserve=tuple(options.reserve),
         limits={name: limit for name, limit in limits.items() if limit is not None},
         digests={e.key: e.digest for e in episodes},
@@ -291,27 +234,24 @@ def condition_of(population: Population, wanted: str | None) -> str:
 def _read_group(task: _Group) -> _GroupFacts:
     """Read, check and, where asked, write one unit and condition."""
     population, record, written = task.population, None, None
-    ((unit, condition, keys),) = population.groups()
     names, episodes, resolution = [c.name for c in population.channels], list[_EpisodeFacts](), dict[str, float]()
     n, hidden = len(population.states), [s for s in population.states if s not in population.measured]
 
     def usable() -> Iterator[tuple[EpisodeKey, Array, str]]:
-        for key, values, digest in usable_episodes(population, keys, task.on_nan):
+        for key, values, digest in usable_episodes(population, task.on_nan):
             for name in population.measured if not episodes else ():
                 resolution[name] = smallest_step(values[:, names.index(name)])
-            inputs, place = values[:, n : len(names)], f"{condition}/{key.episode}"
-            ends = {name: ends_of(unit, place, values[:, names.index(name)], inputs) for name in hidden}
+            inputs = values[:, n : len(names)]
+            ends = {name: ends_of(key, values[:, names.index(name)], inputs) for name in hidden}
             reach = np.stack([inputs.min(axis=0), inputs.max(axis=0)])
-            episodes.append(_EpisodeFacts(key, digest, len(values), size_of(values), reach, ends))
+            episodes.append(_EpisodeFacts(key, digest, len(values), reach, ends))
             yield key, values, digest
 
     if task.folder is None:
         deque(usable(), maxlen=0)
     else:
-        record = write_group(population, unit, condition, task.folder, usable())
-        written = file_digest(task.folder / record.file) if record.episodes else None
-    if not episodes:
-        raise DataError(f"Unit {unit} ({condition}): every episode was dropped; fix the source or leave the unit out.")
+        record = write_group(population, task.folder, usable())
+        written = file_digest(task.folder / record.file)
     return _GroupFacts(record, written, resolution, episodes)
 
 

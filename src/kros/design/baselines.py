@@ -13,7 +13,6 @@ from ..core.errors import ConfigError, DataError, SynthesisError
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
-from ..evaluate.disturb import hold_missing
 from ..identify import ModelSet
 from ..observer import Seen
 from ..observer.baselines.difference import FilteredDifference, cutoffs_hz, followed
@@ -73,9 +72,7 @@ class Baseline:
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
             estimator, some = self.by_unit[unit], samples.of(rows)
-            if isinstance(estimator, ExtendedKalman):
-                parts.append(estimator.run(some.y, some.u, values, some.starts))
-            elif self.restarts:
+            if self.restarts:
                 parts.append(restarted(estimator, some, values))
             else:
                 parts.append(estimator.run(some.y, some.u, values))
@@ -84,16 +81,16 @@ class Baseline:
 
 
 def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, missing measurements held, every member again from each sample at which it starts again."""
+    """Run a batch, every member again from each sample at which it starts again."""
     n_samples, batch = samples.starts.shape
-    estimate = estimator.run(hold_missing(samples.y), samples.u, parameters)
+    estimate = estimator.run(samples.y, samples.u, parameters)
     for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
         members = np.flatnonzero(samples.starts[begin])
         again = samples.starts[begin + 1 :, members]
         lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
         rows = slice(begin, int(np.max(lasts)) + 1)
         part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
-        y, u = hold_missing(samples.y[rows, members]), samples.u[rows, members]
+        y, u = samples.y[rows, members], samples.u[rows, members]
         estimate[begin + 1 : rows.stop, members] = estimator.run(y, u, part)[1:]
     return estimate
 

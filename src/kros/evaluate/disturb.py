@@ -19,7 +19,6 @@ import numpy.typing as npt
 
 from ..core.errors import DimensionError
 from ..data.batch import EpisodeBatch
-from ..data.batch import hold_missing as hold_missing  # beside what makes them miss
 from ..data.population import EpisodeKey
 from .errors import error_percent
 

@@ -149,36 +149,23 @@ def from_control(system: Any) -> StateSpace:
     if system.dt is None or system.dt is True:
         advice = "give it in seconds, control.ss(A, B, C, D, 0.001), or 0"
         raise DimensionError(f"from_control: the sampling period is not known (dt = {system.dt}); {advice}.")
-    if isinstance(system, control.TransferFunction):
-        return _realised(system)
+    system = _realised(system) if isinstance(system, control.TransferFunction) else system
     A, B, C, D = (np.array(getattr(system, matrix), dtype=float) for matrix in "ABCD")
     return StateSpace(A, B, C, D, float(system.dt))
 
 
-def _realised(model: Any) -> StateSpace:
+def _realised(model: Any) -> Any:
     """A transfer function, entry by entry: no minimal realisation is needed for a frequency response."""
-    from scipy.linalg import block_diag
-    from scipy.signal import tf2ss
-
-    p, m = model.noutputs, model.ninputs
-    blocks, D = [], np.zeros((p, m))
-    for i, j in np.ndindex(p, m):
-        numerator, denominator = np.trim_zeros(model.num[i][j], "f"), np.trim_zeros(model.den[i][j], "f")
-        if len(numerator) > len(denominator):
-            raise DataError(
-                f"from_control: entry ({i}, {j}) of the transfer function is improper; give a causal model."
-            )
-        if len(denominator) == 1 and numerator.size:
-            D[i, j] = numerator[0] / denominator[0]
-        elif numerator.size:
-            a, b, c, d = tf2ss(numerator, denominator)
-            D[i, j] = d[0, 0]
-            blocks.append((a, b @ np.eye(m)[[j]], np.eye(p)[:, [i]] @ c))
-    n = sum(len(a) for a, _, _ in blocks)
-    A = block_diag(*(a for a, _, _ in blocks)) if blocks else np.zeros((0, 0))
-    B = np.concatenate([np.zeros((0, m)), *(b for _, b, _ in blocks)])
-    C = np.concatenate([np.zeros((p, 0)), *(c for _, _, c in blocks)], axis=1)
-    return StateSpace(A.reshape(n, n), B, C, D, float(model.dt))
+    rows, columns = np.eye(model.noutputs), np.eye(model.ninputs)
+    total = control.ss([], [], [], np.zeros((model.noutputs, model.ninputs)), model.dt)
+    for i, j in np.ndindex(model.noutputs, model.ninputs):
+        try:
+            entry = control.ss(control.tf(model.num[i][j], model.den[i][j], model.dt))
+        except ValueError as error:
+            problem = f"entry ({i}, {j}) of the transfer function is improper"
+            raise DataError(f"from_control: {problem}; give a causal model.") from error
+        total = total + rows[:, [i]] * entry * columns[[j]]
+    return total
 
 
 def uncertainty_to_control(model: UncertainModel | ResponseUncertainty) -> UncertaintyForControl:

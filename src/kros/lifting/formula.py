@@ -43,6 +43,7 @@ MAX_DEPTH = 20  # functions and powers inside each other; sums and products are 
 MAX_FACTORS = 40  # of one product, whose derivative has as many terms of as many factors
 MAX_TERMS = 2000  # of a formula with parameters, multiplied out
 _EXACT = 2**53
+_DIGITS = 17  # decimal, of a number of double precision
 _CHAINS = ((ast.Add, ast.Sub), (ast.Mult, ast.Div))
 
 
@@ -68,9 +69,9 @@ class Formula:
 
         sizes = dict(self.sizes)
         known = {symbol: sizes.get(base_and_delay(symbol.name)[0], 1.0) for symbol in self.written.free_symbols}
-        larger = {symbol: sp.Float(size, 17) * symbol for symbol, size in known.items() if size != 1}
+        larger = {symbol: sp.Float(size, _DIGITS) * symbol for symbol, size in known.items() if size != 1}
         tree = self.written.xreplace(larger)
-        return tree if self.size == 1 else tree * sp.Float(1 / self.size, 17)
+        return tree if self.size == 1 else tree * sp.Float(1 / self.size, _DIGITS)
 
     @cached_property
     def used(self) -> frozenset[str]:
@@ -152,7 +153,7 @@ class _Reader:
         import sympy as sp
 
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            return sp.Integer(node.value) if isinstance(node.value, int) else sp.Float(node.value, 17)
+            return sp.Integer(node.value) if isinstance(node.value, int) else sp.Float(node.value, _DIGITS)
         if isinstance(node, ast.Name):
             return self._name(node.id)
         if isinstance(node, ast.Subscript) and isinstance(node.value, ast.Name):
@@ -271,7 +272,7 @@ def _number(value: Any) -> Any:
 
     number = finite(value)
     exact = value.is_Rational and not _large(value)
-    return value if exact or (value / sp.pi).is_Rational else sp.Float(number, 17)
+    return value if exact or (value / sp.pi).is_Rational else sp.Float(number, _DIGITS)
 
 
 def _large(value: Any) -> bool:

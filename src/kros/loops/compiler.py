@@ -116,14 +116,14 @@ def _folders() -> Iterator[Path]:
         folders.insert(0, (Path(cache) if cache else Path.home() / ".cache") / "kros")
     for folder in folders:
         try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            folder.mkdir(mode=stat.S_IRWXU, parents=True, exist_ok=True)
             found = folder.lstat()
         except (OSError, RuntimeError):
             continue
         if (
             stat.S_ISDIR(found.st_mode)
             and found.st_uid == os.getuid()
-            and not found.st_mode & 0o022
+            and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
             and os.access(folder, os.W_OK)
         ):
             yield folder

@@ -100,7 +100,6 @@ class TorqueScale:
 
     torque_constant: float  # torque per unit of current
     bias: float  # error of the current without load, in units of current
-    residual_percent: float  # what is left of the known load, low-passed, in percent of its standard deviation
 
     @classmethod
     def calibrated(
@@ -108,14 +107,12 @@ class TorqueScale:
     ) -> TorqueScale:
         """Return the scale from the error of a current and a known load by least squares of low-passed signals."""
         x, t = (low_passed(s, corner_hz, sample_period_s)[skip:].ravel() for s in (error, known))
-        dx, dt = x - x.mean(), t - t.mean()
-        if not dt @ dt > 0 or not dx @ dt > 0:
-            found = f"deviations {t.std():.3g} and {x.std():.3g} and covariance {dx @ dt / len(t):.3g}"
+        covariance = np.cov(x, t)
+        if not covariance[0, 1] > 0:
+            found = f"deviations {t.std():.3g} and {x.std():.3g} and covariance {covariance[0, 1]:.3g}"
             raise DataError(f"Torque constant: the current's error should follow the load, found {found}; check signs.")
-        constant = float(dx @ dt / (dx @ dx))
-        rest = dt - constant * dx
-        residual = float(100 * np.sqrt(rest @ rest / (dt @ dt)))
-        return cls(constant, float(x.mean() - t.mean() / constant), residual)
+        constant = float(covariance[0, 1] / covariance[0, 0])
+        return cls(constant, float(x.mean() - t.mean() / constant))
 
     def load(self, error: npt.ArrayLike) -> Array:
         """Return the load's torque, ``K (i - i_hat - bias)``, from measured minus estimated current."""

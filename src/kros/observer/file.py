@@ -119,7 +119,7 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        "runtime": observer.runtime.content(),
+        "runtime": {key: value for key, value in vars(observer.runtime).items() if np.any(value)},
         **{key: vars(part) for key, part in parts.items() if part is not None},
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,

@@ -4,9 +4,10 @@ While measurements arrive, a filter bank feeds nothing back that it estimates. B
 internal states are the filters z of measurements and inputs, whose estimate is given then, and the filters w of
 inputs alone with their own estimate :math:`x^u` of all recorded states. The fallback
 
-.. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (x_k - x^u_k),
+.. math:: f_{k+1} = x^u_{k+1} + o_{k+1}, \qquad o_{k+1} = \rho \, (o_k + (1 - m) (x_k - x^u_k - o_k)),
 
-continues the last estimate (of measured states: the last measurement) and tends to :math:`x^u`. The age a of a gap is
+continues the last estimate (of measured states, for which m is zero here, the last measurement) and tends to
+:math:`x^u`; estimates in which the fallback counts already change it less, since they say little. The age a of a gap is
 the number of samples that are missing so far; when measurements return it falls by a factor :math:`\mu` a sample, as
 the filters forget what stood for them. Every state has its own :math:`\mu`: a state that is estimated from slow
 filters is wrong for longer. Then it counts as :math:`0.1 e^5 T` at most, so that m is below one percent after five time
@@ -128,7 +129,8 @@ class Gaps:
         """Return the next offset from the fallback, after states (batch, n) and measurements, (batch, q)."""
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = y
-        return np.asarray(self.bank.forget * (last - x[:, self.fallback]))
+        fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
+        return np.asarray(self.bank.forget * (last - fallback + share * (self.offset - last + fallback)))
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""

@@ -50,38 +50,22 @@ class Monitor:
     first: float = 0.0  # share that the first sample replaces, later ones less, down to `forget`
 
     def __post_init__(self) -> None:
-        for name in ("filters", "size", "limits", "weights"):
-            value = np.asarray(getattr(self, name), dtype=float)
-            object.__setattr__(self, name, value)
-            if not np.isfinite(value).all():
-                raise DataError(f"Monitor of an observer: {name} should hold finite numbers.")
-        bands, q = len(self.filters), len(np.atleast_1d(self.size))
-        if (
-            self.filters.shape != (bands, 3)
-            or self.size.shape != (q,)
-            or {self.limits.shape, self.weights.shape} != {(q, bands)}
-            or not bands
-        ):
+        arrays = ("filters", "size", "limits", "weights")
+        for name in arrays:
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        shapes, (bands, q) = [getattr(self, name).shape for name in arrays], (len(self.filters), self.size.size)
+        if not bands or shapes != [(bands, 3), (q,), (q, bands), (q, bands)]:
             raise DataError(
-                "Monitor of an observer: filters (bands, 3), size (q), limits and weights (q, bands) do not fit "
-                "together, found "
-                f"{self.filters.shape}, {self.size.shape}, {self.limits.shape} and {self.weights.shape}."
+                f"Monitor of an observer: {', '.join(arrays)} should have shapes (bands, 3), (q), (q, bands) and "
+                f"(q, bands), found {shapes}."
             )
-        if (
-            np.any(self.size <= 0)
-            or np.any(self.limits <= 0)
-            or not 0 < self.forget <= 1
-            or not 0 <= self.first <= 1
-            or self.settle < 0
-        ):
+        finite = all(np.isfinite(getattr(self, name)).all() for name in arrays)
+        sized = np.all(self.size > 0) and np.all(self.limits > 0) and np.all(self.weights >= 0)
+        whole = np.all(self.weights == np.round(self.weights)) and self.weights.sum() == WEIGHT
+        if not (finite and sized and whole and 0 < self.forget <= 1 and 0 <= self.first <= 1 and self.settle >= 0):
             raise DataError(
-                "Monitor of an observer: size and limits should be positive, forget and first within 0 and 1, settle "
-                "at least 0."
-            )
-        if np.any(self.weights != np.round(self.weights)) or np.any(self.weights < 0) or self.weights.sum() != WEIGHT:
-            raise DataError(
-                f"Monitor of an observer: weights should be whole numbers of at least 0 that sum to {WEIGHT}, found "
-                f"{self.weights}."
+                "Monitor of an observer: numbers should be finite, size and limits positive, weights whole and of sum "
+                f"{WEIGHT}, forget and first within 0 and 1, settle at least 0; found {self}."
             )
 
     def times(self, y: Array) -> Self:
@@ -92,8 +76,7 @@ class Monitor:
         """Return mean squares, (n_samples, batch, q, bands), after every sample; those not judged hold what was."""
         from scipy.signal import lfilter
 
-        scaled = innovation / self.size
-        scaled = np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
+        scaled = self.scaled(innovation)
         squares = np.zeros((*innovation.shape, len(self.filters)))
         for machine in range(innovation.shape[1]):
             rows = np.flatnonzero(judged[:, machine])
@@ -103,6 +86,11 @@ class Monitor:
                 latest = np.searchsorted(rows, np.arange(len(judged)), side="right")
                 squares[:, machine] = np.concatenate([np.zeros((1, *means.shape[1:])), means])[latest]
         return squares
+
+    def scaled(self, innovation: Array) -> Array:
+        """Return innovations (..., q) over their sizes, within what counts at most."""
+        scaled = innovation / self.size
+        return np.clip(np.where(np.isnan(scaled), LARGEST, scaled), -LARGEST, LARGEST)
 
     def in_turn(self, episodes: Sequence[tuple[Array, Flags]]) -> list[Array]:
         """Return the mean squares of episodes, (n_samples, q, bands), that a machine has one after the other."""
@@ -124,11 +112,8 @@ class Monitor:
 
     def level(self, mean_squares: Array) -> Array:
         """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
-        return np.asarray((self.band_levels(mean_squares) * self.weights).sum(axis=(-2, -1)) / WEIGHT)
-
-    def band_levels(self, mean_squares: Array) -> Array:
-        """Return the level of every band over its limit in dB, shape (..., q, bands)."""
-        return np.asarray(10 * np.log10(np.maximum(mean_squares / self.limits, QUIET)))
+        levels = 10 * np.log10(np.maximum(mean_squares / self.limits, QUIET))
+        return np.asarray((levels * self.weights).sum(axis=(-2, -1)) / WEIGHT)
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:
@@ -153,57 +138,36 @@ class Watch:
     """A monitor with its memory, on one machine."""
 
     def __init__(self, monitor: Monitor) -> None:
-        self._settle, self._forget, self._first = monitor.settle, monitor.forget, max(monitor.first, monitor.forget)
-        self._inverse = (1 / monitor.size).tolist()
-        self._filters: list[list[float]] = monitor.filters.tolist()
-        self._limits = (1 / monitor.limits).tolist()
-        self._weights: list[list[int]] = monitor.weights.astype(int).tolist()
         self._monitor = monitor
         self.reset()
 
     def reset(self) -> None:
         """Forget everything."""
-        self._memory = [[[0.0, 0.0, 0.0] for _ in self._filters] for _ in self._inverse]
-        self._gain = self._first
+        self._filters, self._squares = np.zeros((2, *self._monitor.limits.shape)), np.zeros(self._monitor.limits.shape)
+        self._gain, self.outside = max(self._monitor.first, self._monitor.forget), False
         self.begin()
-        self.outside = False
 
     def begin(self) -> None:
         """Judge nothing until the observer has settled."""
-        self._wait = self._settle
+        self._wait = self._monitor.settle
 
-    def take(self, innovation: Sequence[float], good: bool) -> None:
-        """Take the innovation of every channel; whether the sample is good by itself."""
+    def take(self, innovation: Array, good: bool) -> None:
+        """Take the innovation of every channel, (q,); whether the sample is good by itself."""
         if not good:
-            self._wait = min(self._wait + RECOVERY, self._settle)
+            self._wait = min(self._wait + RECOVERY, self._monitor.settle)
             return
         if self._wait > 0:
             self._wait -= 1
             return
-        product, gain = 1.0, self._gain
-        for value, inverse, channel, limits, weights in zip(
-            innovation, self._inverse, self._memory, self._limits, self._weights, strict=True
-        ):
-            v = value * inverse
-            if not v < LARGEST:
-                v = LARGEST
-            elif v < -LARGEST:
-                v = -LARGEST
-            for (b, a1, a2), memory, limit, weight in zip(self._filters, channel, limits, weights, strict=True):
-                band = b * v + memory[0]
-                memory[0] = memory[1] - a1 * band
-                memory[1] = -b * v - a2 * band
-                memory[2] += gain * (band * band - memory[2])
-                share = memory[2] * limit
-                if share < QUIET:
-                    share = QUIET
-                for _ in range(weight):
-                    product *= share
-        gain /= 1.0 + gain
-        self._gain = gain if gain > self._forget else self._forget
-        self.outside = product > 1.0
+        b, a1, a2 = self._monitor.filters.T
+        driven = b * self._monitor.scaled(innovation)[:, None]
+        bands = driven + self._filters[0]
+        self._filters = np.stack([self._filters[1] - a1 * bands, -driven - a2 * bands])
+        self._squares = self._squares + self._gain * (bands**2 - self._squares)
+        self._gain = max(self._gain / (1 + self._gain), self._monitor.forget)
+        self.outside = self.level_db > 0
 
     @property
     def level_db(self) -> float:
         """Level of the innovation over its bound, dB; far below zero before anything was judged."""
-        return float(self._monitor.level(np.array([[band[2] for band in channel] for channel in self._memory])))
+        return float(self._monitor.level(self._squares))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import UserDict, deque
+from collections import UserDict
 from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -14,9 +14,9 @@ import numpy.typing as npt
 from ..core.errors import ConfigError, DimensionError
 from .data import ObserverData
 from .monitor import Watch
-from .screen import LONGEST, Held, SampleStatus, Screen
-from .simulate import Restarts
-from .step import Steps, forward
+from .screen import LONGEST, SampleStatus, Screen
+from .simulate import Course, stepped
+from .step import forward
 from .tracking import PhaseLockedLoop
 
 Array = npt.NDArray[np.float64]
@@ -81,11 +81,9 @@ class RunningObserver:
 
     def __init__(self, observer: ObserverData, y: npt.ArrayLike, parameters: Mapping[str, float]) -> None:
         self.observer = observer
-        self._screen = Screen.of(observer)
-        self._steps = Steps(observer, 1, {})
+        self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
         self._measured = tuple(observer.lifting.states[i] for i in observer.measured)
-        self._loop: PhaseLockedLoop | None = None
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
@@ -104,7 +102,7 @@ class RunningObserver:
     def parameters(self, values: Mapping[str, float]) -> None:
         """Change all of them."""
         self._parameters = _Checked(self.observer, values)
-        self._steps.values = self._parameters.data
+        self._course.values = self._course.steps.values = self._parameters.data
 
     def track(self, name: str, settle_s: float | None = None) -> None:
         """Let one of the parameters follow the machine from now on (`PhaseLockedLoop`).
@@ -114,7 +112,7 @@ class RunningObserver:
         ConfigError
             When the observer has no such parameter, or has delays.
         """
-        self._loop = PhaseLockedLoop(self.observer, name, 1, settle_s)
+        self._course.loop = PhaseLockedLoop(self.observer, name, 1, settle_s)
 
     @property
     def status(self) -> SampleStatus:
@@ -129,20 +127,10 @@ class RunningObserver:
     def reset(self, y: npt.ArrayLike) -> None:
         """Start again at a measurement, shape (q,); nothing of the past is left, the parameters stay."""
         first = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(self.observer.inputs))))
-        self._status, self._held = SampleStatus(int(first.status[0, 0])), Held.nothing(1, len(self.observer.inputs))
-        self._restarts = Restarts(self.observer.guard, 1)
-        self._fresh = bool(np.isfinite(first.y).any())
+        self._status, self._fresh = SampleStatus(int(first.status[0, 0])), bool(np.isfinite(first.y).any())
+        self._course.begin(first)
         if self._watch is not None:
             self._watch.reset()
-        self._begin(first.y[0])
-
-    def _begin(self, y: Array, u: Array | None = None) -> None:
-        self._steps.begin(y, u=u)
-        if self._loop is not None:
-            self._loop.begin()
-        if self._watch is not None:
-            self._watch.begin()
-        self._inputs: deque[Array] = deque()
 
     @cached_property
     def _filter_gain(self) -> Array:
@@ -151,16 +139,16 @@ class RunningObserver:
     @property
     def estimate(self) -> Estimate:
         """One-step prediction: the state at k from what arrived up to k - 1."""
-        return self._forward(self._steps.x)
+        return self._forward(self._course.steps.x)
 
     def filter(self, y: npt.ArrayLike) -> Estimate:
         """Return the estimate for k from what arrived up to k, y (q,), NaN where missing; nothing moves on."""
-        o = self.observer
-        if len(self._inputs) < o.runtime.delay:
+        o, steps = self.observer, self._course.steps
+        if len(self._course.ahead()) < o.runtime.delay:
             return self.estimate
         given = self._screen.take(self._measurement(y)[None, None], np.zeros((1, 1, len(o.inputs)))).y[0]
-        nu = np.where(np.isfinite(given), self._steps.innovation(given), 0.0)
-        return self._forward(self._steps.x + nu @ self._filter_gain.T)
+        nu = np.where(np.isfinite(given), steps.innovation(given), 0.0)
+        return self._forward(steps.x + nu @ self._filter_gain.T)
 
     def step(self, y: npt.ArrayLike, u: npt.ArrayLike) -> Estimate:
         """Take what arrives and the input at k, return the estimate for k + 1.
@@ -183,39 +171,26 @@ class RunningObserver:
         DimensionError
             When there are not as many measurements or inputs as the observer has.
         """
-        sample = self._screen.take(self._measurement(y)[None, None], self._input(u)[None, None], self._held)
-        self._status, self._held = SampleStatus(int(sample.status[0, 0])), sample.held
-        begins = bool(sample.starts[0, 0])
+        course, watch, bank = self._course, self._watch, self.observer.bank
+        sample = self._screen.take(self._measurement(y)[None, None], self._input(u)[None, None], course.held)
         if self._fresh and not (sample.held.since > LONGEST).any():  # it was started at this sample
-            self._held = replace(sample.held, stale=np.zeros(1, dtype=bool))
-            begins = begins and self.observer.bank is not None
+            starts = sample.starts & (bank is not None)
+            sample = replace(sample, starts=starts, held=replace(sample.held, stale=np.zeros(1, dtype=bool)))
         self._fresh = False
-        if begins:
-            self._begin(sample.y[0], sample.u[0])
-        self._inputs.append(sample.u[0])
-        if len(self._inputs) > self.observer.runtime.delay:
-            self._advance(sample.y[0], self._inputs.popleft())
-        if self._restarts.after(self._steps.waiting)[0]:
-            self._status |= SampleStatus.RESTARTED
-        if self._steps.waiting[0]:
-            self._held = replace(self._held, stale=np.ones(1, dtype=bool))
-        if self._watch is not None and self._watch.outside:
+        run = stepped(course, sample)
+        if course.loop is not None:
+            self.parameters[course.loop.name] = float(course.values[course.loop.name][0])
+        if watch is not None and run.starts[0, 0]:
+            watch.begin()
+        moved = bool(run.moving[0, 0])
+        if watch is not None and moved:
+            watch.take(run.innovation[0, 0], not sample.status[0, 0])
+        self._status = SampleStatus(int(sample.status[0, 0] | run.status[0, 0]))
+        if moved and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
+            self._status |= SampleStatus.LIMIT
+        if watch is not None and watch.outside:
             self._status |= SampleStatus.UNCERTIFIED
         return self.estimate
-
-    def _advance(self, y: Array, u: Array) -> None:
-        """Take the step of a sample, with the input of its time."""
-        steps = self._steps
-        if steps.waiting[0]:
-            return
-        if self._watch is not None:
-            self._watch.take(steps.innovation(y)[0].tolist(), not self._status)
-        if self._loop is None:
-            steps.step(y, u)
-        else:
-            self.parameters[self._loop.name] = float(self._loop.step(steps, y, u)[0])
-        if not steps.waiting[0] and self.observer.runtime.binds(steps.x[0]):
-            self._status |= SampleStatus.LIMIT
 
     def _measurement(self, y: npt.ArrayLike) -> Array:
         return self._shaped(y, "measurements", self._measured)
@@ -234,9 +209,9 @@ class RunningObserver:
 
     def _forward(self, x: Array) -> Estimate:
         """Predict states, shape (1, n), through the model over the inputs that no measurement has met yet."""
-        if self._inputs:
-            earlier, ahead = self._steps.earlier(self._inputs[0]), np.array(self._inputs)
-            x = forward(self.observer, self._steps.values, np.array([len(ahead)]), x, earlier, ahead)
+        ahead, steps = self._course.ahead(), self._course.steps
+        if len(ahead):
+            x = forward(self.observer, steps.values, np.array([len(ahead)]), x, steps.earlier(ahead[0]), ahead)
         return Estimate(self._places, self.observer.runtime.clip_estimate(x[0].copy()))
 
 

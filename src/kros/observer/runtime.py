@@ -94,27 +94,30 @@ class Runtime:
             object.__setattr__(self, name, np.asarray(value, dtype=float))
             if np.isnan(getattr(self, name)).any():
                 raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
-        if self.lower is not None and self.upper is not None and np.any(self.lower > self.upper):
+        if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
             raise DataError(f"{what}: lower limits {self.lower} should not exceed the upper ones {self.upper}.")
 
     def limits(self) -> dict[str, Array]:
         """Return the limits that there are, by name."""
         return {name: side for name, side in (("lower", self.lower), ("upper", self.upper)) if side is not None}
 
+    def sides(self, n: int) -> tuple[Array, Array]:
+        """Return lower and upper limits of the first n states, infinite where there are none."""
+        limits = self.limits()
+        return limits.get("lower", np.full(n, -np.inf))[:n], limits.get("upper", np.full(n, np.inf))[:n]
+
     def limited_states(self, n: int) -> list[int]:
         """Return which of n states have limits."""
-        sides = [np.isfinite(side) for side in self.limits().values()]
-        return [int(i) for i in np.flatnonzero(np.any(sides, axis=0))] if sides else []
+        return np.flatnonzero(np.isfinite(self.sides(n)).any(axis=0)).tolist()
 
     def binds(self, x: Array) -> bool:
         """Whether an estimate, (n,), meets a limit."""
-        low = self.lower is not None and bool(np.any(x <= self.lower))
-        return low or (self.upper is not None and bool(np.any(x >= self.upper)))
+        low, high = self.sides(len(x))
+        return bool(np.any((x <= low) | (x >= high)))
 
     def clip_estimate(self, x: Array) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
-        low, high = (side if side is None else side[: x.shape[-1]] for side in (self.lower, self.upper))
-        return x if low is None and high is None else np.asarray(np.clip(x, low, high))
+        return np.clip(x, *self.sides(x.shape[-1])) if self.limits() else x
 
     def times(self, x: Array) -> Runtime:
         """Return the same in other units of measure, by the factors of the states."""
@@ -127,18 +130,13 @@ class Runtime:
             if limit.shape != (n,):
                 raise DimensionError(f"Observer {name}: runtime.{key} should have shape ({n},), found {limit.shape}.")
 
-    def content(self) -> dict[str, Any]:
-        """Return what an observer's file holds of it: nothing that is as by default."""
-        return ({"delay": int(self.delay)} if self.delay else {}) | self.limits()
-
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
-        """Read what `content` returned; null stands for what is infinite."""
-        values = dict(content)
-        for name, none in (("lower", -np.inf), ("upper", np.inf)):
-            if values.get(name) is not None:
-                values[name] = np.array([none if limit is None else limit for limit in values[name]], dtype=float)
-        return cls(**values)
+        """Read the fields that a file holds; null stands for what is infinite."""
+        ends = {name: content.get(name) for name in ("lower", "upper")}
+        none = {"lower": -np.inf, "upper": np.inf}
+        limits = {k: np.array([none[k] if v is None else v for v in row]) for k, row in ends.items() if row}
+        return cls(content.get("delay", 0), **limits)
 
 
 @dataclass(frozen=True, eq=False)

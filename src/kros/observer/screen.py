@@ -22,8 +22,9 @@ and a start costs no more than a start. Parameters stay.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -103,36 +104,27 @@ class Screened:
 
     def of(self, members: Sequence[int] | Whole) -> Screened:
         """Return the samples of some members of the batch."""
-        held = Held(self.held.inputs[members], self.held.since[members], self.held.stale[members])
-        y, u, at = self.y[:, members], self.u[:, members], (slice(None), members)
-        return Screened(y, u, self.status[at], self.starts[at], self.complete[at], held)
+        signals: dict[str, Any] = {name: getattr(self, name)[:, members] for name in _SIGNALS}
+        return replace(self, held=Held(*(value[members] for value in vars(self.held).values())), **signals)
 
     def rows(self, part: slice) -> Screened:
         """Return some samples of all members."""
-        y, u, status, starts, complete = (getattr(self, name)[part] for name in _SIGNALS)
-        return Screened(y, u, status, starts, complete, self.held)
+        signals: dict[str, Any] = {name: getattr(self, name)[part] for name in _SIGNALS}
+        return replace(self, **signals)
 
     def after(self, before: Screened) -> Screened:
         """Return the samples behind earlier ones."""
-        both = (np.concatenate([getattr(before, name), getattr(self, name)]) for name in _SIGNALS)
-        y, u, status, starts, complete = both
-        return Screened(y, u, status, starts, complete, self.held)
+        signals: dict[str, Any] = {n: np.concatenate([getattr(before, n), getattr(self, n)]) for n in _SIGNALS}
+        return replace(self, **signals)
 
 
 def require_samples(who: str, measured: int, inputs: tuple[str, ...], y: Array, u: Array) -> None:
     """Refuse measurements and inputs that do not fit together, or to an observer."""
-    if y.ndim != 3 or u.ndim != 3 or y.shape[:2] != u.shape[:2] or not len(y):
+    n_samples, batch = y.shape[:2] if y.ndim == 3 and len(y) else (1, 0)
+    if (y.shape, u.shape) != ((n_samples, batch, measured), (n_samples, batch, len(inputs))):
         raise DimensionError(
-            f"Running {who}: measurements {y.shape} and inputs {u.shape} should agree in (n_samples, batch), with a "
-            "last axis for their channels and at least one sample."
-        )
-    if u.shape[2] != len(inputs):
-        raise DimensionError(
-            f"Running {who}: expected inputs {tuple(inputs)} on the last axis of u, found shape {u.shape}."
-        )
-    if y.shape[2] != measured:
-        raise DimensionError(
-            f"Running {who}: expected {measured} measurements on the last axis of y, found shape {y.shape}."
+            f"Running {who}: expected {measured} measurements and the inputs {tuple(inputs)} on the last axes of y and "
+            f"u, (n_samples, batch, .), with at least one sample, found shapes {y.shape} and {u.shape}."
         )
 
 
@@ -149,15 +141,16 @@ class Screen:
     @classmethod
     def of(cls, observer: ObserverData) -> Screen:
         """Return the screen of an observer: its declared limits, and the sizes seen in training."""
-        at, limits = list(observer.measured), observer.runtime.limits()
-        lower, upper = (limits[name][at] if name in limits else None for name in ("lower", "upper"))
-        return cls.sized(observer.seen, len(at), len(observer.inputs), lower, upper)
+        sides = (side[list(observer.measured)] for side in observer.runtime.sides(observer.lifting.n_states))
+        return cls.sized(observer.seen, len(observer.measured), len(observer.inputs), *sides)
 
     @classmethod
-    def sized(cls, seen: Seen | None, q: int, m: int, lower: Array | None = None, upper: Array | None = None) -> Screen:
+    def sized(
+        cls, seen: Seen | None, q: int, m: int, lower: float | Array = -np.inf, upper: float | Array = np.inf
+    ) -> Screen:
         """Return the screen for sizes seen in training, and limits of measurements where these are declared."""
         size, low, high = (np.full(q + m, end) for end in (np.inf, -np.inf, np.inf))
-        low[:q], high[:q] = low[:q] if lower is None else lower, high[:q] if upper is None else upper
+        low[:q], high[:q] = lower, upper
         if seen is not None:
             size = np.concatenate([seen.measured, seen.inputs])
             size[size == 0] = np.inf

@@ -9,16 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DimensionError
 from ..loops import Library, formulas, library, tape_of
 from .data import ObserverData
 from .monitor import judged_samples
 from .runtime import Guard, bounds
-from .screen import Bits, Flags, SampleStatus, Screened, Whole, screened
+from .screen import Bits, Flags, Held, SampleStatus, Screened, Whole, screened
 from .step import Parameters, Steps, forward
 
 Array = npt.NDArray[np.float64]
-_ROWS = 512  # samples predicted forward at a time
+_ROWS = 1000  # samples predicted forward at a time
 
 
 def run_observer(
@@ -73,11 +72,6 @@ def run_observers(
 ) -> Array:
     """Run observers of one model side by side, which differ in their corrections: (observer, n_samples, batch, n)."""
     first = observers[0]
-    if any(_kind(o) != _kind(first) for o in observers[1:]):
-        raise DimensionError(
-            f"Running {len(observers)} observers side by side: they differ in lifting, measured states, inputs, delay, "
-            "limits or ranges; run them one by one."
-        )
     if len(observers) > 1 and (first.bank is not None or (first.runtime.delay and first.lifting.history)):
         return np.stack([run_observer(o, y, u, parameters) for o in observers])
     (n_samples, batch), n = np.shape(y)[:2], first.lifting.n_states
@@ -87,14 +81,6 @@ def run_observers(
         if not np.may_share_memory(run.estimates, states):
             states[:, i] = run.estimates.swapaxes(1, 2)
     return states.transpose(1, 0, 3, 2)
-
-
-def _kind(observer: ObserverData) -> tuple[Any, ...]:
-    """Return what is alike where observers run side by side."""
-    run, seen = observer.runtime, observer.seen
-    limits = [side.tolist() for side in run.limits().values()]
-    sizes = None if seen is None else (seen.measured.tolist(), seen.inputs.tolist())
-    return observer.lifting, observer.measured, observer.inputs, run.delay, limits, sizes
 
 
 def run_innovations(
@@ -134,9 +120,9 @@ def _run(
 
 def _limit(observer: ObserverData, estimates: Array) -> None:
     """Bring estimates, (..., n), within their limits, in place."""
-    for i in observer.runtime.limited_states(observer.lifting.n_states):
-        low, high = (side if side is None else side[i] for side in (observer.runtime.lower, observer.runtime.upper))
-        np.clip(estimates[..., i], low, high, out=estimates[..., i])
+    n, sides = observer.lifting.n_states, observer.runtime.sides(observer.lifting.n_states)
+    for i in observer.runtime.limited_states(n):
+        np.clip(estimates[..., i], sides[0][i], sides[1][i], out=estimates[..., i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,9 +176,27 @@ class Course:
         self.since = np.full(batch, -1, dtype=np.intp)  # samples since a start, at most the delay
         self._before: Screened | None = None  # as many samples as measurements are late
 
+    @property
+    def held(self) -> Held | None:
+        """What is known of inputs before the next sample."""
+        return None if self._before is None else self._before.held
+
+    def ahead(self) -> Array:
+        """Return the inputs that no measurement has met yet, (samples, batch, m), of machines that started at once."""
+        u = self._before.u if self._before is not None else np.empty((0, 1, 0))
+        return u[len(u) - min(len(u), int(self.since[0]) + 1) :]
+
+    def begin(self, first: Screened) -> None:
+        """Start all machines at a sample, (1, batch, q), that `take` sees again."""
+        self.steps.begin(first.y[0])
+        self.restarts, self.since = Restarts(self.observer.guard, len(self.since)), np.full_like(self.since, -1)
+        self._before = replace(first.rows(slice(0)), held=Held.nothing(*first.u.shape[1:]))
+        if self.loop is not None:
+            self.loop.begin()
+
     def take(self, y: Array, u: Array) -> Stepped:
         """Run over the next samples, y (n_samples, batch, q) and u (n_samples, batch, m), with the bits of all."""
-        samples = screened(self.observer, y, u, None if self._before is None else self._before.held)
+        samples = screened(self.observer, y, u, self.held)
         loops, run = library(), None
         if loops is not None and self.even(samples):
             runs, restarted = _compiled(loops, [self], samples)
@@ -211,7 +215,8 @@ class Course:
     def enter(self, samples: Screened) -> tuple[Screened, int]:
         """Start at the first sample of all; return samples behind those that inputs are still needed of, a number."""
         if self._before is not None:
-            return samples.after(self._before), len(self._before.y)
+            lead = len(self._before.y)
+            return samples.after(self._before) if lead else samples, lead
         self.steps.begin(samples.y[0], u=np.where(samples.starts[0][:, None], samples.u[0], 0.0))
         later = samples.starts.copy()
         later[0] = False

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import ConfigError, DataError
+from ..core.errors import ConfigError
 from ..data.population import DEFAULT_CONDITION, OUTLIERS, Channel, EpisodeKey, Population, Unit
+from ..data.prepare import assemble
+from ..data.recording import Recording, Recordings
 
 Array = npt.NDArray[np.float64]
 
@@ -46,21 +48,12 @@ class SimulatedPopulation(Generic[T]):
     truth: T  # with ``as_dict()``
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedEpisodes:
-    """Source of raw episodes in memory, which can be pickled."""
+class SimulatedEpisodes(Recordings):
+    """Raw episodes in memory, (n, n_samples) a part: states, inputs, what states really were."""
 
-    parts: Mapping[EpisodeKey, tuple[Array, ...]]
-
-    def __call__(self, key: EpisodeKey) -> Array:
-        """Return the samples of an episode, shape (n_samples, n_states + n_inputs + n_truths)."""
-        if key not in self.parts:
-            raise DataError(f"Asked for {key}; the simulation has no such episode; take keys from population.episodes.")
-        return np.ascontiguousarray(np.concatenate(self.parts[key]).T)
-
-    def restricted(self, keys: Iterable[EpisodeKey]) -> SimulatedEpisodes:
-        """Return the same for fewer episodes, cheaper to send to another process."""
-        return SimulatedEpisodes({key: self.parts[key] for key in keys})
+    def read(self, key: EpisodeKey, place: tuple[Array, ...]) -> Recording:
+        """Return an episode."""
+        return Recording(key, np.ascontiguousarray(np.concatenate(place).T))
 
 
 @dataclass(frozen=True)
@@ -160,9 +153,9 @@ class Batch(BatchSettings, ABC, Generic[P]):
             noise = self.random(NOISE_STREAM, int(key.unit), at[1]).standard_normal((len(self.noise), n_samples))
             states[1 : 1 + len(noise), *at] += np.array(self.noise)[:, None] * noise
         states[0] = np.rint(states[0] / COUNT_RAD) * COUNT_RAD
-        source = SimulatedEpisodes({k: (states[:, u, e], inputs[e, None], true[:, u, e]) for k, (u, e) in keys.items()})
-        facts = (truth.sample_period_s, units, tuple(keys), source, {"plant": truth.plant}, self.truths)
-        population = Population(self.channels, *facts)
+        parts = {key: (states[:, u, e], inputs[e, None], true[:, u, e]) for key, (u, e) in keys.items()}
+        columns, about = (*self.channels, *self.truths), {"plant": truth.plant}
+        population = assemble(SimulatedEpisodes(parts), columns, units, truth.sample_period_s, about)
         return SimulatedPopulation(population, population, truth)
 
     def _units(self) -> tuple[tuple[Unit, ...], P]:

@@ -10,13 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from ...core.errors import DataError
-from ..readers.tables import ABSENT, DATES, PARQUET, Dialect, opened, parquet_head, timestamp_pattern
+from ..readers.tables import ABSENT, ORDERS, Dialect, cells_of, head_of, lines_of, microseconds
 from .examine import RULE
 from .roles import is_unit_row
 
 MARKS = ((";", ","), (";", "."), ("\t", ","), ("\t", "."), (",", "."), ("|", "."), ("|", ","), (" ", "."), (" ", ","))
 _NUMBER = re.compile(r"^[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)(?:[eEdD][+-]?\d+)?$")
+_CLOCK = re.compile(r"^(?:\d+[-./]\d+[-./]\d+[T ]\s*)?\d{1,2}:\d{2}:\d{2}\b")
 _ABSENT_WORDS = "nan +nan -nan null none na n/a inf -inf +inf #n/a"
 _NO_NUMBER = {"", *_ABSENT_WORDS.split(), *(a.lower() for a in ABSENT)}
 
@@ -42,21 +45,19 @@ class TableHead:
     def timestamp(self, column: int) -> str | None:
         """Return the order of the date where a column holds timestamps, or None."""
         cells = [c for c in self.cells(column) if c]
-        return next((order for order in DATES if cells and all(_is_time(c, order) for c in cells)), None)
+        if not cells or not all(map(_CLOCK.match, cells)):
+            return None
+        import pyarrow as pa
+
+        times = (microseconds(pa.array(cells), order) for order in ORDERS)
+        return next((order for order, values in zip(ORDERS, times, strict=True) if np.isfinite(values).all()), None)
 
 
 def look_at(path: Path) -> TableHead:
     """Return how a file is written; a text file by the reading with most rows of numbers of equal width."""
-    if path.suffix == PARQUET:
-        fields, cells = parquet_head(path, RULE.rows)
-        return TableHead(Dialect(), tuple(fields), ("",) * len(fields), tuple(cells))
-    with opened(path) as file:
-        content = b""
-        while len(content) < RULE.head and (more := file.read(RULE.head - len(content))):
-            content += more
+    content = head_of(path)
     encoding = encoding_of(content)
-    lines = content.decode(encoding, errors="replace").removeprefix("\ufeff").splitlines()
-    lines = lines[:-1] if len(content) >= RULE.head else lines
+    lines = lines_of(content, encoding, path)
     readings = [(_rows(lines, delimiter), delimiter, decimal) for delimiter, decimal in MARKS]
     rows, delimiter, decimal = max(readings, key=lambda reading: _score(reading[0], reading[2]))
     if _score(rows, decimal)[0] < 2:
@@ -84,10 +85,9 @@ def _rows(lines: Sequence[str], delimiter: str) -> list[list[str]]:
     rows = []
     for line in (*first, *rest[:: max(1, len(rest) // RULE.spread)]):
         try:
-            cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
+            rows.append(cells_of(line, delimiter))
         except csv.Error:
-            cells = []
-        rows.append([c.strip() for c in cells])
+            rows.append([])
     return rows
 
 
@@ -95,14 +95,10 @@ def _is_number(cell: str, decimal: str) -> bool:
     return bool(_NUMBER.match(cell)) and ("," if decimal == "." else ".") not in cell
 
 
-def _is_time(cell: str, order: str) -> bool:
-    return bool(re.match(timestamp_pattern(order), cell))
-
-
 def _is_data(row: Sequence[str], decimal: str) -> bool:
     """Tell whether a row holds numbers: at most half of its cells are text that is no time."""
     cells = [c for c in row if c.lower() not in _NO_NUMBER]
-    numbers = sum(_is_number(c, decimal) or any(_is_time(c, order) for order in DATES) for c in cells)
+    numbers = sum(_is_number(c, decimal) or bool(_CLOCK.match(c)) for c in cells)
     return len(row) > 1 and numbers >= 1 and 2 * numbers >= len(cells)
 
 

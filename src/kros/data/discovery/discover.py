@@ -21,8 +21,9 @@ from ...core.files import did_you_mean
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..readers.csv_folder import ENDINGS, csv_files, read_csv_folder
-from ..readers.tables import PARQUET, Dialect, file_fields, read_columns
+from ..readers.tables import Dialect, file_fields, read_table
 from ..recording import CHECK, some, usable
+from ..steps import GAP
 from .dialect import TableHead, look_at
 from .examine import RULE, EpisodeLook, examine, median_period
 from .filenames import infer_names, quoted
@@ -57,7 +58,7 @@ class Discovery:
 
 
 def discover(source: Path, wanted: Wanted | None = None, work: Work | None = None) -> Discovery:
-    """Describe a folder of text tables or of Parquet files of any layout."""
+    """Describe a folder of text tables."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
     mapping: dict[str, Any] = {"files": _names(list(alike), wanted.files)}
@@ -80,9 +81,10 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
     files = {relative: path for path, relative in csv_files(source)}
     selected = {relative: path for relative, path in files.items() if selects(relative)}
     if not selected:
-        there = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
-        advice = there if files else f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV or Parquet"
-        raise DataError(f"Looking at {source}: {advice}.")
+        problem = f"none of {len(files)} files of recordings matches --files {expression!r}; correct the expression"
+        if not files:
+            problem = f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV, or use kros.from_frame"
+        raise DataError(f"Looking at {source}: {problem}.")
     return selected
 
 
@@ -117,8 +119,7 @@ def _fits(path: Path, head: TableHead) -> bool:
         fields = file_fields(path, head.dialect)
     except DataError:
         return False
-    named = head.dialect.header or path.suffix == PARQUET
-    return set(head.fields) - {""} <= set(fields) if named else len(fields) == len(head.fields)
+    return set(head.fields) - {""} <= set(fields) if head.dialect.header else len(fields) == len(head.fields)
 
 
 def _columns(
@@ -179,11 +180,7 @@ def _time(
 
 def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
     """Read the numeric columns of a file, shape (n_columns, n_rows), NaN where a number cannot be used."""
-    if path.suffix == PARQUET:
-        values = read_columns(path, file_fields(path), [head.fields[i] for i in columns])
-    else:
-        names = [f"{name or 'column'} #{i + 1}" for i, name in enumerate(head.fields)]
-        values = read_columns(path, names, [names[i] for i in columns], head.dialect)
+    values = read_table(path, head.fields, columns, head.dialect).T
     return np.where(usable(values), values, np.nan)
 
 
@@ -251,9 +248,8 @@ def _examined(
     mapping = mapping | _exclusion([*excluded, *(_relative(population, source, key) for key in wrong)])
     retained = read_csv_folder(source, mapping)
     prepare, text = _resampling(population, source, good)
-    findings += [*text, *_lacking(retained)]
     reading = _reading(retained, source)
-    return Discovery(mapping, prepare, draft.columns, retained, notes, tuple(findings), bool(nan), reading)
+    return Discovery(mapping, prepare, draft.columns, retained, notes, (*findings, *text), bool(nan), reading)
 
 
 def _resampling(
@@ -267,19 +263,10 @@ def _resampling(
     recorded = f"(recorded at about {population.sample_period_s:.4g} s)"
     text = f"time is uneven: all episodes are resampled to a period of {period_s:g} s {recorded}"
     if uneven:
-        text += f", the worst step in {_relative(population, source, worst.key)} at sample {worst.uneven[1]}"
-    return ({"step": "resample", "period_s": period_s},), [text, *_gaps(population, source, looks)]
-
-
-def _gaps(population: Population, source: Path, looks: Sequence[EpisodeLook]) -> list[str]:
-    """Say what gaps in time leave of recordings."""
-    cut = sorted((s for s in looks if s.gap[0] > 0), key=lambda s: s.kept)
-    if not cut:
-        return []
-    first, where = cut[0], _relative(population, source, cut[0].key)
-    gap = f"a gap of {first.gap[0]:.3g} s after sample {first.gap[1]} of {where}"
-    text = f"{gap}, whose longest stretch without one is {100 * first.kept:.0f} % of it; that alone is taken"
-    return [text if len(cut) == 1 else f"{text}, as of {len(cut) - 1} more recordings with gaps, which lose less"]
+        where = f"at sample {worst.uneven[1]} of {_relative(population, source, worst.key)}"
+        text += f", the worst step differs by {worst.uneven[0] * period_s:.3g} s {where}"
+    text += f"; where a step is longer than {GAP:g} periods, the longest stretch without such a gap is taken"
+    return ({"step": "resample", "period_s": period_s},), [text]
 
 
 def _reading(population: Population, source: Path) -> str:
@@ -297,11 +284,3 @@ def _exclusion(names: Sequence[str]) -> dict[str, Any]:
 def _relative(population: Population, source: Path, key: EpisodeKey) -> str:
     recordings: Any = population.source
     return Path(recordings.recordings.places[key].path).relative_to(source).as_posix()
-
-
-def _lacking(population: Population) -> list[str]:
-    """Report units that were not recorded in every condition."""
-    recorded = {(u, c) for u, c, _ in population.groups()}
-    lacking = {u: [c for c in population.conditions if (u, c) not in recorded] for u in population.unit_ids}
-    lacks = [f"{u} lacks {some(conditions)}" for u, conditions in lacking.items() if conditions]
-    return [f"not every unit was recorded in every condition: {some(lacks)}"] if lacks else []

@@ -12,14 +12,12 @@ from ...core.errors import DataError
 from ...core.work import Work
 from ..population import EpisodeKey, Population
 from ..recording import GroupWatch, NonFiniteError, check_episode, check_increasing, copies_among, digest_of
-from ..steps import GAP, longest_stretch
 
 
 @dataclass(frozen=True)
 class DiscoveryRule:
     """What recordings are judged by before a study exists."""
 
-    head: int = 1 << 18  # bytes of a text file that say how it is written
     rows: int = 60  # first rows of numbers that are looked at closely
     spread: int = 200  # further lines, spread over the head: machines rest at first, and zeros have no decimal point
     above: int = 20  # lines that may stand before the header
@@ -41,8 +39,6 @@ class EpisodeLook:
     n_samples: int = 0
     period_s: float = np.nan  # median step of time
     uneven: tuple[float, int] = (0.0, 0)  # largest relative deviation of a step of time, and the sample before it
-    gap: tuple[float, int] = (0.0, 0)  # longest step of time where it is a gap, s, and the sample before it
-    kept: float = 1.0  # share of the samples in the longest stretch without a gap
     nan: str = ""  # where it holds NaN or infinity, or nothing
     digest: str = ""
 
@@ -67,18 +63,15 @@ def _look(population: Population) -> list[EpisodeLook]:
     for key in population.episodes:
         looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
-            recording = source.recorded(key)
+            recording = source.recordings(key)
             values, time = recording.values, recording.time_s
             check_increasing(recording)
             looks[key] = replace(looks[key], n_samples=len(values))
             if time is not None and len(time) > 1:
-                steps = np.diff(time)
-                period, deviation = float(np.median(steps)), np.abs(steps / np.median(steps) - 1)
-                uneven, longest = ((float(x.max()), int(x.argmax())) for x in (deviation, steps))
+                period = float(np.median(np.diff(time)))
+                deviation = np.abs(np.diff(time) / period - 1)
+                uneven = float(deviation.max()), int(deviation.argmax())
                 looks[key] = replace(looks[key], period_s=period, uneven=uneven)
-                if longest[0] > GAP * period:
-                    start, stop = longest_stretch(time, GAP * period)
-                    looks[key] = replace(looks[key], gap=longest, kept=(stop - start) / len(time))
             check_episode(values, key, population.columns)
             looks[key] = replace(looks[key], digest=digest_of(values))
             watch.add(key, values)

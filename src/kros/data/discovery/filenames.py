@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 
 from ..population import OUTLIERS
 
@@ -156,26 +156,26 @@ def _by_place(columns: list[tuple[str, ...]], varying: Sequence[int], left: Sequ
         if roles[i] is None and before and all(numbered):  # batch2/motor7: the batch is part of the name
             roles[i] = UNIT
         elif roles[i] is None:
-            few = len(set(columns[i])) <= 4 and not any(v.isdigit() for v in columns[i]) and i != varying[-1]
             labels = CONDITION in roles and len({re.sub(r"\d+", "", v.lower()) for v in columns[i]}) > 1
             free: str = UNIT if labels and not before else EPISODE  # KDN_1bar, O-ring257_3bar: these count nothing
-            roles[i] = CONDITION if (before or few) and CONDITION not in roles else free
+            roles[i] = CONDITION if before and CONDITION not in roles else free
 
 
 def _contiguous(roles: Roles) -> Roles:
-    """Keep of every role one stretch of places, with text between; later places become episodes."""
+    """Keep of every role one stretch of places, with text between; others become episodes, or are not needed."""
     for role in (GROUP, UNIT, CONDITION, EPISODE):
-        places = [i for i, r in enumerate(roles) if r == role]
-        if len(places) < 2:
-            continue
-        first, last = places[0], places[-1]
-        if all(r in (role, None) for r in roles[first : last + 1]):
-            roles[first : last + 1] = [role] * (last + 1 - first)
-        elif role is EPISODE:
-            for i in places[:-1]:
-                roles[i] = role if all(r in (role, None) for r in roles[i:last]) else "other"
-        else:
-            return _contiguous([EPISODE if i in places[1:] else r for i, r in enumerate(roles)])
+        runs: list[list[int]] = [[]]
+        for i, r in enumerate(roles):
+            if r == role:
+                runs[-1].append(i)
+            elif r is not None:
+                runs.append([])
+        runs = [run for run in runs if run]
+        if runs:
+            places = runs.pop(-1 if role is EPISODE else 0)
+            roles[places[0] : places[-1] + 1] = [role] * (places[-1] + 1 - places[0])
+        for i in chain(*runs):
+            roles[i] = "other" if role is EPISODE else EPISODE
     return roles
 
 

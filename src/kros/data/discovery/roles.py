@@ -15,6 +15,7 @@ from enum import Enum
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import AGREED
 from ..recording import CHECK
 
 Array = npt.NDArray[np.float64]
@@ -138,7 +139,7 @@ def clean_unit(text: str) -> str:
 def unit_of_factor(factor: float, unit: str) -> str:
     """Return the unit of measure that is so many radians, or radians per second; nothing where none is known."""
     sizes = ((name, size) for name, (size, base) in _TO_RADIANS.items() if base == unit)
-    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=1e-6)), "")
+    return next((name for name, size in sizes if math.isclose(size, factor, rel_tol=AGREED)), "")
 
 
 def identifier(text: str, taken: Collection[str] = ()) -> str:
@@ -179,11 +180,6 @@ def kind_of(name: str, unit: str = "") -> str:
     return next(quantities, "") if of_unit == "other" else of_unit
 
 
-def is_commanded(name: str) -> bool:
-    """Tell whether a name speaks of a command."""
-    return "input" in _kinds_of(name)
-
-
 def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[int]:
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
     rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
@@ -222,7 +218,7 @@ def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[Ta
     for i, column in enumerate(columns):
         part, why = column.part, column.why
         if part is not ColumnPart.TIME:
-            spare = _spare(i, column, proposed, samples)
+            spare = _spare(i, column, samples)
             part, why = (ColumnPart.LEFT_OUT, spare) if spare else _by_name(column)
         proposed.append(replace(column, part=part, why=why))
     free = [c.kind for c in proposed if c.part is ColumnPart.STATE]
@@ -231,7 +227,7 @@ def propose(columns: Sequence[TableColumn], samples: Sequence[Array]) -> list[Ta
     return [replace(c, part=ColumnPart.MEASURED) if c in measured else c for c in proposed]
 
 
-def _spare(i: int, column: TableColumn, before: Sequence[TableColumn], samples: Sequence[Array]) -> str:
+def _spare(i: int, column: TableColumn, samples: Sequence[Array]) -> str:
     """Return why a column is not needed, or nothing."""
     signals = [s[i] for s in samples]
     if all(np.isnan(s).mean() > 0.1 for s in signals):
@@ -241,16 +237,12 @@ def _spare(i: int, column: TableColumn, before: Sequence[TableColumn], samples: 
         return f"stays at {ends.pop():g} in the files that were looked at"
     if all(_counts(s) for s in signals):
         return "counts the samples"
-    if "spare" in _kinds_of(column.name):
-        return "by its name"
-    copies = (j for j, c in enumerate(before) if c.part is not ColumnPart.LEFT_OUT)
-    same = next((j for j in copies if all(np.array_equal(s[i], s[j]) for s in samples)), None)
-    return "" if same is None else f"the same as {before[same].header!r}"
+    return "by its name" if "spare" in _kinds_of(column.name) else ""
 
 
 def _by_name(column: TableColumn) -> tuple[ColumnPart, str]:
     """Return the part that the name and the unit of measure of a column speak for, and why."""
-    if is_commanded(split_header(column.header)[0]) or column.kind == "voltage":
+    if "input" in _kinds_of(split_header(column.header)[0]) or column.kind == "voltage":
         return ColumnPart.INPUT, "a command or a voltage, by name and unit"
     if column.kind in _STATES:
         return ColumnPart.STATE, f"{column.kind}, by name or unit"

@@ -1,4 +1,4 @@
-"""A folder of tables, text or Parquet, one episode or several a file, and its mapping, the keys of ``[data.csv]``."""
+"""A folder of tables of text, one episode or several a file, and its mapping, the keys of ``[data.csv]``."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import codecs
 import logging
 import os
 import re
-import sys
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,13 +16,13 @@ import numpy.typing as npt
 from pydantic import ConfigDict, Field, field_validator, model_validator
 
 from ...core.errors import DataError
-from ...core.files import did_you_mean, read_toml, require_regular
+from ...core.files import did_you_mean, read_toml
 from ...core.settings import Settings
 from ..population import DEFAULT_CONDITION, Channel, EpisodeKey, Population, Role, Scaling, Unit, columns_in_order
 from ..prepare import assemble, parse_steps
 from ..recording import Recording, Recordings, check_names, some, usable
 from ..steps import Scale, Step
-from .tables import PARQUET, Dialect, file_fields, read_blocks, read_columns
+from .tables import TIMESTAMP_SCALE, Dialect, file_fields, read_blocks
 
 Column = str | Annotated[int, Field(ge=1)]  # a name in the header, or a number counted from 1
 GROUPS = ("unit", "condition", "episode", "group")
@@ -166,11 +165,9 @@ class CsvMapping(Settings):
 
     def without(self, names: Collection[str]) -> CsvMapping:
         """Return the mapping without some channels."""
-        columns = [{name: c for name, c in u.columns.items() if name not in names} for u in self.unit]
         steps = [step.without(names) for step in parse_steps(self.prepare, "CSV mapping: prepare")]
         remaining = {
             "channel": tuple(c for c in self.channel if c.name not in names),
-            "unit": tuple(u.model_copy(update={"columns": c}) for u, c in zip(self.unit, columns, strict=True)),
             "prepare": tuple(step for step in steps if step is not None),
         }
         return self.model_copy(update=remaining)
@@ -191,7 +188,7 @@ def load_mapping(mapping: CsvMapping | Mapping[str, Any] | Path | str) -> CsvMap
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
-ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz", ".parquet")
+ENDINGS = (".csv", ".tsv", ".txt", ".dat", ".csv.gz", ".tsv.gz", ".txt.gz", ".dat.gz")
 DEFAULT_UNIT = "unit"
 DEFAULT_EPISODE = "0"
 _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
@@ -199,11 +196,11 @@ _NUMBER = re.compile(r"[-+]?[0-9.]+([eE][-+]?[0-9]+)?")
 
 @dataclass(frozen=True)
 class FilePlace:
-    """Where an episode is: a file, its columns, those wanted (time first, if any), and which piece of how many."""
+    """Where an episode is: a file, its columns, the positions of those wanted (time first), which piece of how many."""
 
     path: str
-    names: tuple[str, ...]
-    wanted: tuple[str, ...]
+    fields: tuple[str, ...]
+    wanted: tuple[int, ...]
     piece: tuple[int, int] = (0, 1)
 
 
@@ -221,30 +218,32 @@ class CsvRecordings(Recordings):
 
     def read(self, key: EpisodeKey, place: FilePlace) -> Recording:
         """Return one episode as recorded."""
-        i, n = place.piece
-        require_regular(Path(place.path), sys.maxsize)
-        columns = read_columns(Path(place.path), place.names, place.wanted, self.dialect, self.timestamp)
-        columns = columns[:, i * columns.shape[1] // n : (i + 1) * columns.shape[1] // n]
-        return self._recording(key, columns.T, columns[:1, :1])
+        (values,), (i, n) = self._values(place, np.inf), place.piece
+        part = values[i * len(values) // n : (i + 1) * len(values) // n]
+        return self._recording(key, part, part[:1])
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
-        """Yield one episode in blocks, unless it is a piece of a file, in Parquet, or with timestamps."""
-        place, first = self.places[key], np.zeros((0, 0))
-        if place.piece[1] > 1 or self.timestamp is not None or place.path.endswith(PARQUET):
+        """Yield one episode in blocks, unless it is a piece of a file."""
+        place = self.places[key]
+        if place.piece[1] > 1:
             yield self(key)
             return
-        before: Recording | None = None
-        for values in read_blocks(Path(place.path), place.names, place.wanted, self.dialect, rows):
-            first = first if first.size else values[:1, :1]
-            yield from [] if before is None else [before]
-            before = self._recording(key, values, first)
-        yield from [] if before is None else [before.ended()]
+        first, waiting = np.empty(0), list[Recording]()
+        for values in self._values(place, rows):
+            yield from waiting
+            first = first if first.size else values[:1]
+            waiting = [self._recording(key, values, first)]
+        yield waiting[0].ended()
+
+    def _values(self, place: FilePlace, rows: float) -> Iterator[Array]:
+        """Yield the columns of a file in blocks."""
+        return read_blocks(Path(place.path), place.fields, place.wanted, self.dialect, self.timestamp, rows)
 
     def _recording(self, key: EpisodeKey, values: Array, first: Array) -> Recording:
         """Return samples with their time, the first column if there is one, since the `first` of an episode."""
         if self.time_scale is None:
             return Recording(key, np.ascontiguousarray(values))
-        scale = 1.0 if self.timestamp is not None else self.time_scale
+        scale = self.time_scale if self.timestamp is None else TIMESTAMP_SCALE
         time, start = (np.where(usable(t), t, np.nan) for t in (values[:, 0], first[:, 0]))
         since = time - start  # before scaling: milliseconds since 1970 are whole numbers, seconds are not
         return Recording(key, np.ascontiguousarray(values[:, 1:]), since * scale)
@@ -253,7 +252,7 @@ class CsvRecordings(Recordings):
 def read_csv_folder(
     source: Path | str, mapping: CsvMapping | Mapping[str, Any] | Path | str, optional: Collection[str] = ()
 ) -> Population:
-    """Read a folder of CSV files (also gzip-compressed), or of Parquet files of any layout."""
+    """Read a folder of CSV files, also gzip-compressed."""
     chosen, source = load_mapping(mapping), Path(source)
     places: dict[EpisodeKey, FilePlace] = {}
     groups: dict[str, str] = {}
@@ -331,15 +330,11 @@ def _place(path: Path, fields: list[str], mapping: CsvMapping, unit: UnitMapping
     """Return where the channels of a unit are in a file."""
     wanted = [] if mapping.time is None else [mapping.time]
     wanted += [mapping.column(channel, unit) for channel in mapping.ordered]
-    names = [f"#{i}" for i in range(1, len(fields) + 1)]  # headers may repeat names that are not needed
     numbered = all(isinstance(c, int) and _NUMBER.fullmatch(f) for c, f in zip(wanted, fields, strict=False))
     if mapping.header and numbered:
         problem = f"one header line is needed, found numbers in the first line: {fields}"
         raise DataError(f"Reading {path}: {problem}; put the names of the columns first, or set header = false.")
-    positions = [_position(path, fields, column) for column in wanted]
-    for position, column in zip(positions, wanted, strict=True):
-        names[position] = column if isinstance(column, str) else f"column {column}"
-    return FilePlace(str(path), tuple(names), tuple(names[position] for position in positions))
+    return FilePlace(str(path), tuple(fields), tuple(_position(path, fields, column) for column in wanted))
 
 
 def _position(path: Path, fields: list[str], column: Column) -> int:

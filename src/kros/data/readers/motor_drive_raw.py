@@ -12,11 +12,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from datetime import datetime, timedelta
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,27 +24,13 @@ from ..steps import Offset, Scale, Shift, Step, Trim
 from .csv_folder import ChannelMapping, CsvMapping, csv_files, read_csv_folder
 from .tables import from_numpy
 
-
-@dataclass(frozen=True)
-class RawLayout:
-    """Numbers of the paper's layout."""
-
-    gear_ratio: int = 100
-    period_s: float = 1e-3
-    rest: int = 1000  # samples at rest before an episode
-    calibrated: tuple[int, int] = (500, 1000)  # samples of it in which the position is at its target
-    lag: int = 1  # samples by which targets lag the measurements
-    percent: float = 0.01
-    decimals: tuple[int, ...] = (6, 6, 5, 4, 6, 5)  # time, position, velocity, torque, targets of both
-    first: datetime = datetime(2023, 1, 1)  # of the stamps that are written
-
-    @property
-    def radians(self) -> float:
-        """Radians at the gear's output of a degree at the motor."""
-        return math.pi / 180 / self.gear_ratio
-
-
-LAYOUT = RawLayout()
+GEAR_RATIO = 100
+RADIANS = math.pi / 180 / GEAR_RATIO  # at the gear's output of a degree at the motor
+PERCENT = 1 / 100
+PERIOD_S = 1 / 1000
+REST = 1000  # samples at rest before an episode; in the second half of them the position is at its target
+LAG = 1  # samples by which targets lag the measurements
+STAMP = "20230101T000000"  # of the folders that are written
 GROUPS = ("population", OUTLIERS)
 CHANNELS = (
     Channel("position", Role.STATE, "deg", measured=True),
@@ -58,12 +40,12 @@ CHANNELS = (
     Channel("target_velocity", Role.INPUT, "deg/s"),
 )
 STEPS: tuple[Step, ...] = (
-    Scale(("position", "target_position"), LAYOUT.radians, "rad"),
-    Scale(("velocity", "target_velocity"), LAYOUT.radians, "rad/s"),
-    Scale(("current",), LAYOUT.percent, "1"),
-    Shift(("target_position", "target_velocity"), LAYOUT.lag),
-    Offset("position", "target_position", *LAYOUT.calibrated),
-    Trim(start=LAYOUT.rest),
+    Scale(("position", "target_position"), RADIANS, "rad"),
+    Scale(("velocity", "target_velocity"), RADIANS, "rad/s"),
+    Scale(("current",), PERCENT, "1"),
+    Shift(("target_position", "target_velocity"), LAG),
+    Offset("position", "target_position", REST // 2, REST),
+    Trim(start=REST),
 )
 FOLDER = r"\d{8}T\d{6}_(?P<unit>\d{6})_(?P<condition>load|noload)"
 EPISODE = r"[^/]*(?=\d{3}\.csv$)0{0,2}(?P<episode>\d{1,3})\.csv"  # the last three characters of the stem
@@ -75,7 +57,7 @@ MAPPING = CsvMapping(
         for number, c in enumerate(CHANNELS, start=2)
     ),
     prepare=STEPS,
-    metadata={"plant": "harmonic-drive", "gear_ratio": LAYOUT.gear_ratio},
+    metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
 
 HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
@@ -107,7 +89,7 @@ def read_motor_drive_raw(source: Path | str) -> Population:
         raise DataError(f"{what}: file {root / strange} should be named {wanted}; rename it or move it away.")
     population = read_csv_folder(root, MAPPING)
     steps = ((scale, population.sample_period_s * scale) for scale in (1e-3, 1e-6))
-    scale = next((scale for scale, step in steps if math.isclose(step, LAYOUT.period_s, rel_tol=0.01)), None)
+    scale = next((scale for scale, step in steps if math.isclose(step, PERIOD_S, rel_tol=0.01)), None)
     return population if scale is None else read_csv_folder(root, MAPPING.model_copy(update={"time_scale": scale}))
 
 
@@ -117,21 +99,15 @@ def write_raw(population: Population, out: Path | str) -> None:
     Targets are written one row later than the measurements that they belong to, so reading back gives one sample less
     (and 1000 less at rest).
     """
-    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
-        list(pool.map(lambda group: _write_folder(population, folder, *group), enumerate(population.groups())))
-
-
-def _write_folder(population: Population, folder: Path, index: int, keys_of: tuple[str, str, Any]) -> None:
-    """Write the episodes of one unit and condition."""
-    unit, condition, keys = keys_of
-    group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
-    stamp = (LAYOUT.first + timedelta(minutes=10 * index)).strftime("%Y%m%dT%H%M%S")
-    name = f"{stamp}_{unit}_{condition}"
-    target = folder / "batch_b" / group / name
-    target.mkdir(parents=True)
-    for key in keys:
-        content = raw_csv(population.read(key), population.sample_period_s)
-        (target / f"{name}_{int(key.episode):03d}.csv").write_bytes(content)
+    with whole_folder(Path(out)) as folder:
+        for unit, condition, keys in population.groups():
+            group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
+            name = f"{STAMP}_{unit}_{condition}"
+            target = folder / "batch_b" / group / name
+            target.mkdir(parents=True)
+            for key in keys:
+                content = raw_csv(population.read(key), population.sample_period_s)
+                (target / f"{name}_{int(key.episode):03d}.csv").write_bytes(content)
 
 
 def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
@@ -139,13 +115,10 @@ def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
     import pyarrow as pa
     from pyarrow import csv
 
-    recorded = values.copy()
-    recorded[LAYOUT.lag :, 3:] = values[: -LAYOUT.lag, 3:]
-    recorded[: LAYOUT.lag, 3:] = values[0, 3:]
-    recorded /= np.array([LAYOUT.radians, LAYOUT.radians, LAYOUT.percent, LAYOUT.radians, LAYOUT.radians])
-    columns = zip([np.arange(len(values)) * sample_period_s, *recorded.T], LAYOUT.decimals, strict=True)
-    rounded = [from_numpy(np.round(column, decimals) + 0.0) for column, decimals in columns]
-    table = pa.Table.from_arrays(rounded, names=[c.name for c in CHANNELS] + ["time"])
+    recorded = values / np.array([RADIANS, RADIANS, PERCENT, RADIANS, RADIANS])
+    recorded[LAG:, 3:] = recorded[:-LAG, 3:].copy()
+    columns = [from_numpy(column) for column in (np.arange(len(values)) * sample_period_s, *recorded.T)]
+    table = pa.Table.from_arrays(columns, names=["time", *(c.name for c in CHANNELS)])
     buffer = io.BytesIO(HEADER)
     buffer.seek(len(HEADER))
     csv.write_csv(table, buffer, csv.WriteOptions(include_header=False))

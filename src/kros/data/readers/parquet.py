@@ -10,11 +10,9 @@ then the index.
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, dataclass, field, replace
 from functools import lru_cache
 from hashlib import sha256
@@ -34,11 +32,9 @@ from ..prepare import assemble
 from ..recording import Recording, Recordings, check_structure, refuse_copies, usable_episodes
 from .tables import BLOCK, from_numpy, repeated, to_numpy
 
-logger = logging.getLogger(__name__)
-
 Array = npt.NDArray[np.float64]
 Place = tuple[str, int, int]
-Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # with their samples and digests
+Episodes = Iterable[tuple[EpisodeKey, Array, str]]  # usable ones, with their samples and digests
 INDEX = "population"  # kind of the artifact, hence population.json
 KEYS = ("unit", "condition", "episode")
 AGAIN = "convert the recordings again"
@@ -107,7 +103,7 @@ def _tables(path: Path, place: Place, columns: list[str], rows: int | None) -> I
             yield pa.Table.from_batches([part])
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def _metadata(path: Path, version: tuple[int, int]) -> Any:
     """Return the description of all row groups of a file, which are read one by one."""
     from pyarrow import parquet
@@ -167,16 +163,15 @@ class GroupRecord:
 
     unit: str
     condition: str
-    file: str = ""
-    episodes: tuple[str, ...] = ()  # in the order of the row groups
-    samples: tuple[int, ...] = ()  # length of each episode
+    file: str
+    episodes: tuple[str, ...]  # in the order of the row groups
+    samples: tuple[int, ...]  # length of each episode
     digests: tuple[str, ...] = ()  # of all samples of each episode
 
     @property
-    def recognised(self) -> list[tuple[EpisodeKey, str]]:
-        """Episodes with their digests."""
-        keys = [EpisodeKey(self.unit, self.condition, episode) for episode in self.episodes]
-        return list(zip(keys, self.digests, strict=True)) if self.digests else []
+    def keys(self) -> list[EpisodeKey]:
+        """Keys of the episodes."""
+        return [EpisodeKey(self.unit, self.condition, episode) for episode in self.episodes]
 
 
 @dataclass(frozen=True)
@@ -198,32 +193,23 @@ def _places(groups: Iterable[GroupRecord]) -> dict[EpisodeKey, Place]:
     for g in groups:
         if g.file in ("", ".", "..") or Path(g.file).name != g.file:
             raise ValueError(f"the file {g.file!r} is not beside the index")
-        for row_group, (episode, samples) in enumerate(zip(g.episodes, g.samples, strict=True)):
-            key = EpisodeKey(g.unit, g.condition, episode)
+        for row_group, (key, samples) in enumerate(zip(g.keys, g.samples, strict=True)):
             if key in places or samples < 0:
                 raise ValueError(f"{key} occurs twice, or has {samples} samples")
             places[key] = g.file, row_group, samples
     return places
 
 
-def write_group(
-    population: Population, unit: str, condition: str, folder: Path | str, episodes: Episodes | None = None
-) -> GroupRecord:
-    """Write the usable episodes of one unit and condition; by default they are read, prepared and checked here."""
-    keys = population.keys(unit, condition)
+def write_group(population: Population, folder: Path | str, episodes: Episodes) -> GroupRecord:
+    """Write the episodes of a population that is one unit in one condition."""
+    ((unit, condition, _),) = population.groups()
     path = Path(folder) / group_file(unit, condition)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        usable = usable_episodes(population, keys) if episodes is None else episodes
-        written = list(_write_episodes(population, usable, temporary))
-        if not written:
-            text = "Unit %s (%s) is left out: no episode of %d is left after dropping those with NaN."
-            logger.warning(text, unit, condition, len(keys))
-            return GroupRecord(unit, condition)
+        names, samples, digests = zip(*_write_episodes(population, episodes, temporary), strict=True)
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-    names, samples, digests = zip(*written, strict=True)
     return GroupRecord(unit, condition, path.name, names, samples, digests)
 
 
@@ -231,7 +217,8 @@ def group_file(unit: str, condition: str) -> str:
     """Return the name of the file of one unit and condition; different ids never share a name."""
     name = f"{quote(unit, safe='')}@{quote(condition, safe='')}"
     if len(name) > LONGEST_NAME:
-        name = f"{name[: LONGEST_NAME - 65]}~{sha256(name.encode()).hexdigest()}"
+        digest = f"~{sha256(name.encode()).hexdigest()}"
+        name = name[: LONGEST_NAME - len(digest)] + digest
     return f"{name}.parquet"
 
 
@@ -266,15 +253,13 @@ def write_index(
     population: Population, records: Iterable[GroupRecord], folder: Path | str, converted: bool = True
 ) -> None:
     """Write `population.json` for groups that were written; where they are `converted`, they are new recordings."""
-    groups = [g for g in records if g.episodes]
-    written, scaling = {g.unit for g in groups}, population.scaling
-    check_structure(population.columns, [EpisodeKey(g.unit, g.condition, e) for g in groups for e in g.episodes])
-    refuse_copies(pair for g in groups for pair in g.recognised)
+    groups, scaling = tuple(records), dict(population.scaling)
+    check_structure(population.columns, [key for g in groups for key in g.keys])
+    refuse_copies(pair for g in groups for pair in zip(g.keys, g.digests, strict=bool(g.digests)))
     if converted:
         scaling = {name: replace(scale, converted=scale.factor) for name, scale in scaling.items()}
-    channels, truths, units = population.channels, population.truths, [u for u in population.units if u.id in written]
-    facts = (population.sample_period_s, channels, tuple(units), dict(population.metadata))
-    index = _Index(*facts, tuple(replace(g, digests=()) for g in groups), truths, dict(scaling))
+    facts = (population.sample_period_s, population.channels, population.units, dict(population.metadata))
+    index = _Index(*facts, tuple(replace(g, digests=()) for g in groups), population.truths, scaling)
     save_artifact(Path(folder), INDEX, vars(index))
 
 
@@ -307,6 +292,7 @@ def write_parquet(population: Population, out: Path | str, converted: bool = Tru
     ...     print(sorted(path.name for path in Path(folder, "recordings").iterdir()))
     ['a@default.parquet', 'population.json']
     """
-    with whole_folder(Path(out)) as folder, ThreadPoolExecutor() as pool:
-        groups = [pool.submit(write_group, population, unit, c, folder) for unit, c, _ in population.groups()]
-        write_index(population, [group.result() for group in groups], folder, converted)
+    with whole_folder(Path(out)) as folder:
+        groups = [population.select([unit], [condition]) for unit, condition, _ in population.groups()]
+        records = [write_group(group, folder, usable_episodes(group)) for group in groups]
+        write_index(population, records, folder, converted)

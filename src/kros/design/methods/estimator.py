@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from ...identify.model_set import kind_of
-from ...observer import EstimatorSettings, Recordings, identify_estimator
+from ...observer import EstimatorSettings, Recordings, Seen, identify_estimator
 from ...observer.sensor import Sensor
 from ...synthesis import Status, Synthesis
 from ..task import Design, DesignTask, Method
@@ -38,12 +38,22 @@ class Estimator(Method):
         settings = models.sample_period_s, nominal, self.settings
         identified = identify_estimator(task.name, *channels, recordings, *settings)
         runtime = identified.observer.runtime
-        if task.limits is not None and runtime.lower is not None and runtime.upper is not None:
+        if task.limits is not None:
             n = len(task.limits[0])
-            lower, upper = runtime.lower.copy(), runtime.upper.copy()
+            lower, upper = (side.copy() for side in runtime.sides(identified.observer.lifting.n_states))
             lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
             runtime = replace(runtime, lower=lower, upper=upper)
-        observer = replace(identified.observer, runtime=runtime, seen=training.seen, sensor=task.sensor)
+        observer = replace(identified.observer, runtime=runtime, seen=self._seen(task), sensor=task.sensor)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)
         return Design(task.name, observer, synthesis, identified.facts)
+
+    def _seen(self, task: DesignTask) -> Seen | None:
+        """Return the sizes seen in training, without those of coordinates that go on for ever."""
+        seen, models, settings = task.recordings.seen, task.models, self.settings
+        if seen is None:
+            return None
+        free = {name for first, others in settings.unbounded.items() for name in (first, *others)}
+        measured = [models.lifting.states[i] in free for i in models.measured]
+        inputs = [name in free for name in models.recorded_inputs]
+        return Seen(np.where(measured, 0.0, seen.measured), np.where(inputs, 0.0, seen.inputs))

@@ -21,7 +21,7 @@ from ...observer.tracking import MOST, PhaseLockedLoop, measurement_sizes
 from ...observer.units import recorded_channel, recorded_factors
 from ..text import plain, plain_names
 from .origin import OriginShift, find_shift
-from .realise import RULE, Realised
+from .realise import RULE, realised
 
 Array = npt.NDArray[np.float64]
 DOUBLE, SINGLE = Precision(), Precision("float")
@@ -54,7 +54,7 @@ class LoadOutput:
 class Source:
     """An observer in the terms of its C source."""
 
-    realised: Realised
+    observer: Observer  # in the coordinates in which it is computed
     name: str
     precision: Precision
     shift: OriginShift | None
@@ -68,15 +68,10 @@ class Source:
         """Look at an observer; refuse what it cannot give."""
         if load is not None and (missing := [s for s in (load.load, load.current) if s not in observer.recorded]):
             raise ConfigError(f"Export: load torque needs {', '.join(missing)}, found {', '.join(observer.recorded)}.")
-        realised = Realised.of(observer)
-        loop = None if track is None else PhaseLockedLoop(realised.observer, track, 1)
-        shift = find_shift(realised.observer) if precision == "float" else None
-        return cls(realised, name, Precision(precision), shift, loop, load)
-
-    @property
-    def observer(self) -> Observer:
-        """The observer in the coordinates in which it is computed."""
-        return self.realised.observer
+        observer = realised(observer)
+        loop = None if track is None else PhaseLockedLoop(observer, track, 1)
+        shift = find_shift(observer) if precision == "float" else None
+        return cls(observer, name, Precision(precision), shift, loop, load)
 
     def context(self) -> dict[str, Any]:
         """Return everything that the templates name."""
@@ -127,23 +122,20 @@ class Source:
     def linear(self) -> dict[str, Any]:
         """Return the model and the correction, zeros left out."""
         o, K, n = self.observer, self.observer.controller, self.observer.lifting.n_states
-        write = self.precision.literal
-        parts = self.realised.model, o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
+        parts = np.hstack([o.A, o.B])[:n], o.into[:n] @ np.hstack([K.C, K.D]), np.hstack([K.A, K.B])
         sums = dict(zip(("model", "correction", "controller"), map(self.sums, parts), strict=True))
         return sums | {
             "operations": sum(np.count_nonzero(part) for part in parts),
-            "less": [(j, i, None if factor == 1 else write(factor)) for j, i, factor in self.realised.less],
             "filter_gain": self.sums(o.filter_gain),
         }
 
     def limits(self) -> dict[str, Any]:
         """Return limits and default parameters."""
-        o, q, limits, bounds = self.observer, len(self.measured), self.observer.runtime.limits(), self.bounds()
+        o, q, bounds, sides = self.observer, len(self.measured), self.bounds(), self.observer.runtime.sides
         largest = None if o.seen is None else o.seen.measured * BEYOND / np.abs(recorded_factors(o, self.measured))
         return {
-            "clips_estimate": bool(limits),
-            "lower": row(limits.get("lower", np.full(o.lifting.n_states, -np.inf))),
-            "upper": row(limits.get("upper", np.full(o.lifting.n_states, np.inf))),
+            "clips_estimate": bool(o.runtime.limits()),
+            **dict(zip(("lower", "upper"), map(row, sides(o.lifting.n_states)), strict=True)),
             "largest_angle": None if largest is None else ", ".join(f"{v:.6g}" for v in largest),
             "y_bounds": bounds[:q],
             "u_bounds": bounds[q:],
@@ -258,11 +250,11 @@ class Source:
             "filters": own.filters,
             "first": first,
             "fallback": o.lifting.n_states - first,
-            "start": self.sums(self.realised.start),
+            "start": self.sums(own.start),
             **{name: self.row(getattr(own, name)) for name in ("forget", "reach", "half", "recovery")},
             "longest": self.row(longest_age(own.half)),
             "ramp": self.sums(o.A[z, z]),
-            "into": self.matrix(self.realised.into),
+            "into": self.matrix(o.A[z][:, list(o.measured)]),
             "hidden": [f"{int(i not in o.measured)}u" for i in range(first)],
         }
 

@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import EPS, ITERATED, TINY
 from ...lifting import Lifting
 from ...observer.data import ObserverData
 from .realise import RULE
 
 Array = npt.NDArray[np.float64]
-_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +46,10 @@ def find_shift(observer: ObserverData) -> OriginShift | None:
     at, n, m = observer.measured[0], lifting.n_states, len(observer.inputs)
     size = np.ones(n + m)
     if observer.seen is not None:
-        size[[at, *range(n, n + m)]] = np.maximum(np.append(observer.seen.measured, observer.seen.inputs), _TINY)
+        size[[at, *range(n, n + m)]] = np.maximum(np.append(observer.seen.measured, observer.seen.inputs), TINY)
     moving = np.hstack([observer.A[:n, :n] - np.eye(n), observer.B[:n]])
     whole, rest = _direction(moving, at, n, size)
-    if np.abs(moving @ (whole + rest)).max() > RULE.rounding * max(np.abs(moving * (whole + rest)).max(), _TINY):
+    if np.abs(moving @ (whole + rest)).max() > RULE.rounding * max(np.abs(moving * (whole + rest)).max(), TINY):
         return None
     others = frozenset(lifting.states[i] for i in range(n) if rest[i] != 0 and i != at)
     period = _period(lifting, lifting.states[at], others)
@@ -63,14 +63,14 @@ def _direction(moving: Array, at: int, n: int, size: Array) -> tuple[Array, Arra
     free = np.arange(len(size)) != at
     whole, rest = np.eye(len(size))[at], np.zeros(len(size))
     for last in (False, True):
-        rest[free] = np.linalg.lstsq((moving * size)[:, free], -moving @ whole, rcond=1e-13)[0] * size[free]
+        rest[free] = np.linalg.lstsq((moving * size)[:, free], -moving @ whole, rcond=EPS * len(size))[0] * size[free]
         if not last:
             near = np.round(rest[n:])
-            whole[n:] = np.where(np.abs(rest[n:] - near) < RULE.plain, near, 0.0)
+            whole[n:] = np.where(np.abs(rest[n:] - near) < RULE.whole, near, 0.0)
     return whole, np.where(np.abs(rest) < RULE.rounding * size / size[at], 0.0, rest)
 
 
-@lru_cache(maxsize=64)
+@lru_cache
 def _period(lifting: Lifting, name: str, others: frozenset[str]) -> float | None:
     """Return the movement of a state after which all functions repeat; zero for any, None for none."""
     import sympy as sp
@@ -91,6 +91,6 @@ def _period(lifting: Lifting, name: str, others: frozenset[str]) -> float | None
 def _common(rates: list[Any]) -> float | None:
     ratios = np.array(rates) / min(rates)
     for count in range(1, RULE.periods + 1):
-        if np.abs(ratios * count - np.round(ratios * count)).max() < 1e-9:
+        if np.abs(ratios * count - np.round(ratios * count)).max() < ITERATED:
             return float(2 * np.pi / min(rates) * count)
     return None

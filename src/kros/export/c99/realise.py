@@ -1,15 +1,6 @@
-r"""The linear part of an observer as numbers that rounding does little to, and with few operations.
+"""The linear part of an observer with few operations: filters in the coordinates of their modes.
 
-Internal states are in the coordinates of their modes, a real block diagonal form: two multiplications each in place of
-one for every other state.
-
-An observer that watches the difference of a reference and a measurement has large columns of either that cancel: what
-is left is a millionth of either, and rounding is not. So the difference is formed first. For the input j and the
-measured state i with :math:`B_j \approx -c\,(A - I)_i`
-
-.. math:: (A - I)_i\, x_i + B_j u_j = \bigl((A - I)_i + c\, B_j\bigr) x_i + B_j\, (u_j - c\, x_i),
-
-of which the first column is small; it is formed before coordinates change.
+Internal states are in a real block diagonal form: two multiplications each in place of one for every other state.
 """
 
 from __future__ import annotations
@@ -19,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import ROUNDING
 from ...observer import Observer
 
 Array = npt.NDArray[np.float64]
@@ -29,83 +21,32 @@ class ExportRule:
     """How an observer is realised in C, and how the origin of single precision moves; estimates stay the same."""
 
     alike: float = 1e4  # condition of the modes, by which rounding grows, up to which they are used
-    smaller: float = 0.1  # of a column: what is left of it where a difference is worth a subtraction
-    plain: float = 0.01  # factors as near to a whole number are whole: their difference is exact
-    negligible: float = 1e-12  # of the largest entry of a block of modes: rounding
+    whole: float = 0.01  # factors as near to a whole number are whole: their difference is exact
     far: int = 8  # periods from the origin, as far as single precision goes
     rounding: float = 5e4 * np.finfo(float).eps  # of the largest term of a direction
-    periods: int = 64  # of the first function at most, until all others repeat
+    periods: int = 60  # of the first function at most, until all others repeat
     static: float = 0.01  # of the largest measurement: the step of the origin where no function repeats
 
 
 RULE = ExportRule()
 
 
-@dataclass(frozen=True, eq=False)
-class Realised:
-    """An observer as it is computed."""
-
-    observer: Observer
-    model: Array  # (n, n_lifted + m)
-    less: tuple[tuple[int, int, float], ...]
-    start: Array  # (n, n_lifted + m), of a filter bank
-    into: Array  # (filters, q), from measurements to the filters of a bank
-
-    @classmethod
-    def of(cls, observer: Observer) -> Realised:
-        """Realise an observer."""
-        n, less, A = observer.lifting.n_states, differences(observer), observer.A.copy()
-        start = np.zeros((n, 0)) if observer.bank is None else observer.bank.start.copy()
-        for j, i, factor in less:
-            A[:, i] += factor * observer.B[:, j]
-            if observer.bank is not None:
-                start[:, i] += factor * start[:, len(A) + j]
-        turn = to_modes(observer)
-        if turn is None:
-            return cls(observer, np.hstack([A[:n], observer.B[:n]]), less, start, _into(observer))
-        turned = in_coordinates(observer, turn)
-        own, measured = turned.A.copy(), list(observer.measured)
-        A = turn @ A @ np.linalg.inv(turn)  # leaves the measured columns apart from the others
-        for part in _parts(observer):
-            block = own[part, part]
-            if np.count_nonzero(turn[part, part]) > len(block):  # of modes, others have no rounding
-                block[np.abs(block) < RULE.negligible * np.abs(block).max()] = 0.0
-        model = np.hstack([own[:n], turned.B[:n]])
-        model[:, measured] = A[:n, measured]
-        turned = replace(turned, A=own)
-        return cls(turned, model, less, turn[:n, :n] @ start, _into(turned))
-
-
-def _into(observer: Observer) -> Array:
-    """Return the gains from measurements to the filters of a bank."""
+def realised(observer: Observer) -> Observer:
+    """Return an observer as it is computed; what is rounding among the modes of a bank's filters is left out."""
     if observer.bank is None:
-        return np.zeros((0, len(observer.measured)))
-    first = len(observer.recorded)
-    return observer.A[first : first + observer.bank.filters][:, list(observer.measured)]
+        return observer
+    turn = to_modes(observer)
+    turned = in_coordinates(observer, turn)
+    A = turned.A.copy()
+    for part in _parts(observer):
+        block = A[part, part]
+        if np.count_nonzero(turn[part, part]) > len(block):  # of modes, others have no rounding
+            block[np.abs(block) < ROUNDING * np.abs(block).max()] = 0.0
+    return replace(turned, A=A)
 
 
-def differences(observer: Observer) -> tuple[tuple[int, int, float], ...]:
-    """Return which input is better taken relative to which measured state, and the factor of the state."""
-    n, found, free = observer.lifting.n_states, [], set(range(len(observer.inputs)))
-    for i in observer.measured:
-        column = observer.A[:n, i] - np.eye(n)[i]
-        left = {}
-        for j in free:
-            along = observer.B[:n, j]
-            factor = -float(along @ column) / max(float(along @ along), 1e-300)
-            factor = 1.0 if abs(factor - 1) < RULE.plain else factor
-            left[j] = float(np.linalg.norm(column + factor * along)), factor
-        best = min(left, key=left.__getitem__, default=None)
-        if best is not None and left[best][0] < RULE.smaller * np.linalg.norm(column):
-            found.append((best, i, left[best][1]))
-            free.remove(best)
-    return tuple(found)
-
-
-def to_modes(observer: Observer) -> Array | None:
-    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted); None without a bank."""
-    if observer.bank is None:
-        return None
+def to_modes(observer: Observer) -> Array:
+    """Return coordinates of the modes of a bank's filters, (n_lifted, n_lifted)."""
     from scipy.linalg import matrix_balance
 
     n, turn = observer.lifting.n_states, np.eye(observer.lifting.n_lifted)

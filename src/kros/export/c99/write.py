@@ -177,18 +177,18 @@ class Golden:
     sure: npt.NDArray[Any]
 
     @classmethod
-    def of(cls, observer: Observer, track: str | None = None, count: int = 64, tolerance: float = 0.0) -> Golden:
+    def of(cls, observer: Observer, track: str | None = None, count: int = 60, tolerance: float = 0.0) -> Golden:
         """Run an observer on smooth signals with a missing measurement, a lost input and a spike."""
         q, m = len(observer.measured), len(observer.inputs)
         seen = observer.seen
         y_size, u_size = (np.ones(q), np.ones(m)) if seen is None else (seen.measured, seen.inputs)
         k = np.arange(count)[:, None]
-        y = y_size * 0.5 * np.sin(0.05 * k + np.arange(q))
-        u = u_size * 0.5 * np.sin(0.05 * (k + 1) + np.arange(m))
+        y = y_size * 0.5 * np.sin(k / 20 + np.arange(q))
+        u = u_size * 0.5 * np.sin((k + 1) / 20 + np.arange(m))
         y[count // 3 : count // 3 + 3] = np.nan
         u[count // 2] = np.inf
         if seen is not None:
-            y[2 * count // 3] = 40 * y_size
+            y[2 * count // 3] = 20 * y_size
         passes = 1 if observer.monitor is None else 2 + observer.monitor.settle // (count // 2)
 
         def run(factor: float) -> tuple[Array, npt.NDArray[np.uint32]]:

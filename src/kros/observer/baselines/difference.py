@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...data import EpisodeBatch
+from ...data.batch import hold_missing
 
 Array = npt.NDArray[np.float64]
 
@@ -26,7 +27,7 @@ class FilteredDifference:
     def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Estimate the rates from y (n_samples, batch, q), from rest; (n_samples, batch, n), NaN for other states."""
         del u, parameters
-        estimate = np.full((*y.shape[:2], self.n_states), np.nan)
+        y, estimate = hold_missing(y), np.full((*y.shape[:2], self.n_states), np.nan)
         for number, (measurement, state) in enumerate(self.pairs):
             rate = np.zeros(y.shape[1::-1])
             rate[:, 2:] = np.diff(y[:-1, :, measurement].T, axis=1) / self.sample_period_s
@@ -41,42 +42,31 @@ class FilteredDifference:
 
     def scaled_to(self, batch: EpisodeBatch, measured: Sequence[int]) -> FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
-        states, y = batch.states, batch.measurements(measured, arrived=False)
-        inside = (np.arange(len(y))[:, None] < batch.lengths).astype(float)
-        found = replace(self, scales=()).run(y, y[..., :0])
-        slopes = []
-        for _, state in self.pairs:
-            rate, truth = found[..., state] * inside, states[..., state] * inside
-            largest = np.abs(rate).max(initial=0.0) or 1.0
-            power = float(np.sum((rate / largest) ** 2))
-            slopes.append(float(np.sum(rate / largest * truth)) / power / largest if power else 1.0)
-        return replace(self, scales=tuple(slopes))
+        y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+        rates, states = replace(self, scales=()).run(y, y[..., :0])[inside], batch.states[inside]
+        products = [(rates[:, i] @ rates[:, i], rates[:, i] @ states[:, i]) for _, i in self.pairs]
+        return replace(self, scales=tuple(float(along / power) if power else 1.0 for power, along in products))
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:
     """Return which states are rates of measured ones: these explain a share of their variance, whatever the units."""
-    states, y, sample_period_s = batch.states, batch.measurements(measured, arrived=False), batch.sample_period_s
-    hidden = [j for j in range(states.shape[-1]) if j not in measured]
-    inside = np.arange(len(y))[:, None] < batch.lengths
-    share = np.zeros((len(measured), len(hidden)))
-    for i, j in np.ndindex(share.shape):
-        truth = states[..., hidden[j]][inside]
-        truth = (truth - truth.mean()) / (np.abs(truth).max(initial=0.0) or 1.0)
-        for cutoff in cutoffs_hz(sample_period_s)[::4]:
-            rate = FilteredDifference(states.shape[-1], ((i, hidden[j]),), float(cutoff), sample_period_s).run(
-                y, y[..., :0]
-            )
-            rate = rate[..., hidden[j]][inside]
-            rate = (rate - rate.mean()) / (np.abs(rate).max(initial=0.0) or 1.0)
-            power = float(rate @ rate) * float(truth @ truth)
-            found = float(rate @ truth)
-            share[i, j] = max(float(share[i, j]), found * abs(found) / power if power else 0.0)
-    pairs = []
-    for i in range(len(share)):
-        j = int(share[i].argmax()) if hidden else 0
-        if hidden and share[i, j] > explained and share[:, j].argmax() == i:
-            pairs.append((i, hidden[j]))
-    return tuple(pairs)
+    y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
+    states, n, dt = batch.states[inside], batch.states.shape[-1], batch.sample_period_s
+    hidden = [j for j in range(n) if j not in measured]
+    share = np.zeros((len(measured), n))
+    for i in range(len(measured)):
+        for cutoff in cutoffs_hz(dt)[::4]:
+            rates = FilteredDifference(n, tuple((i, j) for j in hidden), float(cutoff), dt).run(y, y[..., :0])[inside]
+            share[i] = np.maximum(share[i], [_explained(*pair) for pair in zip(rates.T, states.T, strict=True)])
+    best = [(i, int(j)) for i, j in enumerate(share.argmax(axis=1)) if share[i, j] > explained]
+    return tuple((i, j) for i, j in best if share[:, j].argmax() == i)
+
+
+def _explained(rate: Array, state: Array) -> float:
+    """Return the share of a state's variance that a rate of the same sign explains, zero for what is not estimated."""
+    if np.isnan(rate).any() or not np.ptp(rate) or not np.ptp(state):
+        return 0.0
+    return max(float(np.corrcoef(rate, state)[0, 1]), 0.0) ** 2
 
 
 def cutoffs_hz(sample_period_s: float) -> Array:

@@ -44,55 +44,34 @@ class ExtendedKalman:
     parameters: Mapping[str, float] = field(default_factory=dict)
     delay: int = 0  # samples by which measurements are late: it corrects as of then, and predicts forward
 
-    def run(
-        self,
-        y: Array,
-        u: Array,
-        parameters: Mapping[str, npt.ArrayLike] | None = None,
-        starts: npt.NDArray[np.bool_] | None = None,
-    ) -> Array:
-        """Predict a batch from y (n_samples, batch, q), NaN where missing, and u; machines start again at `starts`."""
-        return self.run_all(y, u, parameters, starts)[0]
+    def run(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
+        """Predict a batch from y (n_samples, batch, q), NaN where missing, and u, shape (n_samples, batch, n)."""
+        return self.run_all(y, u, parameters)[0]
 
-    def run_all(
-        self,
-        y: Array,
-        u: Array,
-        parameters: Mapping[str, npt.ArrayLike] | None = None,
-        starts: npt.NDArray[np.bool_] | None = None,
-    ) -> Array:
+    @np.errstate(over="ignore", invalid="ignore", divide="ignore")
+    def run_all(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None = None) -> Array:
         """Run all filters of a stack Q (k, n, n) side by side, shape (k, n_samples, batch, n)."""
         require_samples("the extended Kalman filter", len(self.measured), self.inputs, y, u)
-        starts = np.zeros(y.shape[:2], dtype=bool) if starts is None else starts
+        lifting, n, C, (n_samples, batch) = self.lifting, self.lifting.n_states, list(self.measured), y.shape[:2]
+        values = {**self.parameters, **(parameters or {})}
+        values = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,)) for name, v in values.items()}
         if self.delay:
-            return self._late(y, u, parameters, starts)
-        lifting, n, C = self.lifting, self.lifting.n_states, list(self.measured)
+            return self._late(y, u, values)
         Q = self.Q.reshape(-1, 1, n, n)
-        k, (n_samples, batch) = len(Q), y.shape[:2]
-        values = {
-            name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))
-            for name, v in {**self.parameters, **(parameters or {})}.items()
-        }
-        x, P = np.zeros((k, batch, n)), np.zeros((k, batch, n, n))
-        earlier = np.zeros((k, batch, len(lifting.window.earlier)))
-        estimates = np.empty((n_samples, k, batch, n))
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            for sample in range(n_samples):
-                begins, held = starts[sample] | (sample == 0), np.broadcast_to(u[sample], (k, *u[sample].shape))
-                estimates[sample] = x
-                if begins.any():
-                    x[:, begins], P[:, begins] = 0.0, self.P0
-                    x[..., C] = np.where(begins[:, None], np.where(np.isfinite(y[sample]), y[sample], 0.0), x[..., C])
-                if sample == 0:
-                    estimates[0] = x
-                x, P = self._corrected(x, P, y[sample])
-                earlier = np.where(begins[:, None], lifting.window.hold(x, held), earlier) if begins.any() else earlier
-                window = np.concatenate([x, earlier], axis=-1)
-                F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
-                x = self._ahead(window, held, values)
-                P = F @ P @ np.swapaxes(F, -1, -2) + Q
-                P = (P + P.swapaxes(-1, -2)) / 2
-                earlier = lifting.window.advance(window, held)
+        x, P = np.zeros((len(Q), batch, n)), np.broadcast_to(self.P0, (len(Q), batch, n, n))
+        x[..., C] = np.where(np.isfinite(y[0]), y[0], 0.0)
+        u = np.broadcast_to(u[:, None], (n_samples, len(Q), *u.shape[1:]))
+        estimates, earlier = np.empty((n_samples, *x.shape)), None
+        for sample in range(n_samples):
+            estimates[sample] = x
+            x, P = self._corrected(x, P, y[sample])
+            earlier = lifting.window.hold(x, u[0]) if earlier is None else earlier
+            window = np.concatenate([x, earlier], axis=-1)
+            F = self.A[:n, :n] + self.A[:n, n:] @ lifting.slopes(window, values)[..., :n]
+            x = self._ahead(window, u[sample], values)
+            P = F @ P @ np.swapaxes(F, -1, -2) + Q
+            P = (P + P.swapaxes(-1, -2)) / 2
+            earlier = lifting.window.advance(window, u[sample])
         return np.moveaxis(estimates, 0, 1)
 
     def _ahead(self, window: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
@@ -105,21 +84,19 @@ class ExtendedKalman:
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
         PC, nu = P[..., list(self.measured)], y - x[..., list(self.measured)]
-        L, lost = _divided(PC, PC[..., list(self.measured), :] + self.R), np.atleast_1d(~np.isfinite(y).all(axis=-1))
-        L, nu = np.where(lost[:, None, None], 0.0, L), np.where(lost[:, None], 0.0, nu)
+        S, lost = PC[..., list(self.measured), :] + self.R, np.atleast_1d(~np.isfinite(y).all(axis=-1))
+        L, nu = np.where(lost[:, None, None], 0.0, PC @ np.linalg.inv(S)), np.where(lost[:, None], 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)
 
-    def _late(
-        self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike] | None, starts: npt.NDArray[np.bool_]
-    ) -> Array:
+    def _late(self, y: Array, u: Array, values: Mapping[str, npt.ArrayLike]) -> Array:
         """Run on what was measured, and predict each estimate to the row in which it is there."""
-        d, values = min(self.delay, len(y) - 1), {**self.parameters, **(parameters or {})}
+        d = min(self.delay, len(y) - 1)
         if self.lifting.history:
             raise DimensionError(
                 f"Extended Kalman filter: a delay of {d} samples needs a lifting of present values, found "
                 f"{self.lifting.functions}."
             )
-        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], parameters, starts[d:])
+        x = replace(self, delay=0).run_all(y[d:], u[: len(u) - d], values)
         late = np.empty((len(x), len(y), *x.shape[2:]))
         for step in range(d):
             late[:, step] = x[:, 0]  # nothing arrived but where to start
@@ -133,11 +110,3 @@ def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
     P0 = np.diag(scale**2)
     P0[np.ix_(list(measured), list(measured))] = R
     return np.asarray(P0)
-
-
-def _divided(PC: Array, S: Array) -> Array:
-    """``PC S^-1``, without a solver where there is one measurement; a filter that diverged stays not a number."""
-    if S.shape[-1] == 1:
-        return np.asarray(PC / S)
-    finite = np.isfinite(S).all(axis=(-2, -1), keepdims=True)
-    return np.asarray(np.where(finite, PC @ np.linalg.inv(np.where(finite, S, np.eye(S.shape[-1]))), np.nan))

@@ -49,7 +49,7 @@ class Learned:
 
         del parameters
         delays, samples = len(self.weights), len(y)
-        z = np.concatenate([y, u], axis=-1)
+        z = np.concatenate([hold_missing(y), u], axis=-1)
         first, moved = z[0], np.concatenate([np.zeros((1, *z.shape[1:])), z[:-1] - z[0]])
         size = next_fast_len(samples + delays, real=True)
         spectrum = rfft(moved, size, axis=0)[:, :, None] @ rfft(self.weights, size, axis=0)[:, None]

@@ -201,7 +201,7 @@ def relift_certificate(
         system = result.system(observer)
     except UnboundedSlopeError as error:
         return replace(result, status=ReliftStatus.UNBOUNDED, reason=f"No certificate: {error}.")
-    result = replace(result, channels=system.channels, start=np.zeros((0, 0)) if system.start is None else system.start)
+    result = replace(result, channels=system.channels, start=system.start)
     if growing := growing_place(system):
         return replace(result, status=ReliftStatus.UNSTABLE, reason=growing)
     proof = first_proof(system)

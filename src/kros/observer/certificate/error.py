@@ -23,7 +23,7 @@ d_k       : position of every slope in its interval
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -115,18 +115,13 @@ class ErrorSystem:
     C: Array  # (n_z, n_xi)
     dt: float  # s
     channels: tuple[str, ...] = ()  # what moves in every channel, for people
-    E: Array | None = None  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
-    start: Array | None = None  # (n_xi, n_window): where the first error goes; the first states by default
-
-    @property
-    def nested(self) -> Array:
-        """E, shape (n_p, n_p)."""
-        return np.zeros((self.L.shape[1], self.L.shape[1])) if self.E is None else self.E
+    E: Array | float = 0.0  # (n_p, n_p): strictly triangular up to the order of channels; zero by default
+    start: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (n_xi, n_window): where the first error goes
 
     def closed(self, d: npt.ArrayLike) -> Array:
         """Return ``(I - diag(d) E)^-1 diag(d)``, shape (n_p, n_p)."""
-        moved = np.diag(np.asarray(d, dtype=float))
-        return moved if self.E is None else np.asarray(np.linalg.solve(np.eye(len(moved)) - moved @ self.E, moved))
+        d = np.asarray(d, dtype=float)
+        return np.asarray(np.linalg.solve(np.eye(len(d)) - d[:, None] * self.E, np.diag(d)))
 
     def corner(self, d: npt.ArrayLike) -> tuple[Array, Array]:
         """Return ``A + L d M`` and ``B + L d D``, d (n_p,) a place in the box."""
@@ -139,7 +134,7 @@ class ErrorSystem:
         B = np.hstack([self.L / root * gain, self.B])
         C = np.vstack([_WIDER * root[:, None] * self.M, self.C])
         D = np.zeros((len(C), B.shape[1]))
-        D[: len(root), : len(root)] = _WIDER * root[:, None] * self.nested / root * gain
+        D[: len(root), : len(root)] = _WIDER * root[:, None] * self.E / root * gain
         D[: len(root), len(root) :] = _WIDER * root[:, None] * self.D
         return (self.A, B), C, D
 
@@ -155,7 +150,7 @@ class ErrorSystem:
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' (frozen) to the rest: ``r+ = A r + L p``, ``p = d (M r + E p + q')``."""
         width = self.L.shape[1]
-        return replace(self, B=np.zeros_like(self.L), D=np.eye(width), start=None)
+        return replace(self, B=np.zeros_like(self.L), D=np.eye(width))
 
 
 def error_system(
@@ -239,8 +234,7 @@ class _Assembly:
             start = np.zeros((n_xi, h))
             start[h + order + np.arange(len(self.slots)), self.slots] = 1.0
             start[n_xi - len(shown) :, :n] = np.eye(n)[shown]
-        dt, nested = self.observer.sample_period_s, E if E.any() else None
-        return ErrorSystem(A, L, B, M, D, C, dt, tuple(self.channels), nested, start)
+        return ErrorSystem(A, L, B, M, D, C, self.observer.sample_period_s, tuple(self.channels), E, start)
 
     def late(self, after: Array) -> list[Array]:
         """Return what follows with a delay: measured error, its residuals, latest first, and predicted error."""

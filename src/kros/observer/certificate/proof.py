@@ -49,15 +49,14 @@ class ProofSettings:
     accuracy: float = 5e-4  # of the least squared gain on the grid
     rounds: int = 60  # of cutting planes
     cuts: int = 30  # of a round
-    above: tuple[float, ...] = (1.001, 1.01, 1.1, 2.0)  # of the least gain on the grid: what is tried
+    above: int = 3  # decimals of 1.001, the first multiple of the least gain on the grid that is tried; 2 is the last
     spare: float = 0.25  # share of the distance to one that the extra output may take
     corners: int = 64  # of a box, which are visited where slopes are frozen
-    bits: int = 96  # of the scaled matrix that is decided on; the rounding to them is subtracted
 
 
 SETTINGS = ProofSettings()
-_TIGHT = 1e-8  # relative, of a norm that decides
 _DIGITS = np.finfo(float).nmant + 1  # binary, of a number
+_BITS = 2 * _DIGITS  # of the scaled matrix that is decided on; the rounding to them is subtracted
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +115,11 @@ def proposals(system: ErrorSystem) -> Iterator[Proof]:
     if multipliers is None or not np.isfinite(least):
         return
     size = float(np.linalg.norm(system.B) * np.linalg.norm(system.C))
-    least = max(least, np.sqrt(EPS) ** 1.5 * size, TINY)  # nothing arrives: any will do
-    for factor in SETTINGS.above:  # multipliers that grow with the gain leave room for what the grid did not see
+    least = max(least, ROUNDING * size, TINY)  # nothing arrives: any will do
+    for decimals in range(
+        SETTINGS.above, -1, -1
+    ):  # multipliers that grow with the gain leave room for what the grid did not see
+        factor = 1 + 10.0**-decimals
         R = lyapunov_factor(system, multipliers * factor, least * factor)
         if R is not None:
             yield Proof(least * factor, R, multipliers * factor)
@@ -184,7 +186,7 @@ def gain_squared(H: Complex, t: Array) -> float:
 
 def _responses(system: ErrorSystem) -> Complex:
     """H at many frequencies: those of the poles and a logarithmic grid; shape (f, n_p + n_z, n_p + n_w)."""
-    C, D = np.vstack([system.M, system.C]), np.hstack([system.nested, system.D])
+    C, D = np.vstack([system.M, system.C]), np.hstack([np.broadcast_to(system.E, 2 * (system.L.shape[1],)), system.D])
     D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
     plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
     poles = np.log(plant.poles().astype(complex) + TINY)
@@ -204,7 +206,7 @@ def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Arr
     inputs, feed, n = inputs / gain, feed / gain, len(A)
     T, back = reachable_coordinates(A, inputs, system.dt)
     A, inputs, outputs = np.eye(n) + back @ (A - np.eye(n)) @ T, back @ inputs, outputs @ T
-    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), _TIGHT) * (1 + _TIGHT)) ** 2
+    room = 1 - (hinf_norm(StateSpace(A, inputs, outputs, feed, system.dt), ITERATED) * (1 + ITERATED)) ** 2
     if room <= 0:
         return None
     spread = hinf_norm(StateSpace(A, inputs, np.eye(n), np.zeros((n, inputs.shape[1])), system.dt), 1e-2)
@@ -257,7 +259,7 @@ def positive(F: Integers) -> bool:
     half = [int(F[i, i]).bit_length() // 2 for i in range(n)]
     M = np.empty((n, n), dtype=object)
     for i, j in np.ndindex(n, n):  # diagonal entries of alike size, few bits
-        M[i, j] = (int(F[i, j]) << SETTINGS.bits) >> (half[i] + half[j])
+        M[i, j] = (int(F[i, j]) << _BITS) >> (half[i] + half[j])
     M[range(n), range(n)] -= n
     pivot = 1
     for k in range(n):

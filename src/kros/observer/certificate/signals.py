@@ -120,9 +120,8 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
 
 def frozen_response(system: ErrorSystem, w: Array, first: Array) -> tuple[Array, Array]:
     """Return the scaled errors and what the slopes act on, (n_samples, batch, .), with slopes in the middle."""
-    start = first @ (np.eye(len(system.A), first.shape[1]) if system.start is None else system.start).T
     w = np.concatenate([w, np.zeros((1, *w.shape[1:]))])
-    xi = recursion(system.A, w, start, system.B)
+    xi = recursion(system.A, w, first @ system.start.T, system.B)
     return np.asarray(xi @ system.C.T), np.asarray(xi @ system.M.T + w @ system.D.T)
 
 

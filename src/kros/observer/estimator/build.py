@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.errors import ConfigError
 from ...core.lti import gain
 from ...lifting import Lifting
 from ...synthesis.result import Injection
@@ -83,16 +84,18 @@ def identify_estimator(
     settings, measured = settings or EstimatorSettings(), tuple(measured)
     n = lifting.n_states
     hidden = [i for i in range(n) if i not in measured] or list(measured)
+    require_known(settings.unbounded, [lifting.states[i] for i in measured], inputs)
     readout, family = best_family(lifting, measured, inputs, recordings, settings, hidden)
     channels = readout.design.channels
     blind_channels = channels.without_measurements()
     blind_bank = Bank.of(blind_channels, recordings.length, settings)
     blind = Readout.of(Design(blind_channels, blind_bank, recordings, settings))
-    first = first_estimate(channels, recordings)
+    held = [measured[i] for i in blind_channels.held]
     reach = settings.reach * recordings.size[list(measured)]
 
     def observer_of(filters: Filters, fallback: Filters) -> Observer:
-        own = name, lifting, inputs, channels, filters, fallback, first, sample_period_s, parameters or {}, reach
+        absolute = filters.absolute(channels), fallback.absolute(blind_channels)
+        own = name, lifting, inputs, channels, *absolute, sample_period_s, parameters or {}, reach
         return assembled(*own)
 
     filters, fallback = (reduced(r, errors_of(r), settings.order, settings.loss) for r in (readout, blind))
@@ -104,12 +107,12 @@ def identify_estimator(
         reduced(rest, errors_of(rest), len(fallback.A), settings.loss),
     )
     assert observer.bank is not None
-    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings))
+    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings, held))
     observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
     errors = np.exp(np.log(readout.left_out).mean(axis=0) / 2)
     growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
-    worst = np.sqrt(np.max(list(readout.unit_errors().values()), axis=0))
+    worst = np.sqrt(readout.episode_errors().max(axis=0))
     facts = {
         "channels": family,
         "filters": len(filters.A),
@@ -124,6 +127,16 @@ def identify_estimator(
         "settle_samples": settle_samples(filters, fallback, observer.bank),
     }
     return Identified(observer, readout, family, facts)
+
+
+def require_known(unbounded: Mapping[str, Sequence[str]], measured: Sequence[str], inputs: Sequence[str]) -> None:
+    """Refuse names of unbounded coordinates that are no measured states, or no inputs behind these."""
+    others = [name for together in unbounded.values() for name in together]
+    if wrong := [*(set(unbounded) - set(measured)), *(set(others) - set(inputs))]:
+        raise ConfigError(
+            f"Estimator: unbounded should map measured states {list(measured)} to inputs that go on with them, of "
+            f"{list(inputs)}, found {sorted(wrong)}; correct the names."
+        )
 
 
 def bounded(observer: Observer, recordings: Recordings, room: float) -> Runtime:
@@ -144,7 +157,7 @@ def best_family(
     hidden: Sequence[int],
 ) -> tuple[Readout, str]:
     """Return the readout of the first family after which the next is not better by the margin on left-out units."""
-    ranges = ranges_of(lifting, measured, inputs, recordings)
+    ranges = ranges_of(lifting, measured, inputs, recordings, settings)
     best: Readout | None = None
     chosen = FAMILIES[0]
     for family in FAMILIES:
@@ -172,10 +185,14 @@ def errors_of(readout: Readout) -> Array:
 
 
 def ranges_of(
-    lifting: Lifting, measured: Sequence[int], inputs: Sequence[str], recordings: Recordings
+    lifting: Lifting,
+    measured: Sequence[int],
+    inputs: Sequence[str],
+    recordings: Recordings,
+    settings: EstimatorSettings,
 ) -> dict[str, tuple[float, float]]:
     """Return the least and largest value of measured states and inputs in the units that formulas are written in."""
-    batches = [recordings.read(key) for key in recordings.some(150).keys]
+    batches = [recordings.read(key) for key in recordings.some(settings.episodes).keys]
     found = {}
     names = [lifting.states[i] for i in measured]
     for name, size in zip([*names, *inputs], lifting.sizes_of([*names, *inputs]), strict=True):
@@ -187,42 +204,6 @@ def ranges_of(
     return found
 
 
-def first_estimate(channels: Channels, recordings: Recordings) -> Array:
-    """Return the map (n, channels) from all channels of the first sample to the first state."""
-    v, x = [], []
-    for key in recordings.keys:
-        batch = recordings.read(key)
-        y, u = batch.measurements(channels.measured)[0], batch.inputs[0]
-        v.append(channels.signals(y, u, batch.parameters)[0])
-        x.append(batch.states[0, 0])
-    units = np.array([key.unit for key in recordings.keys])
-    some = np.array([*range(channels.linear), len(channels) - 1])
-    found = np.zeros((x[0].size, len(channels)))
-    found[:, some] = _ridge(np.array(v)[:, some], np.array(x), units).T
-    found[list(channels.measured)] = np.eye(len(channels.measured), len(channels))
-    return found
-
-
-def _ridge(X: Array, T: Array, units: npt.NDArray[Any]) -> Array:
-    """Return ridge coefficients, the penalty best on left-out units; the last column, a constant, has no penalty."""
-    size = np.sqrt(np.mean(X**2, axis=0))
-    X = X / np.where(size > 0, size, 1.0)
-
-    def solved(rows: npt.NDArray[np.bool_], penalty: float) -> Array:
-        rest = np.sqrt(penalty * rows.sum()) * np.eye(X.shape[1])
-        rest[-1] = 0.0
-        stacked = np.vstack([T[rows], np.zeros((X.shape[1], T.shape[1]))])
-        return np.asarray(np.linalg.lstsq(np.vstack([X[rows], rest]), stacked, rcond=None)[0])
-
-    def score(penalty: float) -> float:
-        errors = [((T[units == u] - X[units == u] @ solved(units != u, penalty)) ** 2).mean(axis=0) for u in set(units)]
-        return float(np.log(np.mean(errors, axis=0) + 1e-30).sum())
-
-    every, several = np.ones(len(units), dtype=bool), len(set(units)) > 1
-    best = min((10.0**d for d in range(-8, 3)), key=score) if several else 1e-4
-    return solved(every, best) / np.where(size > 0, size, 1.0)[:, None]
-
-
 def assembled(
     name: str,
     lifting: Lifting,
@@ -230,7 +211,6 @@ def assembled(
     channels: Channels,
     filters: Filters,
     fallback: Filters,
-    first: Array,
     sample_period_s: float,
     parameters: Mapping[str, float],
     reach: Array,
@@ -246,6 +226,8 @@ def assembled(
     z, w, u = (np.arange(a, b) for a, b in ((n, n + r), (n + r, n + r + s), (n + r + s, total)))
     x, at = np.arange(n), list(channels.measured)
     model, start = np.zeros((total, columns)), np.zeros((total, columns))
+    first = filters.C @ filters.S + filters.D  # as if nothing had moved before: no step at the start
+    first[at] = np.eye(len(at), len(channels))
     for rows, states, inputs_of, system in (
         (x, z, places, (filters.C, filters.D)),
         (z, z, places, (filters.A, filters.B)),
@@ -257,10 +239,11 @@ def assembled(
         (x, places, first),
         (z, places, filters.S),
         (w, blind, fallback.S),
-        (u, blind, fallback.C @ fallback.S + fallback.D),  # as if it had run before: no step at the start
+        (u, blind, fallback.C @ fallback.S + fallback.D),
     ):
         start[rows[:, None], np.array(inputs_of)] = first_of
-    model[at, at] += 1.0
+    held = [at[i] for i in channels.without_measurements().held]
+    model[u[held], held] = 1.0
     model = np.vstack([model, np.zeros((len(bare.functions), columns))])
     A, B = model[:, : widened.n_lifted], model[:, widened.n_lifted :]
     bank = FilterBank(r, start, np.ones(n), np.ones(n), np.zeros(n), reach)

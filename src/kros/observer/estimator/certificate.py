@@ -8,7 +8,7 @@ the filters make of noise,
 
 with :math:`\gamma` the H-infinity norm of [1, F], signals divided by their sizes. It holds for every machine and has
 no assumption on slopes for noise that lifted functions do not feel. The bound for recorded signals is the largest
-error on a unit that was left out of the regression.
+error in an episode that was left out of the regression with its unit and all episodes of its name.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     known = {*own.states, *_signals(modelled, own.inputs), CONSTANT}
     texts = [*own.states, *_signals(own, own.inputs)]
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
-    rows, weight = design.sample()
+    rows, weight = design.sample
     added = rows[:, outside] @ readout.coefficients[outside]
     return np.asarray(100 * np.sqrt(weight @ added**2) / design.recordings.size)
 

@@ -14,6 +14,7 @@ from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
 Ranges = Mapping[str, tuple[float, float]]  # of measured states and inputs in training, in the recordings' units
+Group = tuple[tuple[int, float], ...]  # channels that go on together, a measurement first, and how far each
 _QUADRATURE = {"sin": "cos", "cos": "sin"}
 CONSTANT = "1"
 FAMILIES = ("delays", "linear", "products", "products and random features")  # the first without lags and start
@@ -26,10 +27,13 @@ class Channels:
     lifting: Lifting
     measured: tuple[int, ...]
     n_inputs: int
+    reference: Array  # (q, c): signals that readouts of measured states are relative to
     linear: int  # so many channels are linear: measurements, the user's functions and inputs
     nonlinear: int = 0  # so many after them are functions with lags but no delays
     recent: bool = False  # whether delays alone are filters, without lags and start
     inputs_only: bool = False  # whether they leave measurements out: for gaps
+    unbounded: tuple[Group, ...] = ()
+    held: tuple[int, ...] = ()  # measurements that readouts of inputs are relative to, for want of a reference
 
     @property
     def columns(self) -> list[int]:
@@ -43,8 +47,40 @@ class Channels:
         return len(self.columns)
 
     def without_measurements(self) -> Channels:
-        """Return the inputs and the constant alone."""
-        return replace(self, linear=self.n_inputs, nonlinear=0, recent=False, inputs_only=True)
+        """Return the inputs and the constant alone; what goes on with an input is relative to it, else to itself."""
+        inputs = [self.columns.index(self.lifting.n_lifted + i) for i in range(self.n_inputs)]
+        reference, held, groups = np.zeros((len(self.measured), self.n_inputs + 1)), list[int](), list[Group]()
+        for group in self.unbounded:
+            moving = tuple((inputs.index(channel), far) for channel, far in group if channel in inputs)
+            state, step = group[0]
+            groups += [moving] if moving else []
+            held += [] if moving else [state]
+            for channel, far in moving[:1]:
+                reference[state, channel] = step / far
+        bare = replace(self, linear=self.n_inputs, nonlinear=0, recent=False, inputs_only=True)
+        return replace(bare, unbounded=tuple(groups), reference=reference, held=tuple(held))
+
+    @property
+    def relative(self) -> tuple[Array, Array]:
+        """N (c, c) and E (c, k) of ``w_k = N v_k - E p_k``, p_k the first channels of unbounded groups a sample ago.
+
+        The first channel of a group enters by its changes, the others by their distance from it.
+        """
+        c, firsts = len(self), [group[0] for group in self.unbounded]
+        N, E = np.eye(c), np.zeros((c, len(firsts)))
+        for k, ((first, step), group) in enumerate(zip(firsts, self.unbounded, strict=True)):
+            E[first, k] = 1.0
+            for other, far in group[1:]:
+                N[other, first] = -far / step
+        return N, E
+
+    def filtered(self, v: Array) -> Array:
+        """Return the signals w that filters see, of channels v along the first axis."""
+        if not self.unbounded:
+            return v
+        N, E = self.relative
+        before = np.concatenate([v[:1], v[:-1]])
+        return np.asarray(v @ N.T - before @ E @ E.T)
 
     def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
         """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""
@@ -72,14 +108,22 @@ def channels_of(
     functions = list(dict.fromkeys(functions))
     linear = len(measured) + len(functions) + len(inputs) + len(of_inputs)
     names, nonlinear = [*(lifting.states[i] for i in measured), *inputs], list[str]()
+    groups = [(name, *together) for name, together in settings.unbounded.items()]
+    free = {name for group in groups for name in group}
+    y, u = ([name for name in some if name not in free] for some in (names[: len(measured)], inputs))
     if family in FAMILIES[2:]:
-        nonlinear += products(names[: len(measured)], inputs, ranges, settings.beyond)
+        nonlinear += products(y, u, ranges, settings.beyond)
     if family in FAMILIES[3:]:
-        nonlinear += random_features(names, inputs, ranges, settings)
+        nonlinear += random_features(y, u, ranges, settings)
     bare = replace(
         lifting, functions=tuple(functions), inputs=tuple(inputs), input_functions=(*of_inputs, *nonlinear, CONSTANT)
     )
-    return Channels(bare, tuple(measured), len(inputs), linear, len(nonlinear), family == FAMILIES[0])
+    place = {name: i if i < len(measured) else i + len(functions) for i, name in enumerate(names)}
+    sizes = dict(zip(names, lifting.sizes_of(names), strict=True))
+    unbounded = tuple(tuple((place[name], 1 / sizes[name]) for name in group) for group in groups)
+    count = linear + len(nonlinear) + 1
+    reference, recent = np.eye(len(measured), count), family == FAMILIES[0]
+    return Channels(bare, tuple(measured), len(inputs), reference, linear, len(nonlinear), recent, unbounded=unbounded)
 
 
 def quadrature(text: str, used: frozenset[str], lifting: Lifting) -> str:
@@ -109,10 +153,11 @@ def products(measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, bey
 
 
 def random_features(
-    names: Sequence[str], inputs: Sequence[str], ranges: Ranges, settings: EstimatorSettings
+    measured: Sequence[str], inputs: Sequence[str], ranges: Ranges, settings: EstimatorSettings
 ) -> list[str]:
     """Return hyperbolic tangents of random combinations of measurements and inputs, of size one."""
     rng = np.random.default_rng(settings.seed)
+    names = [*measured, *inputs]
     if not inputs:
         return []
     size = np.array([max(abs(low), abs(high)) / np.sqrt(3) for low, high in (ranges[name] for name in names)])

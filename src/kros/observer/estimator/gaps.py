@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -62,12 +63,14 @@ def losses(rng: np.random.Generator, n_samples: int, batch: int) -> Flags:
     return missing
 
 
-def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings) -> FilterBank:
+def with_gaps(
+    bank: FilterBank, trial: Observer, recordings: Recordings, settings: EstimatorSettings, held: Sequence[int]
+) -> FilterBank:
     """Return a filter bank with forgetting and ages of gaps that minimise a trial's errors under simulated losses.
 
     The trial does not know the recordings. Ages of measured states change what the filters see: some are tried side by
     side, with the best of the others for each. A larger one, with which the filters go on by themselves for longer, has
-    to be better by the margin.
+    to be better by the margin. Fallbacks of states `held` go on from their last value by themselves.
     """
     states, shown, inputs, parameters = training(recordings, settings)
     batch, n, at = states.shape[1], len(trial.recorded), list(trial.measured)
@@ -75,6 +78,7 @@ def with_gaps(bank: FilterBank, trial: Observer, recordings: Recordings, setting
     missing = losses(np.random.default_rng(settings.seed), *shown.shape[:2])
     y, own = shown[..., at], trial.own(parameters)
     forget = forgetting(states - recorded_estimates(trial, y, inputs, own)[..., n:])
+    forget[list(held)] = 0.0
     longest = settings.blocks(recordings.length)[-1]
     halves, recoveries = longest * np.array(settings.halves), np.exp(-1 / (longest * np.array(settings.recoveries)))
     tried = halves[::2]
@@ -122,12 +126,18 @@ def blended_errors(
 ) -> Array:
     """Return log squared errors (c, batch, n) for candidates of half and recovery (c, 1), see `Gaps.follow`."""
     count, age = np.zeros(missing.shape[1]), np.zeros((len(half), missing.shape[1]))
-    x, squares = np.repeat(filtered[:1], len(half), axis=0), np.zeros((len(half), *states.shape[1:]))
+    offset, squares = (
+        np.repeat((filtered - from_inputs)[:1], len(half), axis=0),
+        np.zeros((len(half), *states.shape[1:])),
+    )
+    x, level = filtered[0] + 0 * offset, 0 * offset
     for k, lost in enumerate(missing[:-1]):
         count = np.where(lost, count + 1, 0.0)
         age = np.maximum(np.where(lost, age, recovery * np.minimum(age, longest_age(half))), count)
+        apart = x - from_inputs[k]
+        offset = forget * (apart + level * (offset - apart))
         level = (age**2 / (age**2 + half**2))[..., None]
-        fallback = from_inputs[k + 1] + forget * (x - from_inputs[k])
+        fallback = from_inputs[k + 1] + offset
         x = filtered[k + 1] + level * (fallback - filtered[k + 1])
         squares += (x - states[k + 1]) ** 2
     return np.log(squares / len(missing) + TINY)

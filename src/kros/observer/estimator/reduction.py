@@ -16,6 +16,7 @@ import numpy.typing as npt
 from ...core.norms import gramian_root
 from ...core.rounding import EPS
 from ...loops import recursion
+from .channels import Channels
 from .regression import Readout
 
 Array = npt.NDArray[np.float64]
@@ -24,7 +25,7 @@ _EPISODES = 8
 
 @dataclass(frozen=True, eq=False)
 class Filters:
-    """Filters with a readout: ``z+ = A z + B v``, estimate ``C z + D v``, ``z = S v`` at the first sample."""
+    """Filters with a readout: ``z+ = A z + B w``, estimate ``C z + D w``, ``z = S w`` at the first sample."""
 
     A: Array  # (r, r)
     B: Array  # (r, channels)
@@ -37,6 +38,16 @@ class Filters:
         """Return the first states alone."""
         A, B, C, S = self.A[:order, :order], self.B[:order], self.C[:, :order], self.S[:order]
         return replace(self, A=A, B=B, C=C, S=S)
+
+    def absolute(self, channels: Channels) -> Filters:
+        """Return the filters of channels v, where these are of what ``channels.filtered(v)`` returns."""
+        N, E = channels.relative
+        D = self.D @ N
+        D[list(channels.measured)] += channels.reference
+        k = E.shape[1]
+        A = np.block([[np.zeros((k, k + len(self.A)))], [-self.B @ E, self.A]])
+        B, S = np.vstack([E.T, self.B @ N]), np.vstack([E.T, self.S @ (N - E @ E.T)])
+        return replace(self, A=A, B=B, C=np.hstack([-self.D @ E, self.C]), D=D, S=S)
 
     def along(self, v: Array) -> Array:
         """Return the estimates of signals v (n_samples, batch, channels), shape (n_samples, batch, n)."""

@@ -9,11 +9,11 @@ coefficients that know neither the unit nor its episodes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import compress
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +28,7 @@ from .channels import Channels
 from .settings import EstimatorSettings
 
 Array = npt.NDArray[np.float64]
+T = TypeVar("T", bound=Hashable)
 Read = Callable[[EpisodeKey], EpisodeBatch]
 _SMALLEST = 5e4 * EPS  # of singular values: what is smaller is rounding
 
@@ -94,10 +95,17 @@ class Recordings:
 
     def some(self, count: int) -> Recordings:
         """Return some episodes, spread over all."""
-        if len(self.keys) <= count:
-            return self
-        at = np.linspace(0, len(self.keys) - 1, count).round().astype(int)
-        return self.only(np.isin(np.arange(len(self.keys)), at).tolist())
+        at = spread(range(len(self.keys)), count)
+        return self.only([i in at for i in range(len(self.keys))])
+
+    def some_of(self, groups: Mapping[EpisodeKey, Group], count: int) -> Recordings:
+        """Return some episodes, spread over those of every group, and one of each at least."""
+        members: dict[Group, list[EpisodeKey]] = {}
+        for key in self.keys:
+            members.setdefault(groups[key], []).append(key)
+        share = min(1.0, count / len(self.keys))
+        kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
+        return self.only([key in kept for key in self.keys])
 
     def only(self, which: Sequence[bool]) -> Recordings:
         """Return the episodes that are flagged."""
@@ -149,7 +157,7 @@ class Design:
     ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
         """Yield episode, bank rows, targets and weights of every episode, with an offset of the measurements.
 
-        Targets are states at the next sample, of measured ones their change.
+        Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
         thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
@@ -159,18 +167,20 @@ class Design:
             v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
             at, weights = thinning.at(length, number)
             targets = batch.states[at + 1, 0] / recordings.size
-            if not self.channels.inputs_only:
-                targets[:, measured] -= y[at] / recordings.size[measured]
-            yield key, self.bank.rows(v, at), targets, weights
+            reference = v[at] @ self.channels.reference.T
+            reference[:, self.channels.held] = y[at][:, self.channels.held]
+            targets[:, measured] -= reference / recordings.size[measured]
+            yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
     def signals(self, some: int, length: int) -> Array:
-        """Return the channels of some episodes, cut to one length, shape (n_samples, batch, channels)."""
+        """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
         found = []
         for key in self.recordings.some(some).keys:
             batch = self.recordings.read(key)
             y = interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
             own = {k: p[0] for k, p in batch.parameters.items()}
-            found.append(self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own))
+            v = self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own)
+            found.append(self.channels.filtered(v))
         shortest = min(length, *(len(v) for v in found))
         return np.stack([v[:shortest] for v in found], axis=1)
 
@@ -182,12 +192,19 @@ class Design:
 
     @cached_property
     def fine_sample(self) -> tuple[Array, Array]:
-        """Thinned rows of the bank with every delay, and their weights."""
-        return replace(self, bank=self.bank.fine).sample()
+        """Thinned rows of the bank with every delay, and weights that sum to one."""
+        return replace(self, bank=self.bank.fine).thinned()
 
-    def sample(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
-        """Return thinned rows of the bank, and weights that sum to one."""
-        parts = list(self.rows(self.recordings.some(150), self.settings.sample, offset))
+    @cached_property
+    def sample(self) -> tuple[Array, Array]:
+        """Thinned rows of the bank, sums of those with every delay, and their weights."""
+        rows, weights = self.fine_sample
+        return rows @ self.bank.refined(np.eye(len(self.bank))), weights
+
+    def thinned(self, offset: Array | float = 0.0) -> tuple[Array, Array]:
+        """Return thinned rows of the bank with an offset of the measurements, and weights that sum to one."""
+        settings = self.settings
+        parts = list(self.rows(self.recordings.some(settings.episodes // 2), settings.sample, offset))
         weights = np.concatenate([w for *_, w in parts])
         return np.vstack([rows for _, rows, _, _ in parts]), weights / weights.sum()
 
@@ -216,11 +233,11 @@ class Whitening:
     @classmethod
     def of(cls, design: Design) -> Whitening:
         """Find the directions from thinned rows."""
-        X, weights = design.sample()
+        X, weights = design.sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
         trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            moved = (design.sample(bias)[0] - X) / size * np.sqrt(weights)[:, None]
+            moved = (design.thinned(bias)[0] - X) / size * np.sqrt(weights)[:, None]
             trust = np.vstack([trust, qr_triangle(moved)])
         _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
@@ -242,7 +259,8 @@ class Moments:
     def of(cls, design: Design, whitening: Whitening) -> Moments:
         """Sum the rows of every group."""
         sums: dict[Group, list[Array]] = {}
-        groups, recordings = design.groups, design.recordings.some(design.settings.episodes)
+        groups = design.groups
+        recordings = design.recordings.some_of(groups, design.settings.episodes)
         for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
             group = groups[key]
             F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
@@ -350,14 +368,17 @@ class Readout:
         log = np.log(self.left_out[:, list(states)]).mean(axis=1)
         return np.array([log[self.folds == fold].mean() for fold in np.unique(self.folds)])
 
-    def unit_errors(self) -> dict[tuple[str, str], Array]:
-        """Return the left-out mean squared errors (n,) over the squared sizes of every unit and condition."""
-        sums: dict[tuple[str, str], list[Any]] = {}
-        for key, rows, targets, weights in self.design.rows(self.design.recordings, self.design.settings.rows):
-            missed = targets - rows @ self.others[self.design.groups[key]]
-            own = sums.setdefault((key.unit, key.condition), [0.0, 0.0])
-            own[0], own[1] = own[0] + weights @ missed**2, own[1] + weights.sum()
-        return {name: total / weight for name, (total, weight) in sums.items()}
+    def episode_errors(self) -> Array:
+        """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
+        design, found = self.design, []
+        for key, rows, targets, weights in design.rows(design.recordings, design.settings.rows):
+            found.append(np.average((targets - rows @ self.others[design.groups[key]]) ** 2, axis=0, weights=weights))
+        return np.array(found)
+
+
+def spread(items: Sequence[T], count: int) -> set[T]:
+    """Return so many items, evenly spaced from the first to the last."""
+    return {items[i] for i in np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int)}
 
 
 def is_less(one: Array, other: Array, margin: float) -> bool:

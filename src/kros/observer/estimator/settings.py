@@ -19,6 +19,11 @@ class EstimatorSettings(Settings):
     ((0, 1, 2, 4, 6, 8), (300.0, 600.0))
     """
 
+    unbounded: dict[str, tuple[str, ...]] = Field(
+        {},
+        description="measured states that may go on for ever, such as the position of a spindle, with the inputs that go "
+        "on with them, such as its reference; the estimator sees their changes and distances alone",
+    )
     dense: int = Field(32, ge=1, description="delays of every linear channel that are taken one by one, in samples")
     longest: int = Field(
         100, ge=1, description="longest delay, in samples; a short episode allows a quarter of its length"
@@ -46,9 +51,6 @@ class EstimatorSettings(Settings):
     )
     parts: int = Field(3, ge=1, description="parts of the episodes, of which the one that is judged on is left out")
     folds: int = Field(4, ge=2, description="folds of units that are left out in turn, at most")
-    directions: int = Field(
-        400, ge=10, description="principal directions of the bank that the regression sees, at most"
-    )
     nonlinear_trust: float = Field(
         1e-3, ge=0, description="relative error of a nonlinear channel: rows with target zero"
     )

@@ -12,7 +12,8 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError
 from ...core.settings import member
 from ...data import prepare
-from ...data.population import OUTLIERS, Channel, EpisodeKey, Population, Role, Unit
+from ...data.population import OUTLIERS, Channel, EpisodeKey, Role, Unit
+from ...data.prepare import assemble
 from ...data.steps import Offset, Trim
 from ..batch import BatchSettings, SimulatedEpisodes, SimulatedPopulation
 from .dynamics import simulate
@@ -112,7 +113,7 @@ class HarmonicDrivePopulation(BatchSettings):
         inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
         parts = {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
-        raw = Population(CHANNELS, SAMPLE_PERIOD_S, units, keys, SimulatedEpisodes(parts), about, TRUTHS)
+        raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
         load_rows = {key: i for i, key in enumerate(k for k in keys if k.condition == "load")}
         torque = signals.load_torque[:, REST_SAMPLES:-1]
         truth = Truth(tuple(u.id for u in units), parameters, loop, GAINS[loop], load_rows, torque)

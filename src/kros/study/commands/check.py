@@ -225,14 +225,13 @@ def monitored(recordings: FieldRecordings) -> Rows:
     monitor = observer.monitor
     for unit, condition, keys in population.groups():
         counts, judged, samples = dict[str, int](), Judged(), 0
-        for arrived in recordings.batches(keys):
-            samples += int(arrived.batch.lengths.sum())
-            status = screened(observer, arrived.y, arrived.u).status
-            count_status(counts, np.where(np.arange(len(status))[:, None] < arrived.batch.lengths, status, 0))
+        for arrived in map(recordings.arriving, keys):
+            samples += len(arrived.y)
+            count_status(counts, screened(observer, arrived.y, arrived.u).status)
             if monitor is not None:
                 values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
-                judged += [(nu[:n, i], good[:n, i]) for i, n in enumerate(arrived.batch.lengths)]
+                judged.append((nu[:, 0], good[:, 0]))
         level = highest_level(monitor, judged)
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
         row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))

@@ -12,6 +12,7 @@ from ...core.artifacts import load_artifact, write_json
 from ...core.errors import ConfigError, KrosError
 from ...core.files import did_you_mean
 from ...data import EpisodeBatch
+from ...data.discovery.roles import identifier
 from ...data.survey import RecordingFacts
 from ...evaluate.sensor import as_arriving
 from ...export import CompiledObserver, LoadOutput, export_c, export_fmu
@@ -104,9 +105,3 @@ def held_out_episode(config: StudyConfig, store: Store) -> EpisodeBatch:
         raise ConfigError("no episode is held out.")
     phase = {} if calibration is None else {calibration.spec.parameter: calibration.units[keys[0].unit].phase_rad}
     return EpisodeBatch.read(open_source(config), keys[:1], LARGEST, {keys[0].unit: phase})
-
-
-def identifier(text: str) -> str:
-    """Return a C identifier that looks like a study's name."""
-    plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in text).strip("_") or "observer"
-    return plain if plain[0].isalpha() else f"observer_{plain}"

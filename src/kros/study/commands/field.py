@@ -19,6 +19,7 @@ import numpy.typing as npt
 from ...core.artifacts import write_json
 from ...core.errors import ConfigError, DataError, IdentificationError
 from ...core.files import read_toml
+from ...core.rounding import AGREED
 from ...data import Population, read, split_episodes
 from ...data.population import EpisodeKey
 from ...data.prepare import with_gaps
@@ -42,7 +43,8 @@ Texts = dict[str, str]  # by unit
 # Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
-_BATCH, _SAMPLES, _BLOCK = 64, 200_000, 50_000  # episodes at a time, their samples, and samples of one that is longer
+_BLOCK = 50_000  # samples of an episode that are run at once
+_BATCH, _SAMPLES = 64, 4 * _BLOCK  # shorter episodes that run side by side, and their samples
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
@@ -85,7 +87,7 @@ def check_channels(population: Population, observer: Observer, *, hidden: bool =
             both = f"is in {units[channel.name]!r} in the run and in {channel.unit!r} in the recordings"
             advice = "declare a scale step, or leave the unit out where it is only written differently"
             raise DataError(f"Channels: {channel.name} {both}; {advice}.")
-    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=1e-6):
+    if not np.isclose(population.sample_period_s, observer.sample_period_s, rtol=AGREED):
         both = f"the run has {observer.sample_period_s} s, the recordings {population.sample_period_s} s"
         raise DataError(f"Sampling period: {both}; declare a resample step.")
 
@@ -223,14 +225,9 @@ class FieldRecordings:
     def _parameters(self) -> Values:
         return {u: {**self.observer.parameters, **known} for u, known in self.values.items()}
 
-    def batches(self, keys: tuple[EpisodeKey, ...]) -> Iterator[Arriving]:
-        """Read episodes, long ones one by one, so that memory does not grow with their number."""
-        start, count = 0, 1
-        while start < len(keys):
-            episodes = {key: self.population.read(key) for key in keys[start : start + count]}
-            batch = arriving(self.observer, self.population, episodes, self._parameters)
-            start, count = start + count, min(_BATCH, max(1, _SAMPLES // len(batch.y)))
-            yield batch
+    def arriving(self, key: EpisodeKey) -> Arriving:
+        """Read one episode as it arrives at the observer."""
+        return arriving(self.observer, self.population, {key: self.population.read(key)}, self._parameters)
 
     def estimates(self) -> Iterator[Estimated]:
         """Run the observer over all episodes: short ones side by side, long ones in blocks."""

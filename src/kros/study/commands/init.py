@@ -9,43 +9,23 @@ import re
 import textwrap
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ...core.errors import ConfigError, DataError, IdentificationError
+from ...core.errors import ConfigError, DataError
 from ...core.work import Progress, Work
-from ...data import Population, Role
+from ...data import Population
 from ...data.discovery.discover import Discovery, Wanted, discover
-from ...data.discovery.roles import ColumnPart, TableColumn, is_commanded, kind_of
+from ...data.discovery.roles import ColumnPart, TableColumn
 from ...data.readers.csv_folder import CsvMapping
 from ...data.readers.opening import detect_reader
-from ...data.recording import check_population, some
-from ...data.survey import UNLOADED, RecordingFacts, survey
-from ...identify import PhaseSpec
-from ...identify.calibration import calibrate
-from ...identify.periodic import PeriodicTerm, periodic_term
-from ...identify.presets import HARMONIC_DRIVE
+from ...data.recording import check_population
+from ...data.survey import UNLOADED, survey
 from ..config import validate_config
 from ..stages.learning import FEWEST, open_source
 
 
-@dataclass(frozen=True)
-class LiftingProposal:
-    """Tables ``[lifting]`` and ``[calibrate]``, and what they rest on."""
-
-    lifting: dict[str, Any] = field(default_factory=dict)
-    calibrate: dict[str, Any] = field(default_factory=dict)
-    why: str = "no periodic nonlinearity was found"
-
-
-def study_text(
-    source: Path,
-    data: Mapping[str, Any],
-    discovery: Discovery | None,
-    proposal: LiftingProposal,
-    findings: Sequence[str],
-) -> str:
+def study_text(source: Path, data: Mapping[str, Any], discovery: Discovery | None, findings: Sequence[str]) -> str:
     """Return a study as TOML."""
     written = f"Written by kros init from the recordings in {source.name}. It can be run as it is; edit any line."
     lines = _comment(written)
@@ -59,12 +39,11 @@ def study_text(
     lines += _mapping(discovery) if discovery is not None else []
     for step in data.get("prepare", ()):
         lines += ["", "[[data.prepare]]", *_keys(step)]
-    lines += ["", *_comment(f"Lifted functions: {proposal.why}.")]
-    example = '# functions = ["sin(angle)"]  # nonlinear terms that you know of; without any, models are linear'
-    lines += ["[lifting]", *_keys(proposal.lifting)] if proposal.lifting else ["# [lifting]", example]
-    if proposal.calibrate:
-        where = "Where the phase of every unit is found: in the error of a speed that is held constant."
-        lines += ["", *_comment(where), "[calibrate]", *_keys(proposal.calibrate)]
+    lines += [
+        "",
+        "# Nonlinear terms that you know of, such as gravity or a gear's ratio; without any, models are linear.",
+    ]
+    lines += ["# [lifting]", '# functions = ["sin(angle)", "sin(100*angle + phase)"]']
     return "\n".join(lines) + "\n"
 
 
@@ -80,6 +59,9 @@ def _mapping(discovery: Discovery) -> Iterator[str]:
             yield from _comment(discovery.reading) if key == "files" else ()
             known = "" if key == "files" else CsvMapping.model_fields[key].description or ""
             yield _line(key, value, discovery.notes.get(key, known))
+    for column in discovery.columns:
+        if column.part is ColumnPart.LEFT_OUT:
+            yield from _comment(f"left out: column {column.reference!r} ({column.why})")
     by_name = {c.name: c for c in discovery.columns}
     for channel in discovery.mapping["channel"]:
         yield from ("", "[[data.csv.channel]]", *_channel(channel, by_name[channel["name"]]))
@@ -143,19 +125,21 @@ def init_study(source: Path, out: Path, wanted: Wanted, progress: Progress) -> l
     population = open_source(validate_config({"data": dict(data)}, folder, str(out)))
     unloaded = _unloaded(population)
     data |= {} if unloaded is None else {"identify_on": unloaded}
-    findings, proposal = list(discovery.findings if discovery else ()), LiftingProposal(why="not searched for")
+    findings = list(discovery.findings if discovery else ())
     try:
         check_population(population, allow_single=True)
         population, facts = survey(population, work, identify_on=unloaded, on_nan=data.get("on_nan", "error"))
         findings += facts.alerts
-        proposal = propose_lifting(population, facts)
     except DataError as error:
         findings.append(f"kros run would refuse this: {error}")
-    text = study_text(source, data, discovery, proposal, findings)
+    text = study_text(source, data, discovery, findings)
     validate_config(tomllib.loads(text), folder, str(out))
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(text, encoding="utf-8")
-    return _lines(population, discovery, proposal, findings, out)
+    until = " --until identify" if len(population.units) < FEWEST else ""
+    lines = [repr(population), *([discovery.reading] if discovery else [])]
+    lines += [f"looks wrong: {text}" for text in findings]
+    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
 
 
 def _source(source: Path, out: Path) -> str:
@@ -172,78 +156,3 @@ def _unloaded(population: Population) -> str | None:
         return None
     named = [c for c in conditions if re.sub(r"[\W_]", "", c.lower()) in NO_LOAD]
     return named[0] if named else max(conditions, key=lambda c: len({k.unit for k in population.keys(condition=c)}))
-
-
-def propose_lifting(population: Population, facts: RecordingFacts) -> LiftingProposal:
-    """Return lifted functions where recordings ask for them: the periodic term of an angle, with a phase per unit."""
-    if population.metadata.get("plant") == HARMONIC_DRIVE:
-        return LiftingProposal(why="the recordings name their plant, which has a known lifting")
-    measured = [c for c in population.channels if c.role is Role.STATE and c.measured]
-    angles = [c.name for c in measured if c.unit == "rad" or (not c.unit and kind_of(c.name) in ("angle", "position"))]
-    keys = [k for u in facts.pooled[:6] for k in facts.keys("train", u, facts.identify_on)[:3]]
-    term = periodic_term(population, angles, keys) if angles and keys else None
-    if term is None:
-        return LiftingProposal()
-    share = f"{100 * term.share:.2g} % of"
-    if term.ratio == 1:
-        why = f"sin({term.angle}), as of gravity, explains {share} the one-step residual of a linear model"
-        functions = [f"{f}({term.angle})" for f in (("sin",) if term.odd else ("sin", "cos"))]
-        return LiftingProposal({"functions": functions}, {}, why)
-    above = f"{term.above:.0f} times the residual at neighbouring ratios; {share} the whole residual"
-    why = f"the residual of a linear model repeats {term.ratio:g} times per turn of {term.angle!r} ({above})"
-    spec = _phase_spec(population, term)
-    if spec is not None and _calibrates(population, facts, spec):
-        names = ("angle", "ratio", "reference", "measured")
-        function = f"sin({term.ratio:g}*{term.angle} + phase)"
-        table = {name: getattr(spec, name) for name in names}
-        return LiftingProposal({"functions": [function]}, table, f"{why}; the phase differs from unit to unit")
-    return LiftingProposal({"functions": [f"{f}({term.ratio:g}*{term.angle})" for f in ("sin", "cos")]}, {}, why)
-
-
-def _phase_spec(population: Population, term: PeriodicTerm) -> PhaseSpec | None:
-    """Return what a phase can be calibrated on: a speed that is commanded and the speed that follows it."""
-    speeds = [c for c in population.channels if kind_of(c.name, c.unit) == "velocity"]
-    reference = [c.name for c in speeds if c.role is Role.INPUT and is_commanded(c.name)]
-    measured = [c.name for c in speeds if c.role is Role.STATE]
-    return PhaseSpec(term.angle, term.ratio, reference[0], measured[0]) if reference and measured else None
-
-
-def _calibrates(population: Population, facts: RecordingFacts, spec: PhaseSpec) -> bool:
-    """Tell whether the phase of every unit can be found in its recordings."""
-    try:
-        return set(calibrate(population, facts, spec).units) == set(facts.groups)
-    except IdentificationError as error:
-        log.info("%s", error)
-        return False
-
-
-def _lines(
-    population: Population, discovery: Discovery | None, proposal: LiftingProposal, findings: Sequence[str], out: Path
-) -> list[str]:
-    """Return what people read at the terminal."""
-    units, counts = population.unit_ids, [len(keys) for _, _, keys in population.groups()]
-    each = f"{min(counts)}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
-    number = f"{len(units)} unit{'s' * (len(units) != 1)} ({some(units, 6)})"
-    episodes = f"{len(population.episodes)} episodes ({each} for each unit and condition)"
-    period = f"every {population.sample_period_s:g} s"
-    lines = [f"{number}, conditions {', '.join(population.conditions)}, {episodes}, {period}"]
-    if discovery is not None:
-        lines += [f"  {discovery.reading}", *column_lines(discovery.columns)]
-    functions = "; ".join(proposal.lifting.get("functions", ()))
-    lines.append(f"lifting: {functions}: {proposal.why}" if functions else f"lifting: {proposal.why}")
-    lines += [f"looks wrong: {text}" for text in findings]
-    until = " --until identify" if len(units) < FEWEST else ""
-    return [*lines, f"study: {out}; read it, then run: kros run {out}{until}"]
-
-
-def column_lines(columns: Sequence[TableColumn]) -> list[str]:
-    """Return one line a column: what it is taken for, its channel and its unit of measure."""
-    names = {c: f"{c.name}{f' [{c.unit}]' if c.unit else ''}" for c in columns}
-    width = max(len(n) for n in names.values())
-    lines = []
-    for part in ColumnPart:
-        for column in (c for c in columns if c.part is part):
-            came = f"column {column.reference!r}" if column.reference != column.name else ""
-            why = f"({column.why})" if part is ColumnPart.LEFT_OUT else ""
-            lines.append(f"  {part.value:<9} {names[column]:<{width}}  {came}  {why}".rstrip())
-    return lines

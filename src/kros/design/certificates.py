@@ -260,5 +260,4 @@ def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tu
     if design.observer.bank is None:
         return problem.error_system(design.synthesis.controller), np.zeros(1)
     estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
-    weight = problem.performance.frequency_response([0.0])[0].real
-    return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
+    return problem.estimate_error(estimate), problem.scaled[3] @ (mean / problem.output_scale)

@@ -30,7 +30,7 @@ class Uncertainty:
 
     form: Form
     unit_ids: tuple[str, ...]  # units that the weights cover
-    nominal: int  # row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one)
+    nominal: int  # row of the nominal unit
     nominal_id: str
     freqs_hz: Array  # (frequency,), Hz
     output_scale: Array  # (p,)

@@ -122,9 +122,9 @@ def quantify(
     **options
         Of models of `kros.identify`: those of `QuantifySettings`. Of all others: ``unit_ids`` (names),
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
-        row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
-        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of responses
-        that have none: of measured ones at most half the inverse of the highest frequency).
+        row or name; by default the unit with the lowest peak), ``max_order`` (of an entry), ``tolerance_db`` (overbound
+        at which a lower order is good enough), ``sample_period_s`` (s, of responses that have none: of measured ones at
+        most half the inverse of the highest frequency).
 
     Returns
     -------

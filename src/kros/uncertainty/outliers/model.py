@@ -32,7 +32,6 @@ import numpy.typing as npt
 from ...core.artifacts import load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
-from ..inputs import check_scale
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
@@ -167,8 +166,6 @@ def score_outliers(
     form: Form | str = Form.ADDITIVE,
     *,
     unit_ids: tuple[str, ...] | None = None,
-    output_scale: npt.ArrayLike | None = None,
-    input_scale: npt.ArrayLike | None = None,
     false_alarm_rate: float = 0.01,
 ) -> OutlierModel:
     """Score every unit of a population against the others.
@@ -176,14 +173,12 @@ def score_outliers(
     Parameters
     ----------
     responses : array_like, shape (unit, frequency, p, m), complex
-        In physical units, of all units; nothing but the responses is looked at.
+        In any units of measure, which do not matter: outputs and inputs are scaled such that the responses' typical
+        entries are equal. Nothing but the responses is looked at.
     freqs_hz : array_like, shape (frequency,), Hz
         Increasing, above zero.
     form : Form or str
     unit_ids : tuple of str, optional
-    output_scale, input_scale : array_like, optional
-        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never
-        matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
 
@@ -218,8 +213,6 @@ def score_outliers(
     rows = scored_rows(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     scales = balance(G)
-    if output_scale is not None or input_scale is not None:
-        scales = check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])
     G = G / scales[0][:, None] * scales[1]
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)

@@ -20,12 +20,15 @@ import tokenize
 import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from functools import wraps
+from dataclasses import fields, is_dataclass
+from functools import reduce, wraps
+from operator import getitem
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, TypeVar
+from types import GenericAlias
+from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat
+from pydantic import ConfigDict, Field, NonNegativeFloat, TypeAdapter
 from pydantic_core import to_jsonable_python
 
 from . import limits
@@ -152,10 +155,10 @@ def load_artifact(folder: Path, kind: str) -> tuple[dict[str, Any], dict[str, np
     check_checksum(content, path)
     content.pop(CHECKSUM, None)
     digest = content.pop("arrays", None)
-    if digest is None and not archive.exists():
+    if digest is None:
         return content, {}
     packed = read_bytes(archive, limits.MAX_ARRAYS_BYTES)
-    if digest is not None and hashlib.sha256(packed).hexdigest() != digest:
+    if hashlib.sha256(packed).hexdigest() != digest:
         raise DataError(f"Reading {archive}: it is not the file that {path.name} was written with; {_AGAIN}.")
     return content, unpack_arrays(packed, archive)
 
@@ -181,6 +184,43 @@ def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
             return load(cls, path)
 
     return guarded
+
+
+class Storable:
+    """A dataclass that is written as an artefact: arrays by the names of fields, inner ones ``field/inner``."""
+
+    KIND: ClassVar[str]
+
+    def save(self, folder: Path) -> None:
+        """Write it, with its arrays beside the rest."""
+        arrays: dict[str, np.ndarray] = {}
+        save_artifact(folder, self.KIND, _without_arrays(self, "", arrays), arrays or None)
+
+    @classmethod
+    @loader
+    def load(cls, folder: Path) -> Self:
+        """Read what `save` wrote."""
+        content, arrays = load_artifact(folder, cls.KIND)
+        for name, array in arrays.items():
+            *place, last = name.split("/")
+            reduce(getitem, place, content)[last] = array
+        kind: Any = GenericAlias(tuple, cls)
+        adapter: TypeAdapter[Any] = TypeAdapter(kind, config=ConfigDict(arbitrary_types_allowed=True))
+        return adapter.validate_python([content])[0]
+
+
+def _without_arrays(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
+    """Return dataclasses as mappings and numbers that JSON has not as texts; arrays are collected."""
+    if isinstance(value, np.ndarray):
+        arrays[place] = value
+        return None
+    if is_dataclass(value):
+        value = {f.name: getattr(value, f.name) for f in fields(value)}
+    if isinstance(value, Mapping):
+        return {str(k): _without_arrays(v, f"{place}/{k}".lstrip("/"), arrays) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [_without_arrays(v, place, arrays) for v in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"

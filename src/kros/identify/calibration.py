@@ -21,12 +21,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import digest_of, load_artifact, loader, save_artifact
+from ..core.artifacts import Storable, digest_of
 from ..core.errors import IdentificationError
 from ..core.rounding import TINY
 from ..core.work import Work
@@ -92,7 +91,7 @@ class UnitPhase:
 
 
 @dataclass(frozen=True)
-class PhaseCalibration:
+class PhaseCalibration(Storable):
     """Phases of a population, on one branch.
 
     `lag_rad` is the mean lag of the population; a new unit is put on its branch by it.
@@ -107,21 +106,10 @@ class PhaseCalibration:
     (True, True)
     """
 
+    KIND = "calibration"
     spec: PhaseSpec
     lag_rad: float
     units: Mapping[str, UnitPhase]
-
-    def save(self, folder: Path) -> None:
-        """Write the calibration as readable JSON."""
-        save_artifact(folder, "calibration", {"spec": self.spec, "lag_rad": self.lag_rad, "units": self.units})
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> PhaseCalibration:
-        """Read what `save` wrote."""
-        content, _ = load_artifact(folder, "calibration")
-        units = {unit: UnitPhase(**phase) for unit, phase in content["units"].items()}
-        return cls(PhaseSpec(**content["spec"]), content["lag_rad"], units)
 
     def calibrate(self, segments: Sequence[Segment], unit: str) -> UnitPhase:
         """Calibrate a new unit on the population's branch."""

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import Storable, load_artifact, loader, save_artifact
 from ..core.errors import DataError
 from ..data.population import Population
 from ..data.survey import RecordingFacts
@@ -48,9 +48,10 @@ class Stored(Mapping[str, T]):
 
 
 @dataclass(frozen=True, eq=False)
-class EpisodeFactors:
+class EpisodeFactors(Storable):
     """Triangular factors of every training episode of one condition, free of the lifting's parameters."""
 
+    KIND = "factors"
     condition: str
     rows: tuple[tuple[str, str], ...]
     factor: Factor
@@ -65,23 +66,6 @@ class EpisodeFactors:
         for row, (unit, _) in enumerate(self.rows):
             places.setdefault(unit, []).append(row)
         return places
-
-    def save(self, folder: Path, lifting: Lifting, inputs: tuple[str, ...]) -> None:
-        """Write them with the names of what they are of."""
-        content = {"condition": self.condition, "rows": self.rows, "states": lifting.states, "inputs": inputs}
-        content |= {"functions": lifting.functions, "input_functions": lifting.input_functions}
-        save_artifact(folder, "factors", content, {name: getattr(self.factor, name) for name in _ARRAYS})
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> EpisodeFactors:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(folder, "factors")
-        rows = tuple((str(unit), str(episode)) for unit, episode in content["rows"])
-        return cls(content["condition"], rows, Factor(*(arrays[name] for name in _ARRAYS)))
-
-
-_ARRAYS = ("R", "peak", "n_samples")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -165,7 +149,7 @@ class IdentifiedModels:
         for place, models in self.sets.items():
             models.save(folder / "models" / place)
         for condition, factors in self.factors.items():
-            factors.save(folder / "factors" / quote(condition, safe=""), self.lifting, self.population.inputs)
+            factors.save(folder / "factors" / quote(condition, safe=""))
         content = {"kinds": self.kinds, "sets": list(self.sets), "conditions": list(self.factors)}
         save_artifact(folder / "models", _KIND, content)
 

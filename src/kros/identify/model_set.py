@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import Storable
 from ..core.errors import ConfigError
 from ..core.frequency import log_grid
 from ..core.lti import StateSpace
@@ -24,7 +23,7 @@ Array = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ModelSet:
+class ModelSet(Storable):
     """Koopman (or linear) models of all units, identified in one condition.
 
     Examples
@@ -36,6 +35,7 @@ class ModelSet:
     ((2, 3, 3), True, True)
     """
 
+    KIND = "model"
     name: str  # kind of model, for example ``koopman_edmd``
     condition: str
     lifting: Lifting
@@ -132,41 +132,6 @@ class ModelSet:
     def spectral_radius(self) -> Array:
         """Return the spectral radius of every unit's model."""
         return self.ranges.normalise(KoopmanMatrices(self.A, self.B)).spectral_radius()
-
-    def save(self, folder: Path) -> None:
-        """Write ``arrays.npz`` and ``model.json``."""
-        content = {name: getattr(self, name) for name in _CONTENT}
-        content |= {"states": self.lifting.states, "inputs": self.recorded_inputs, "lifting": self.lifting.functions}
-        content |= self.lifting.extension()
-        values = {name: v.tolist() for name, v in self.parameters.items()}
-        content["parameters"] = {name: dict(zip(self.unit_ids, v, strict=True)) for name, v in values.items()}
-        save_artifact(folder, "model", content, {name: getattr(self, name) for name in _ARRAYS})
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> ModelSet:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(folder, "model")
-        units, lifting = tuple(content["unit_ids"]), Lifting.from_content(content)
-        parameters = {k: np.array([v[u] for u in units], dtype=float) for k, v in content["parameters"].items()}
-        given = {name: content[name] for name in _CONTENT} | arrays
-        channels = tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"])
-        given |= {"unit_ids": units, "channels": channels, "status": tuple(content["status"])}
-        return cls(lifting=lifting, parameters=parameters, **given)
-
-
-_ARRAYS = ("A", "B", "output_scale", "input_scale")
-_CONTENT = [
-    "name",
-    "condition",
-    "unit_ids",
-    "channels",
-    "sample_period_s",
-    "alpha",
-    "alpha_in_ranges",
-    "status",
-    "longest_s",
-]
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from enum import Enum
-from pathlib import Path
-from typing import Any
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import Storable
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace
 from ..core.rounding import AGREED
@@ -63,7 +61,7 @@ class Status(str, Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Synthesis:
+class Synthesis(Storable):
     """A verified correction filter and its certificate.
 
     Examples
@@ -74,6 +72,7 @@ class Synthesis:
     ('kalman', 'optimal', 0.5)
     """
 
+    KIND = "synthesis"
     method: str  # for example ``worst_case_h2``
     controller: StateSpace  # ``u = K y`` (positive feedback); for observers ``y`` is the innovation ``y - C x_hat``
     status: Status
@@ -96,22 +95,6 @@ class Synthesis:
             problem = f"a lower bound of {self.lower_bound} lies above what is attained ({self.gap_percent:.6g} %)"
             raise SynthesisError(f"Synthesis {self.method}: {problem}; please report the plant.")
 
-    def save(self, folder: Path) -> None:
-        """Write `synthesis.json` and `arrays.npz`."""
-        content = {name: getattr(self, name) for name in _PLAIN}
-        arrays = {name: getattr(self.controller, name) for name in "ABCD"}
-        save_artifact(Path(folder), "synthesis", {**content, "dt": self.controller.dt}, arrays)
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> Synthesis:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(Path(folder), "synthesis")
-        values: dict[str, Any] = {name: content.get(name) for name in _PLAIN}
-        values["notes"] = tuple(content["notes"])
-        A, B, C, D = (arrays[name] for name in "ABCD")
-        return cls(controller=StateSpace(A, B, C, D, content["dt"]), **values)
-
 
 def enclosed(value: float, lower: float | None) -> tuple[float | None, float | None, tuple[str, ...]]:
     """Return the lower bound of an attained value, their distance in percent, and notes."""
@@ -125,6 +108,3 @@ def enclosed(value: float, lower: float | None) -> tuple[float | None, float | N
         return None, None, (f"Internal error: {problem}; please report this problem.",)
     lower = min(lower, value)
     return lower, 100 * (value / lower - 1), ()
-
-
-_PLAIN = tuple(name for name in Synthesis.__dataclass_fields__ if name != "controller")

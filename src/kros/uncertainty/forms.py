@@ -22,7 +22,7 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 import numpy as np
@@ -36,7 +36,7 @@ from .settings import SET
 Array = npt.NDArray[Any]
 
 
-class Form(str, Enum):
+class Form(StrEnum):
     """Where the perturbation acts.
 
     Examples

@@ -9,17 +9,15 @@ S_u^-1`, an inverse additive one `S_u E S_y^-1`: the weights act on scaled signa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import Storable
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.cover import Cover, Weight
-from .weights.proof import Method
 
 Array = npt.NDArray[Any]
 
@@ -100,7 +98,7 @@ class ResponseUncertainty(Uncertainty):
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class UncertainModel(Uncertainty):
+class UncertainModel(Uncertainty, Storable):
     """A nominal model and a bound on how the units of the population differ from it.
 
     Parameters
@@ -126,6 +124,7 @@ class UncertainModel(Uncertainty):
     ('1', 'output_multiplicative', -14.0)
     """
 
+    KIND = "uncertain_model"
     nominal_system: StateSpace
 
     @property
@@ -137,46 +136,6 @@ class UncertainModel(Uncertainty):
         """Return the nominal between scaled inputs and outputs, on which the weights act."""
         return scale_system(self.nominal_system, self.output_scale, self.input_scale)
 
-    def save(self, folder: Path) -> None:
-        """Write ``arrays.npz`` and ``uncertain_model.json``."""
-        arrays: dict[str, Array] = {name: getattr(self, name) for name in _ARRAYS}
-        arrays |= _packed("nominal", self.nominal_system)
-        arrays |= {f"bound_{form.value}": bound for form, bound in self.bounds.items()}
-        arrays |= {"cover_left": self.cover.left, "cover_right": self.cover.right}
-        content: dict[str, Any] = {name: getattr(self, name) for name in _FACTS}
-        content |= {"sample_period_s": self.sample_period_s, "nominals": {f.value: u for f, u in self.nominals.items()}}
-        for name in _WEIGHTS:
-            weight = getattr(self, name)
-            content[name] = None if weight is None else {fact: getattr(weight, fact) for fact in _OF_WEIGHT}
-            if weight is not None:
-                arrays |= _packed(f"{name}_left", weight.left) | _packed(f"{name}_right", weight.right)
-        save_artifact(Path(folder), "uncertain_model", content, arrays)
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> UncertainModel:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(Path(folder), "uncertain_model")
-        dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
-
-        def system(name: str) -> StateSpace:
-            return StateSpace(**{x: arrays[f"{name}_{x}"] for x in "ABCD"}, dt=dt)
-
-        facts: dict[str, Any] = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
-        facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"])}
-        facts |= {"bounds": {form: arrays[f"bound_{form.value}"] for form in nominals}, "nominals": nominals}
-        for name in (name for name in _WEIGHTS if content[name] is not None):
-            own = content[name] | {"method": Method(content[name]["method"])}
-            own |= {side: tuple(own[side]) for side in ("left_orders", "right_orders")}
-            facts[name] = Weight(system(f"{name}_left"), system(f"{name}_right"), **own)
-        return cls(nominal_system=system("nominal"), cover=Cover(arrays["cover_left"], arrays["cover_right"]), **facts)
-
-
-_ARRAYS = ("freqs_hz", "output_scale", "input_scale", "misfit")
-_WEIGHTS = ("weight", "remainder")
-_FACTS = ("form", "unit_ids", "nominal", "nominal_id")
-_OF_WEIGHT = ("left_orders", "right_orders", "cover_max", "overbound_db_max", "method")
-
 
 def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) -> StateSpace:
     """Return `S_y^-1 G S_u`; states that are the outputs are scaled with them."""
@@ -185,7 +144,3 @@ def scale_system(system: StateSpace, output_scale: Array, input_scale: Array) ->
         A, B = system.A * output_scale * rows, system.B * rows * input_scale
         return StateSpace(A, B, system.C, system.D * rows * input_scale, system.dt)
     return StateSpace(system.A, system.B * input_scale, system.C * rows, system.D * rows * input_scale, system.dt)
-
-
-def _packed(name: str, system: StateSpace) -> dict[str, Array]:
-    return {f"{name}_{x}": getattr(system, x) for x in "ABCD"}

@@ -13,13 +13,12 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import load_artifact, loader, save_artifact
+from ..core.artifacts import Storable
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..core.small_matrices import sigma_max
@@ -30,14 +29,12 @@ from .weights.magnitude import fit_magnitude
 
 Array = npt.NDArray[Any]
 
-_FACTS = ("form", "nominal_id", "unit_ids", "outside", "entry_excess")
-_ARRAYS = ("freqs_hz", "entries", "ratio", "largest", "entry_weights", "entry_orders")
-
 
 @dataclass(frozen=True, eq=False)
-class UnitResiduals:
+class UnitResiduals(Storable):
     """Sizes of the residuals of many units against one nominal."""
 
+    KIND = "unit_residuals"
     form: Form
     nominal_id: str
     unit_ids: tuple[str, ...]  # covered units, and others
@@ -53,20 +50,6 @@ class UnitResiduals:
     def rows(self, *, inside: bool) -> list[int]:
         """Return rows of the units that are covered, or of those that need not be."""
         return [k for k, unit in enumerate(self.unit_ids) if (unit not in self.outside) is inside]
-
-    def save(self, folder: Path) -> None:
-        """Write ``arrays.npz`` and ``unit_residuals.json``."""
-        content = {name: getattr(self, name) for name in _FACTS}
-        save_artifact(Path(folder), "unit_residuals", content, {name: getattr(self, name) for name in _ARRAYS})
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> UnitResiduals:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(Path(folder), "unit_residuals")
-        facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
-        facts |= {name: tuple(content[name]) for name in ("unit_ids", "outside")} | {"form": Form(content["form"])}
-        return cls(**facts | {"entry_excess": float("nan") if facts["entry_excess"] is None else facts["entry_excess"]})
 
 
 def unit_residuals(

@@ -13,13 +13,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, loader, save_artifact
+from ...core.artifacts import Storable
 from ..data import ObserverData
 from ..units import factors
 from .error import Box, ErrorSystem, ReliftScales, UnboundedSlopeError, error_system, state_sizes
@@ -56,7 +54,7 @@ class ReliftStatus(str, Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class ReliftCertificate:
+class ReliftCertificate(Storable):
     """What is proven about an observer at run time.
 
     Parameters
@@ -94,10 +92,11 @@ class ReliftCertificate:
     (True, 'certified', True)
     """
 
+    KIND = "relift"
     scales: ReliftScales
     assumptions: tuple[str, ...]
-    box: Box
-    parameters: Box
+    box: Mapping[str, float | tuple[float, float] | Array]
+    parameters: Mapping[str, float | tuple[float, float] | Array]
     status: ReliftStatus = ReliftStatus.UNBOUNDED
     reason: str = ""
     gain: float | None = None
@@ -130,32 +129,10 @@ class ReliftCertificate:
         assumptions = _assumptions(observer, box, self.parameters)
         return replace(self, scales=scales, box=box, assumptions=assumptions, root=root)
 
-    def save(self, folder: Path) -> None:
-        """Write ``relift.json`` and ``arrays.npz``."""
-        content = {name: getattr(self, name) for name in _PLAIN}
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        arrays |= {f"scales/{name}": getattr(self.scales, name) for name in ReliftScales.__dataclass_fields__}
-        save_artifact(Path(folder), "relift", content, arrays)
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> ReliftCertificate:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(Path(folder), "relift")
-        values: dict[str, Any] = {name: content[name] for name in _PLAIN}
-        values |= {name: tuple(content[name]) for name in ("channels", "assumptions")}
-        scales = ReliftScales(**{name: arrays[f"scales/{name}"] for name in ReliftScales.__dataclass_fields__})
-        values |= {name: arrays[name] for name in _ARRAYS} | {"status": ReliftStatus(content["status"])}
-        return cls(scales=scales, **values)
-
     def __repr__(self) -> str:
         """Say what is proven, in a line."""
         proven = f"gain {self.gain:.4g} (at least {self.lower_bound:.4g})" if self.certified else ""
         return f"<ReliftCertificate {proven or f'{self.status.value}: {self.reason}'}>"
-
-
-_ARRAYS = ("start", "root", "multipliers")
-_PLAIN = tuple(name for name in ReliftCertificate.__dataclass_fields__ if name not in (*_ARRAYS, "scales"))
 
 
 def relift_certificate(

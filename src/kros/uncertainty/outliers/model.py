@@ -23,13 +23,12 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import load_artifact, loader, save_artifact
+from ...core.artifacts import Storable
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
 from ..settings import OUTLIER
@@ -39,12 +38,9 @@ from .tail import LEAST_SCORES, margins, separate
 
 Array = npt.NDArray[Any]
 
-_ARRAYS = ("freqs_hz", "responses", "output_scale", "input_scale")
-_FACTS = ("form", "unit_ids", "threshold_db", "false_alarm_rate")
-
 
 @dataclass(frozen=True, eq=False)
-class OutlierModel:
+class OutlierModel(Storable):
     """Responses of the inliers of a population, against which units are scored.
 
     Parameters
@@ -73,6 +69,7 @@ class OutlierModel:
     True
     """
 
+    KIND = "outlier_model"
     form: Form
     unit_ids: tuple[str, ...]
     freqs_hz: Array
@@ -142,22 +139,6 @@ class OutlierModel:
     @cached_property
     def _known(self) -> Distances:
         return distances(self.form, self.responses, self.freqs_hz)
-
-    def save(self, folder: Path) -> None:
-        """Write ``arrays.npz`` and ``outlier_model.json``."""
-        content = {name: getattr(self, name) for name in _FACTS}
-        content |= {"scores": [{**vars(s), "threshold_db": None} for s in self.scores]}
-        save_artifact(Path(folder), "outlier_model", content, {name: getattr(self, name) for name in _ARRAYS})
-
-    @classmethod
-    @loader
-    def load(cls, folder: Path) -> OutlierModel:
-        """Read what `save` wrote."""
-        content, arrays = load_artifact(Path(folder), "outlier_model")
-        threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
-        facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
-        facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"]), "threshold_db": threshold}
-        return cls(scores=tuple(OutlierScore.from_content(s, threshold) for s in content["scores"]), **facts)
 
 
 def score_outliers(

@@ -6,7 +6,6 @@ nothing is said about the unit instead of "ok".
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
@@ -63,13 +62,6 @@ class OutlierScore:
     detectable_hz: float | None = None  # where that is; None where nothing could be flagged
     detectable_entry: tuple[int, int] = (0, 0)  # output and input
     more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
-
-    @classmethod
-    def from_content(cls, content: Mapping[str, Any], threshold_db: float) -> OutlierScore:
-        """Return a score as it was before it became JSON, which has neither infinity nor tuples."""
-        percent, entry = content["detectable_percent"], tuple(content["detectable_entry"])
-        values = {"threshold_db": threshold_db, "status": Status(content["status"]), "detectable_entry": entry}
-        return cls(**{**content, **values, "detectable_percent": float("inf") if percent is None else percent})
 
 
 @dataclass(frozen=True, eq=False)

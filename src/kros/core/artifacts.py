@@ -21,8 +21,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
-from functools import reduce, wraps
-from operator import getitem
+from functools import cache, wraps
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from types import GenericAlias
 from typing import Any, ClassVar, Self, TypeVar
@@ -38,7 +37,7 @@ from .settings import Settings
 
 T = TypeVar("T")
 SCHEMA = 1
-CHECKSUM = "checksum"
+CHECKSUM, _ARRAY = "checksum", "array in arrays.npz"
 _AGAIN = "write it again with the step that made it"
 _DAMAGED: tuple[type[Exception], ...] = (zipfile.BadZipFile, struct.error, tokenize.TokenError, SyntaxError, OSError)
 _DAMAGED += (EOFError, ValueError, LookupError, TypeError, ArithmeticError, RuntimeError, MemoryError)
@@ -193,34 +192,54 @@ class Storable:
 
     def save(self, folder: Path) -> None:
         """Write it, with its arrays beside the rest."""
-        arrays: dict[str, np.ndarray] = {}
-        save_artifact(folder, self.KIND, _without_arrays(self, "", arrays), arrays or None)
+        content, arrays = divided(self)
+        save_artifact(folder, self.KIND, content, arrays or None)
 
     @classmethod
     @loader
     def load(cls, folder: Path) -> Self:
         """Read what `save` wrote."""
-        content, arrays = load_artifact(folder, cls.KIND)
-        for name, array in arrays.items():
-            *place, last = name.split("/")
-            reduce(getitem, place, content)[last] = array
-        kind: Any = GenericAlias(tuple, cls)
-        adapter: TypeAdapter[Any] = TypeAdapter(kind, config=ConfigDict(arbitrary_types_allowed=True))
-        return adapter.validate_python([content])[0]
+        value: Self = united(cls, *load_artifact(folder, cls.KIND))
+        return value
 
 
-def _without_arrays(value: Any, place: str, arrays: dict[str, np.ndarray]) -> Any:
-    """Return dataclasses as mappings and numbers that JSON has not as texts; arrays are collected."""
-    if isinstance(value, np.ndarray):
-        arrays[place] = value
-        return None
-    if is_dataclass(value):
-        value = {f.name: getattr(value, f.name) for f in fields(value)}
-    if isinstance(value, Mapping):
-        return {str(k): _without_arrays(v, f"{place}/{k}".lstrip("/"), arrays) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [_without_arrays(v, place, arrays) for v in value]
-    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+def divided(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
+    """Return a value in JSON's types, numbers that JSON has not as texts, and its arrays by where they are in it."""
+    arrays: dict[str, np.ndarray] = {}
+
+    def plain_of(part: Any, name: str) -> Any:
+        if isinstance(part, np.ndarray):
+            arrays[name] = part
+            return {_ARRAY: name}
+        if is_dataclass(part):
+            part = {f.name: getattr(part, f.name) for f in fields(part)}
+        if isinstance(part, Mapping):
+            return {str(k): plain_of(v, f"{name}/{k}".lstrip("/")) for k, v in part.items()}
+        if isinstance(part, tuple | list):
+            return [plain_of(v, f"{name}/{k}".lstrip("/")) for k, v in enumerate(part)]
+        return str(part) if isinstance(part, float) and not math.isfinite(part) else part
+
+    return plain_of(value, ""), arrays
+
+
+def united(kind: Any, content: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """Return the value of a type that `divided` divided."""
+
+    def whole(part: Any) -> Any:
+        if isinstance(part, list):
+            return [whole(v) for v in part]
+        if not isinstance(part, dict):
+            return part
+        return arrays[part[_ARRAY]] if _ARRAY in part else {k: whole(v) for k, v in part.items()}
+
+    return _adapter(kind).validate_python([whole(content)])[0]
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    """Return what checks one value of a type."""
+    one: Any = GenericAlias(tuple, (kind,))
+    return TypeAdapter(one, config=ConfigDict(arbitrary_types_allowed=True))
 
 
 MANIFEST, INDEX = "manifest.json", "artefact.json"

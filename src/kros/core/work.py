@@ -6,17 +6,16 @@ it, on a cluster too. Numbers come back bit by bit; what cannot be read back who
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import logging
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 
-from .artifacts import digest_of, pack_arrays, unpack_arrays
+from .artifacts import digest_of, divided, json_bytes, pack_arrays, united, unpack_arrays
 from .errors import DataError
 from .files import read_bytes, write_bytes
 from .limits import MAX_ARRAYS_BYTES
@@ -63,12 +62,12 @@ class Results:
         return self.folder / f"{digest}.npz"
 
 
-def _read(path: Path | None, kinds: Iterable[type]) -> Any:
+def _read(path: Path | None, kind: Any) -> Any:
     """Return a result, or None where there is none or it cannot be read."""
     if path is None or not path.exists():
         return None
     try:
-        return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, {kind.__name__: kind for kind in kinds})
+        return unpacked(read_bytes(path, MAX_ARRAYS_BYTES), path, kind)
     except (DataError, ValueError, LookupError, TypeError, AttributeError) as error:
         log.warning("%s: a result cannot be read (%s), and is computed again", path, error)
         return None
@@ -91,47 +90,14 @@ class Storing:
 
 def packed(value: Any) -> bytes:
     """Return a result as an archive of its arrays, beside JSON of all else."""
-    arrays: list[np.ndarray] = []
-    text = json.dumps(_plain(value, arrays)).encode()
-    return pack_arrays({"content": np.frombuffer(text, np.uint8), **{str(i): a for i, a in enumerate(arrays)}})
+    content, arrays = divided(value)
+    return pack_arrays({"content": np.frombuffer(json_bytes(content), np.uint8), **arrays})
 
 
-def unpacked(content: bytes, path: Path, kinds: Mapping[str, type]) -> Any:
-    """Return what `packed` packed; dataclasses are of some kinds."""
+def unpacked(content: bytes, path: Path, kind: Any) -> Any:
+    """Return what `packed` packed."""
     arrays = unpack_arrays(content, path)
-    return _restored(json.loads(arrays["content"].tobytes()), arrays, kinds)
-
-
-def _plain(value: Any, arrays: list[np.ndarray]) -> Any:
-    """Turn a value into what JSON can hold: what is not JSON's own becomes ``[kind, ...]``."""
-    if value is None or type(value) in (str, int, bool, float):
-        return value
-    if isinstance(value, np.ndarray | np.generic):
-        arrays.append(np.asarray(value))
-        return ["array" if isinstance(value, np.ndarray) else "number", len(arrays) - 1, np.shape(value)]
-    if dataclasses.is_dataclass(value):
-        names = [f.name for f in dataclasses.fields(value)]
-        return [type(value).__name__, {name: _plain(getattr(value, name), arrays) for name in names}]
-    if isinstance(value, list | tuple):
-        return [type(value).__name__, [_plain(v, arrays) for v in value]]
-    if isinstance(value, dict):
-        return ["dict", {k: _plain(v, arrays) for k, v in value.items()}]
-    raise TypeError(f"Storing a result: {type(value).__name__} is of no kind that can be stored.")
-
-
-def _restored(value: Any, arrays: Mapping[str, np.ndarray], kinds: Mapping[str, type]) -> Any:
-    """Return what `_plain` turned into JSON."""
-    if not isinstance(value, list):
-        return value
-    kind, content, *shape = value
-    if shape:
-        array = arrays[str(content)].reshape(shape[0])
-        return array if kind == "array" else array[()]
-    if isinstance(content, list):
-        items = [_restored(v, arrays, kinds) for v in content]
-        return tuple(items) if kind == "tuple" else items
-    fields = {name: _restored(v, arrays, kinds) for name, v in content.items()}
-    return fields if kind == "dict" else kinds[kind](**fields)
+    return united(kind, json.loads(arrays["content"].tobytes()), arrays)
 
 
 @dataclass(frozen=True)
@@ -160,15 +126,15 @@ class Work:
         function: Callable[[Any], T],
         tasks: Iterable[Any],
         marks: Iterable[str | None],
-        kinds: Collection[type] = (),
+        kind: Any = Any,
         usable: Callable[[Any, Any], bool] = lambda task, result: True,
     ) -> Iterator[T]:
-        """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`."""
+        """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`, and of a kind."""
         if self.results is None:
             yield from self.map(title, function, tasks)
             return
         pairs = [(self.results.place(function, mark), task) for mark, task in zip(marks, tasks, strict=True)]
-        read = [_read(path, kinds) for path, _ in pairs]
+        read = [_read(path, kind) for path, _ in pairs]
         earlier = [r if r is None or usable(task, r) else None for r, (_, task) in zip(read, pairs, strict=True)]
         new = [pair for pair, result in zip(pairs, earlier, strict=True) if result is None]
         if new:

@@ -21,7 +21,7 @@ from ..core.artifacts import file_digest, load_artifact, loader
 from ..core.errors import DataError
 from ..core.files import is_file, link_or_copy
 from ..core.work import Work
-from .flat_tops import Ends, FlatTops, FoundLimit, ends_of, found_limit, smallest_step
+from .flat_tops import Ends, FoundLimit, ends_of, found_limit, smallest_step
 from .population import DEFAULT_CONDITION, OUTLIERS, EpisodeKey, Population, split_episodes
 from .prepare import recording_marks
 from .readers.parquet import GroupRecord, read_parquet, write_group, write_index
@@ -129,9 +129,6 @@ class _GroupFacts:
     episodes: list[_EpisodeFacts]
 
 
-_KINDS = (_GroupFacts, GroupRecord, EpisodeKey, FlatTops, _EpisodeFacts)
-
-
 @dataclass(frozen=True)
 class SurveyOptions:
     """Options of `survey`, by name."""
@@ -174,7 +171,7 @@ def survey(
     def usable(task: _Group, known: _GroupFacts) -> bool:
         return copy is None or copy.reuse(known)
 
-    groups = list((work or Work()).recall("read", _read_group, tasks, marks, _KINDS, usable))
+    groups = list((work or Work()).recall("read", _read_group, tasks, marks, _GroupFacts, usable))
     retained = _retained(population, groups, folder)
     episodes = [e for group in groups for e in group.episodes if e.key.unit not in set(chosen.reserve)]
     resolution = {m: min(g.resolution[m] for g in groups) for m in retained.measured}

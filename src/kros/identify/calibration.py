@@ -212,7 +212,7 @@ def calibrate(
 ) -> PhaseCalibration:
     """Calibrate all units on training episodes; one that cannot be calibrated is left out, its reason in the log."""
     tasks = [(population.select([u]), calibration_keys(facts, u), spec) for u in facts.groups]
-    recalled = (work or Work()).recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], (Segment,))
+    recalled = (work or Work()).recall("calibrate", segments_of, tasks, [_mark(facts, t) for t in tasks], list[Segment])
     units: dict[str, UnitPhase] = {}
     for unit, segments in zip(facts.groups, recalled, strict=True):
         try:

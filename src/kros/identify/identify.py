@@ -138,7 +138,7 @@ def _begin(
     units = [u for u in facts.groups if u in values and facts.keys("train", u, condition)]
     tasks = [(population.select([u], [condition]), facts.keys("train", u, condition), base.lifting) for u in units]
     marks = [_mark(facts, task) for task in tasks]
-    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, marks, (Factor,)))
+    episodes = list(work.recall(f"identify ({condition})", reduce_episodes, tasks, marks, Factor))
     parameters = {name: np.array([values[u][name] for u in units]) for name in base.lifting.parameters}
     reduced = _Reduced(base, condition, tuple(units), Factor.stack([combine(f) for f in episodes]), parameters)
     longest_s = max(int(f.n_samples.max()) for f in episodes) * population.sample_period_s

@@ -8,7 +8,7 @@ import shutil
 import numpy as np
 import pytest
 
-from kros.core.artifacts import read_arrays, read_json
+from kros.core.artifacts import load_artifact, read_json
 from kros.core.work import Work
 from kros.data import split_episodes, write_parquet
 from kros.data.readers.parquet import read_parquet
@@ -68,7 +68,7 @@ def test_a_fold_is_the_study_on_recordings_that_do_not_hold_its_units(pendulums,
             assert one.unit_ids == other.unit_ids == ("002", "004")
             assert np.array_equal(one.A, other.A)
             assert np.array_equal(one.B, other.B)
-            weights = [read_arrays(place / "uncertainty" / name / "arrays.npz") for place in (fold, alone)]
+            weights = [load_artifact(place / "uncertainty" / name, "uncertain_model")[1] for place in (fold, alone)]
             assert all(np.array_equal(weights[0][key], weights[1][key]) for key in weights[0])
     made = sorted(p.relative_to(fold / "observers") for p in (fold / "observers").glob("*/*.json"))
     assert made == sorted(p.relative_to(alone / "observers") for p in (alone / "observers").glob("*/*.json"))

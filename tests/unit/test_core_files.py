@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kros.core import limits
-from kros.core.artifacts import load_artifact, pack_arrays, place, read_arrays, read_json, save_artifact
+from kros.core.artifacts import load_artifact, pack_arrays, place, read_json, save_artifact, unpack_arrays
 from kros.core.errors import ConfigError, DataError
 from kros.core.files import read_bytes, read_toml, write_bytes
 
@@ -87,7 +87,7 @@ def test_archives_that_would_unpack_to_anything(tmp_path: Path) -> None:
     path = tmp_path / "arrays.npz"
     np.savez_compressed(path, A=np.zeros(10**6))
     with pytest.raises(DataError, match="compressed"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
     header = (
         b"\x93NUMPY\x01\x00v\x00"
         + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }".ljust(117)
@@ -96,18 +96,18 @@ def test_archives_that_would_unpack_to_anything(tmp_path: Path) -> None:
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", header + bytes(8))
     with pytest.raises(DataError, match="not a valid archive"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("A.npy", b"not an array")
     with pytest.raises(DataError, match="not a valid archive"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
     np.savez(path, A=np.array([{}], dtype=object))
     with pytest.raises(DataError, match="not a valid archive"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
     with path.open("wb") as file:
         file.truncate(limits.MAX_ARRAYS_BYTES + 1)  # takes no space on the disk
     with pytest.raises(DataError, match="files of up to"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
 
 
 def special(kind: str, path: Path) -> Path:
@@ -132,7 +132,7 @@ def test_only_regular_files_are_opened(tmp_path: Path, monkeypatch: pytest.Monke
     with pytest.raises(DataError, match="a regular file is needed"):
         read_json(path)
     with pytest.raises(DataError, match="a regular file is needed"):
-        read_arrays(path)
+        unpack_arrays(read_bytes(path, limits.MAX_ARRAYS_BYTES), path)
 
 
 @pytest.mark.parametrize("name", ["nothing", "x" * 300, "a\0b"])

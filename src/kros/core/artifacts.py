@@ -124,11 +124,6 @@ def unpack_arrays(packed: bytes, path: Path) -> dict[str, np.ndarray]:
         raise DataError(f"Reading {path}: {problem}; {_AGAIN}.") from error
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
-    """Read all arrays of an .npz; pickled objects and packed archives are refused."""
-    return unpack_arrays(read_bytes(Path(path), limits.MAX_ARRAYS_BYTES), path)
-
-
 def save_artifact(
     folder: Path, kind: str, content: Mapping[str, Any], arrays: Mapping[str, np.ndarray] | None = None
 ) -> None:

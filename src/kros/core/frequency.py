@@ -54,14 +54,6 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
     return freqs
 
 
-def dense_grid(freqs_hz: Array, sample_period_s: float, factor: int = 10) -> Array:
-    """Return `factor` times as many frequencies, between and at the given ones, with DC and Nyquist added."""
-    inside = freqs_hz[freqs_hz > 0]
-    steps = np.arange(factor) / factor
-    between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
-    return np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
-
-
 def bilinear_squared(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
     """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
     freqs = np.asarray(freqs_hz, dtype=float)

@@ -1,4 +1,8 @@
-"""Small linear algebra that several layers need."""
+"""Small linear algebra that several layers need.
+
+LAPACK takes stacks of 2 x 2 matrices one by one. Functions of many small matrices have the matrix axes first, `(row,
+column, ...)`: every entry is a long vector over units and frequencies.
+"""
 
 from __future__ import annotations
 
@@ -61,3 +65,43 @@ def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array
     """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first."""
     size = balanced_size(A)
     return np.asarray(np.linalg.lstsq(A * size / size[:, None], values / size[:, None], rcond=rcond)[0] * size[:, None])
+
+
+def entries_first(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Move the matrix axes to the front: (..., p, m) to (p, m, ...), contiguous."""
+    return np.ascontiguousarray(np.moveaxis(matrices, (-2, -1), (0, 1)))
+
+
+def multiply(left: npt.NDArray[Any], right: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Multiply entries-first matrices: (p, r, ...) times (r, m, ...), broadcast over the rest."""
+    return np.asarray(np.einsum("ik...,kj...->ij...", left, right))
+
+
+def squared(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the squared modulus."""
+    return values.real**2 + values.imag**2 if np.iscomplexobj(values) else values**2
+
+
+def sigma_max(matrices: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Return the largest singular value, shape (...), of matrices of shape (..., p, m).
+
+    Examples
+    --------
+    >>> from kros.uncertainty import sigma_max
+    >>> sigma_max([[[3.0, 0.0], [0.0, 4.0]], [[0.0, 1.0], [0.0, 0.0]]]).tolist()
+    [4.0, 1.0]
+    """
+    return sigma_max_first(entries_first(np.asarray(matrices)))
+
+
+def sigma_max_first(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the largest singular value of entries-first matrices (p, m, ...), shape (...)."""
+    columns = matrices if matrices.shape[1] <= matrices.shape[0] else np.swapaxes(matrices, 0, 1)
+    if columns.shape[1] > 2:
+        return np.asarray(np.linalg.norm(columns, 2, axis=(0, 1)))
+    first = squared(columns[:, 0]).sum(axis=0)
+    if columns.shape[1] == 1:
+        return np.sqrt(first)
+    second = squared(columns[:, 1]).sum(axis=0)
+    cross = np.einsum("i...,i...->...", np.conj(columns[:, 0]), columns[:, 1])
+    return np.sqrt((first + second) / 2 + np.sqrt((first - second) ** 2 / 4 + squared(cross)))

@@ -129,8 +129,7 @@ class StateSpace:
 
     def largest_pole(self) -> float:
         """Return the spectral radius, or the largest real part of a pole in continuous time, of one system."""
-        poles = self.poles()
-        return float(np.abs(poles).max(initial=0.0) if self.dt > 0 else poles.real.max(initial=-np.inf))
+        return float(self.spectral_radius() if self.dt > 0 else self.poles().real.max(initial=-np.inf))
 
     def is_stable(self) -> Array:
         """Tell whether every pole is inside the unit circle (or the left half-plane)."""

@@ -46,19 +46,13 @@ def as_state_space(system: Any) -> StateSpace:
 
 
 def gramian(A: Array, B: Array, dt: float) -> Array:
-    """Gramian of a stable pair, ``P = A P A' + B B'`` by doubling; ``A P + P A' + B B' = 0`` for ``dt = 0``."""
-    power, P = A, B @ B.T
-    if dt == 0:
-        from scipy.linalg import solve_continuous_lyapunov
+    """Gramian of a stable pair, ``P = A P A' + B B'``, or ``A P + P A' + B B' = 0`` for ``dt = 0``."""
+    from scipy.linalg import solve_continuous_lyapunov
 
-        return np.asarray(solve_continuous_lyapunov(A, -P))
-    for _ in range(_MAX_ITERATIONS):
-        step = power @ P @ power.T
-        P = P + step
-        if np.all(np.diag(step) <= EPS * np.diag(P)):  # state by state, in whatever units of measure
-            break
-        power = power @ power
-    return (P + P.T) / 2
+    if dt == 0:
+        return np.asarray(solve_continuous_lyapunov(A, -B @ B.T))
+    root = gramian_root(A, B)
+    return root @ root.T
 
 
 def gramian_root(A: Array, B: Array) -> Array:
@@ -189,10 +183,10 @@ def to_continuous(system: StateSpace) -> StateSpace:
 
 
 def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
-    """Return the mapped frequency of the largest gain and that gain; zero without frequencies."""
+    """Return the mapped frequency of the largest gain and that gain."""
     gains = _gains(system, nu)
-    best = int(np.argmax(gains)) if gains.size else 0
-    return (float(nu[best]), float(gains[best])) if gains.size else (0.0, 0.0)
+    best = int(np.argmax(gains))
+    return float(nu[best]), float(gains[best])
 
 
 def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
@@ -216,8 +210,6 @@ def _in_hz(system: StateSpace, nu: Any) -> Any:
 
 def _gains(system: StateSpace, nu: Array) -> Array:
     """Largest singular values at the mapped frequencies `nu` (rad/s for a continuous system)."""
-    if not nu.size:
-        return np.zeros(0)
     return np.linalg.norm(system.frequency_response(_in_hz(system, nu)), 2, axis=(-2, -1))
 
 

@@ -129,7 +129,7 @@ class Work:
         kind: Any = Any,
         usable: Callable[[Any, Any], bool] = lambda task, result: True,
     ) -> Iterator[T]:
-        """Map a function over tasks, in order, but for results that are there by the digests of tasks, `marks`, and of a kind."""
+        """Map a function over tasks, in order, but for results of a kind that are there by digests of tasks."""
         if self.results is None:
             yield from self.map(title, function, tasks)
             return
@@ -146,7 +146,7 @@ class Work:
 
     def run(self, title: str, work: Iterable[Callable[[], T]]) -> list[T]:
         """Run independent pieces of work, in order."""
-        return list(self.map(title, _call, work))
+        return self.begin(title, work)()
 
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""

@@ -15,7 +15,7 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import MANIFEST, load_artifact, read_arrays, read_json, recorded_files
+from ..core.artifacts import MANIFEST, load_artifact, read_json, recorded_files
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
@@ -155,16 +155,18 @@ class RunFolder:
     @cached_property
     def evaluation(self) -> dict[str, Any]:
         """Errors of all observers and models."""
-        folder = self._require("evaluation/evaluation.json", "the observers have not been evaluated yet")
-        content: dict[str, Any] = read_json(folder / "evaluation.json")
-        return content
+        return self._evaluation[0]
+
+    @cached_property
+    def _evaluation(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        reason = "the observers have not been evaluated yet"
+        return load_artifact(self._require("evaluation/evaluation.json", reason), "evaluation")
 
     @cached_property
     def shown(self) -> list[Shown]:
         """Episodes with estimates: nominal unit, worst off-nominal unit, and the nominal unit in other conditions."""
-        keys, reason = self.evaluation["shown"], "the observers have not been evaluated yet"
-        arrays = dict(read_arrays(self._require("evaluation/arrays.npz", reason) / "arrays.npz"))
-        return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(keys)]
+        content, arrays = self._evaluation
+        return [self._shown(arrays, f"shown{k}/", EpisodeKey(*row)) for k, row in enumerate(content["shown"])]
 
     def _shown(self, arrays: Mapping[str, Array], start: str, key: EpisodeKey) -> Shown:
         """Return one episode from the arrays whose names begin with `start`."""

@@ -12,8 +12,8 @@ Examples
 ('1', True)
 """
 
+from ..core.linalg import sigma_max
 from ..core.removed import refusing
-from ..core.small_matrices import sigma_max
 from .forms import Form, misfit, rebuild, residual
 from .model import ResponseUncertainty, UncertainModel
 from .nominal import choose_nominal

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.frequency import check_grid, log_grid
-from ..core.small_matrices import sigma_max
+from ..core.linalg import sigma_max
 from .forms import Form, check_responses, misfit
 from .inputs import Options, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system

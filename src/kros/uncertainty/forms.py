@@ -29,8 +29,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
+from ..core.linalg import sigma_max
 from ..core.settings import member
-from ..core.small_matrices import sigma_max
 from .settings import SET
 
 Array = npt.NDArray[Any]

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import save_artifact
 from ..core.errors import DataError
-from ..core.small_matrices import sigma_max, squared
+from ..core.linalg import sigma_max, squared
 from ..identify.bootstrap import ModelSamples
 from .forms import Form, residual
 from .settings import OUTLIER

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.small_matrices import sigma_max
+from ..core.linalg import sigma_max
 from ..identify.refine.minimax import smallest_largest
 from .forms import Form, as_form, check_responses, residual
 from .settings import SET

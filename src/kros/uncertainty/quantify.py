@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ..core.artifacts import load_artifact, loader, read_json, save_artifact, write_json
 from ..core.errors import ConfigError, IdentificationError
-from ..core.small_matrices import sigma_max
+from ..core.linalg import sigma_max
 from ..core.work import Work
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels, Stored

@@ -20,8 +20,8 @@ import numpy.typing as npt
 
 from ..core.artifacts import Storable
 from ..core.errors import DimensionError
+from ..core.linalg import sigma_max
 from ..core.lti import StateSpace, block_diagonal, gain
-from ..core.small_matrices import sigma_max
 from .forms import Form, residual
 from .settings import SET
 from .weights.cover import Cover, Weight

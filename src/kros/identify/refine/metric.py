@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.linalg import adjoint
-from ...core.small_matrices import entries_first, multiply, sigma_max_first
+from ...core.linalg import adjoint, entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
 Array = npt.NDArray[np.float64]

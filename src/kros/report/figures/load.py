@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...core.artifacts import read_arrays, read_json
+from ...core.artifacts import load_artifact
 from ...evaluate.errors import error_spectrum
 from ..canvas import Figure, frequency_axis, grid, legend, logarithmic
 from ..names import in_condition, model_label, model_look
@@ -19,7 +19,7 @@ def load_torque(run: RunFolder) -> tuple[Figure, str]:
     """Draw estimates of the load over an episode and spectra of their errors, a row a way to estimate."""
     if not run.has("load/load.json"):
         raise NotShownError("this study declares no load; set load.moment")
-    content, arrays = read_json(run.folder / "load" / "load.json"), read_arrays(run.folder / "load" / "arrays.npz")
+    content, arrays = load_artifact(run.folder / "load", "load")
     ways = [(label, [n for n in content["estimates"] if n.endswith(f"/{way}")]) for way, label in _WAYS]
     ways = [(label, names) for label, names in ways if names]
     truth = arrays["truth"].astype(float)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.small_matrices import entries_first, sigma_max_first, squared
+from ...core.linalg import entries_first, sigma_max_first, squared
 from ..forms import Form, residual
 from ..settings import OUTLIER
 

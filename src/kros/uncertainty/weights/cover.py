@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.linalg import entries_first, multiply, sigma_max_first, squared
 from ...core.lti import StateSpace
-from ...core.small_matrices import adjoint, entries_first, multiply, sigma_max_first, squared
 from ..settings import FIT, PROOF
 from .proof import Method
 
@@ -132,7 +132,8 @@ class _Smooth:
         top = np.sqrt(squared(M).sum(axis=(0, 1)).max(axis=0))
         M = M / top
         wide = p <= m
-        power = multiply(M, adjoint(M)) if wide else multiply(adjoint(M), M)
+        adjoint = np.conj(np.swapaxes(M, 0, 1))
+        power = multiply(M, adjoint) if wide else multiply(adjoint, M)
         for _ in range(self.squarings):
             power = multiply(power, power)
         Y = multiply(power, M) if wide else multiply(M, power)

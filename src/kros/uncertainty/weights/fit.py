@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.frequency import bilinear_squared, dense_grid
+from ...core.frequency import bilinear_squared, nyquist_hz
 from ...core.lti import StateSpace, block_diagonal, gain
 from ..forms import Form, completion, residual
 from ..settings import FIT, PROOF, SET
@@ -50,7 +50,9 @@ def fit_weight(
 
 def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
     """Return a dense grid from DC to Nyquist: a fit is free to bend wherever nothing is checked."""
-    dense = dense_grid(freqs_hz, sample_period_s, PROOF.density)
+    inside, steps = freqs_hz[freqs_hz > 0], np.arange(PROOF.density) / PROOF.density
+    between = (inside[:-1, None] * (inside[1:] / inside[:-1])[:, None] ** steps).ravel()
+    dense = np.unique(np.concatenate([[0.0], between, freqs_hz, [nyquist_hz(sample_period_s)]]))
     tau = bilinear_squared(dense, sample_period_s)
     inner = np.log10(tau[(tau > 0) & (tau < np.inf)]) if ((tau > 0) & (tau < np.inf)).any() else np.zeros(1)
     low, high = inner.min() - PROOF.decades, inner.max() + PROOF.decades

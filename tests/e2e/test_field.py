@@ -13,9 +13,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.core.artifacts import describe, read_manifest, write_manifest
 from kros.data import Channel, Population, Role, from_arrays, write_parquet
 from kros.plants import PLANTS
+from kros.report.manifest import describe, read_manifest, write_manifest
 
 SEEN = ("position", "target_position", "target_velocity")
 TOML = """

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 from run_results import files, results
 
-from kros.core.artifacts import recorded_files
 from kros.core.errors import IdentificationError
 from kros.core.files import NAME as LOCK
 from kros.core.files import locked
+from kros.report.manifest import recorded_files
 from kros.study import load_config
 from kros.study import run as run_study
 from kros.study.stages import learning

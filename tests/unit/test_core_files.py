@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from kros.core import limits
-from kros.core.artifacts import load_artifact, pack_arrays, place, read_json, save_artifact, unpack_arrays
+from kros.core.artifacts import load_artifact, pack_arrays, read_json, save_artifact, unpack_arrays
 from kros.core.errors import ConfigError, DataError
 from kros.core.files import read_bytes, read_toml, write_bytes
+from kros.report.manifest import place
 
 
 @pytest.fixture

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from kros.core.artifacts import Artefact
 from kros.core.work import Work
+from kros.report.manifest import Artefact
 from kros.study.config import Stage, StudyConfig, validate_config
 from kros.study.engine.context import Context, StageStep, run_steps
 from kros.study.engine.store import Store

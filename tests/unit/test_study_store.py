@@ -104,7 +104,7 @@ def test_where_files_cannot_be_linked_they_are_copied_with_their_times(tmp_path,
     file = tmp_path / "deep" / "a.txt"
     assert file.stat().st_nlink == 1
     assert file.stat().st_mtime_ns == store.record("read").files["deep/a.txt"][2]
-    monkeypatch.setattr("kros.core.artifacts.file_digest", lambda path: pytest.fail("was read again"))
+    monkeypatch.setattr("kros.report.manifest.file_digest", lambda path: pytest.fail("was read again"))
     store.add("read", store.stored(digest_of("a")))
 
 

@@ -1,12 +1,7 @@
-"""Artefacts: what is written and read, and folders of it that are named by the digest of all that they follow from.
+"""What is written and read: arrays in an .npz (no pickle), the rest in JSON, a schema version and a checksum of both.
 
-    <folder>/arrays.npz, <kind>.json    arrays (no pickle) and the rest, with a schema version and a checksum of both
-    <run>/store/<digest>/               what a stage wrote, and `artefact.json`, which lists it
-    <run>/store/<digest>.npz            the result of one task of a map; see `work`
-    <run>/manifest.json                 the artefacts of a run; their files are at their places in the run folder too
-
-A digest is of settings, inputs and source, so what is there need not be computed. Files appear whole or not at all.
-What was changed since is not read; a JSON file that was edited on purpose is accepted without its key ``checksum``.
+Files appear whole or not at all. What was changed since is not read; a JSON file that was edited on purpose is accepted
+without its key ``checksum``.
 """
 
 from __future__ import annotations
@@ -22,18 +17,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache, wraps
-from pathlib import Path, PurePosixPath, PureWindowsPath
+from pathlib import Path
 from types import GenericAlias
 from typing import Any, ClassVar, Self, TypeVar
 
 import numpy as np
-from pydantic import ConfigDict, Field, NonNegativeFloat, TypeAdapter
+from pydantic import ConfigDict, TypeAdapter
 from pydantic_core import to_jsonable_python
 
 from . import limits
-from .errors import ConfigError, DataError, KrosError
-from .files import is_file, pass_on_shortage, read_bytes, shortened, stamp_of, write_bytes
-from .settings import Settings
+from .errors import DataError, KrosError
+from .files import pass_on_shortage, read_bytes, shortened, write_bytes
 
 T = TypeVar("T")
 SCHEMA = 1
@@ -237,29 +231,6 @@ def _adapter(kind: Any) -> TypeAdapter[Any]:
     return TypeAdapter(one, config=ConfigDict(arbitrary_types_allowed=True))
 
 
-MANIFEST, INDEX = "manifest.json", "artefact.json"
-Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
-
-
-class Artefact(Settings):
-    """Files that follow from what `digest` is of."""
-
-    digest: str = Field(pattern="^[0-9a-f]{64}$")
-    seconds: NonNegativeFloat = 0.0  # that it took
-    files: dict[str, Described] = Field(default_factory=dict)  # by name
-    results: tuple[str, ...] = ()  # digests of the results that it was computed from
-
-    @classmethod
-    def read(cls, path: Path) -> Artefact:
-        """Read one that was written as JSON."""
-        return cls.of(_checked(path), f"Artefact {path}")
-
-    def matches(self, folder: Path, name: str) -> bool:
-        """Return whether a file is in a folder as it was written; one with its size and time is not read."""
-        path, (content, *stamp) = place(folder, name), self.files[name]
-        return is_file(path) and (stamp_of(path) == tuple(stamp) or file_digest(path) == content)
-
-
 def digest_of(*content: object) -> str:
     """Return a digest of plain content, dataclasses among it by their `repr`."""
     return hashlib.sha256(repr(content).encode()).hexdigest()
@@ -269,49 +240,3 @@ def file_digest(path: Path) -> str:
     """Return the SHA-256 of a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def describe(path: Path) -> Described:
-    """Return digest, size and time of a file."""
-    return file_digest(path), *stamp_of(path)
-
-
-def place(folder: Path, name: str) -> Path:
-    """Return the path of a file in a folder; a name that leads out of it, directly or through a link, is refused."""
-    parts = PurePosixPath(name).parts
-    if not parts or ".." in parts or "/".join(parts) != name or PureWindowsPath(name).anchor or "\0" in name:
-        raise DataError(f"Run folder {folder}: {name!r} is not the name of a file inside it.")
-    for depth in range(1, len(parts)):
-        path = folder.joinpath(*parts[:depth])
-        if path.is_symlink():
-            problem = f"{path} is a link, and results stay inside the folder"
-            raise DataError(f"Run folder {folder}: {problem}; put a folder in its place.")
-    return folder / name
-
-
-def read_manifest(folder: Path) -> dict[str, Artefact]:
-    """Return the artefacts of a run by stage; none where there is no manifest."""
-    path = folder / MANIFEST
-    if not is_file(path):
-        return {}
-    try:
-        return {stage: Artefact.of(content, stage) for stage, content in _checked(path).items()}
-    except (ConfigError, DataError, AttributeError, TypeError) as error:
-        problem = f"is damaged, or of another version of kros ({error})"
-        raise DataError(f"Manifest {path}: {problem}; run the study again.") from error
-
-
-def _checked(path: Path) -> Mapping[str, object]:
-    content = read_json(path)
-    check_checksum(content, path)
-    return {key: value for key, value in content.items() if key != CHECKSUM}
-
-
-def write_manifest(folder: Path, artefacts: Mapping[str, Artefact]) -> None:
-    """Write which artefacts a run has; what they were computed from stands in the store."""
-    write_json(folder / MANIFEST, with_checksum({s: a.model_dump(exclude={"results"}) for s, a in artefacts.items()}))
-
-
-def recorded_files(folder: Path) -> frozenset[str]:
-    """Return the names of all files that belong to a run."""
-    return frozenset().union(*(artefact.files for artefact in read_manifest(folder).values()))

@@ -15,12 +15,13 @@ from urllib.parse import unquote
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import MANIFEST, load_artifact, read_json, recorded_files
+from ..core.artifacts import load_artifact, read_json
 from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
 from ..uncertainty.unit_residuals import UnitResiduals
+from .manifest import MANIFEST, recorded_files
 
 Array = npt.NDArray[Any]
 T = TypeVar("T")

@@ -93,10 +93,9 @@ def _certificate(freqs: Array, bound: Array) -> str:
 
 def _between(freqs: Array, values: Array, at_hz: Array) -> Array:
     """Return responses (unit, frequency, p, m) at other frequencies, on straight lines, constant beyond the ends."""
-    units, _, p, m = values.shape
-    columns = np.moveaxis(values, 1, -1).reshape(-1, len(freqs))
-    between = np.array([np.interp(at_hz, freqs, column) for column in columns])
-    return np.moveaxis(between.reshape(units, p, m, len(at_hz)), -1, 1)
+    from scipy.interpolate import make_interp_spline
+
+    return np.asarray(make_interp_spline(freqs, values, k=1, axis=1)(np.clip(at_hz, freqs[0], freqs[-1])))
 
 
 def _bound(

@@ -215,8 +215,7 @@ def _plants(nominal: npt.ArrayLike, perturbed: npt.ArrayLike) -> tuple[Array, Ar
     if G.ndim < 2 or Gp.ndim < 2 or G.shape[-2:] != Gp.shape[-2:]:
         problem = f"Residual: both plants need the shape (..., outputs, inputs), found {G.shape} and {Gp.shape}"
         raise DimensionError(f"{problem}; bring them to the same channels.")
-    axes = max(G.ndim, Gp.ndim)
-    return G.reshape((1,) * (axes - G.ndim) + G.shape), Gp.reshape((1,) * (axes - Gp.ndim) + Gp.shape)
+    return G, Gp
 
 
 def _inverse(matrices: Array) -> Array:

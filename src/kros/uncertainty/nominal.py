@@ -71,5 +71,4 @@ def choose_nominal(responses: npt.ArrayLike, form: Form | str) -> NominalChoice:
         sizes = np.concatenate([sigma_max(residual(form, G[row], part)) for part in parts])
         return sizes.max(axis=0), sizes.argmax(axis=0)
 
-    search = smallest_largest((n_units, n_freqs), 0, bound, against, lambda sizes: sizes.max(axis=-1))
-    return NominalChoice(*search[:2])
+    return NominalChoice(*smallest_largest((n_units, n_freqs), bound, against)[:2])

@@ -97,5 +97,5 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
 
     if np.array_equal(G, np.broadcast_to(G[:, :, :1], G.shape)):
         return 0.0
-    _, _, peaks, exact = smallest_largest((len(A), points), 0, bound_of, against, lambda bound: bound.max(axis=-1))
+    _, _, peaks, exact = smallest_largest((len(A), points), bound_of, against)
     return float(peaks[exact].min())

@@ -19,30 +19,27 @@ import numpy.typing as npt
 from ...core.rounding import ITERATED
 
 Array = npt.NDArray[Any]
-Score = Callable[[Array], Array]
 
 TIE = ITERATED  # relative; scores closer than rounding are one
 
 
 def smallest_largest(
     shape: tuple[int, int],
-    first: int,
     bound_of: Callable[[int], tuple[Array, Array]],
     against: Callable[[Array, Array], Array],
-    score: Score,
 ) -> tuple[int, Array, Array, Array]:
     """Return the best candidate, its bound, all scores (lower bounds where not evaluated), and which are exact."""
     lower, scores, evaluated = np.zeros(shape), np.zeros(shape[0]), np.zeros(shape[0], bool)
-    best, row = np.inf, first
+    best, row = np.inf, 0
     while scores[row] <= best * (1 + TIE):
         lower[row], witness = bound_of(row)
-        scores[row], evaluated[row] = float(score(lower[row])), True
+        scores[row], evaluated[row] = float(lower[row].max()), True
         best = min(best, scores[row])
         rows = np.flatnonzero(~evaluated & (scores <= best * (1 + TIE)))
         if not rows.size:
             break
         lower[rows] = np.maximum(lower[rows], against(rows, witness))
-        scores[rows] = np.maximum(scores[rows], score(lower[rows]))
+        scores[rows] = np.maximum(scores[rows], lower[rows].max(axis=1))
         row = int(rows[np.argmin(scores[rows])])
     exact = np.where(evaluated, scores, np.inf)
     least = exact.min()

@@ -1,7 +1,7 @@
 """The run folder: a manifest of artefacts, which are in its store; their files are in the run folder too.
 
     <run>/manifest.json          which artefact every stage has, with digests of all files
-    <run>/store/<digest>/        artefacts, and results of single units; see `core.artifacts`
+    <run>/store/<digest>/        artefacts, and results of single units; see `report.manifest`
     <run>/models/ ...            the files of the artefacts, for people and for all that reads a run
     <run>/<stage>/<name>/        a run that a stage made, among its files, with another manifest and the same store
 
@@ -21,24 +21,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from ...core.artifacts import (
-    INDEX,
-    MANIFEST,
-    Artefact,
-    describe,
-    digest_of,
-    file_digest,
-    place,
-    read_json,
-    read_manifest,
-    recorded_files,
-    with_checksum,
-    write_json,
-    write_manifest,
-)
+from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
 from ...core.errors import ConfigError, DataError, DimensionError
 from ...core.files import NAME as LOCK
 from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy, locked
+from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config
 
 log = logging.getLogger(__name__)

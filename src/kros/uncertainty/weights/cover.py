@@ -19,7 +19,7 @@ Weights are stable systems that are above a cover, `E_k = W_L Delta_k W_R` with 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -73,17 +73,6 @@ class Weight:
         """Return the magnitudes of the diagonals at some frequencies."""
         left, right = (side.frequency_response(freqs_hz) for side in (self.left, self.right))
         return Cover(np.abs(np.einsum("fii->fi", left)), np.abs(np.einsum("fii->fi", right)))
-
-    def scaled(self, factor: float) -> Weight:
-        """Return the weight with its left part multiplied."""
-        left = self.left
-        return replace(self, left=StateSpace(left.A, left.B, left.C * factor, left.D * factor, left.dt))
-
-    def measured(self, freqs_hz: Array, best: Cover) -> Weight:
-        """Return the weight with its overbound over the optimal cover at some frequencies."""
-        used, some = self.magnitudes(freqs_hz), best.left.min(axis=1) > 0
-        excess = (used.at(some).cost_db() - best.at(some).cost_db()).max(initial=0.0) if some.any() else 0.0
-        return replace(self, overbound_db_max=float(excess))
 
 
 def optimal_cover(E: Array) -> Cover:

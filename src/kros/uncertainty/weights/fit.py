@@ -45,7 +45,9 @@ def fit_weight(
         weight = fit.again(missed)
         proof, ratio = fit.proven(weight)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
-    return _lifted(weight, proof, float(ratio.max())).measured(freqs_hz, cover), cover
+    weight, some = _lifted(weight, proof, float(ratio.max())), cover.left.min(axis=1) > 0
+    excess = weight.magnitudes(freqs_hz).at(some).cost_db() - cover.at(some).cost_db()
+    return replace(weight, overbound_db_max=float(excess.max(initial=0.0))), cover
 
 
 def checking_grid(freqs_hz: Array, sample_period_s: float) -> Array:
@@ -137,10 +139,11 @@ class _Fit:
 
 def _lifted(weight: Weight, proof: Certificate, on_grid: float) -> Weight:
     """Scale the left weight until it touches the residuals from above."""
-    lift = max(proof.bound, on_grid) * (1 + PROOF.rounding)
+    lift, left = max(proof.bound, on_grid) * (1 + PROOF.rounding), weight.left
     if not lift > 0:
         return replace(weight, cover_max=0.0, method=proof.method)
-    return replace(weight.scaled(lift), cover_max=on_grid / lift, method=proof.method)
+    left = StateSpace(left.A, left.B, left.C * lift, left.D * lift, left.dt)
+    return replace(weight, left=left, cover_max=on_grid / lift, method=proof.method)
 
 
 def _peaks(ratio: Array) -> Array:

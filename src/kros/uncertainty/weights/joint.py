@@ -120,10 +120,6 @@ class _Terms:
         weight = np.exp((self.values - top) / temperature)
         return self.price * (top + temperature * float(np.log(weight.sum()))), weight / weight.sum()
 
-    def rows(self, sections: Sections, slopes: Array) -> Array:
-        """Return the derivatives of the values, shape (parameter, n)."""
-        return self.shares[:, sections.owner].T * slopes[:, self.at]
-
 
 @dataclass(frozen=True, eq=False)
 class _State:
@@ -152,37 +148,31 @@ class _State:
         both = np.repeat(np.tile(np.eye(p), 2), count, axis=0)
         return cost, sound, _Terms((left + right).ravel(), np.tile(np.arange(count), p), both, price)
 
-    @cached_property
-    def _rows(self) -> list[Array]:
-        slopes = self.sections.slopes(self.problem.tau)
-        return [terms.rows(self.sections, slopes) for terms in self.terms]
-
-    def value(self, temperature: float) -> tuple[float, Array]:
-        """Return what is minimised, nepers, and its gradient."""
+    def value(self, temperature: float) -> float:
+        """Return what is minimised, nepers."""
         away = self.sections.parameters - self.start
-        smoothed = [terms.smoothed(temperature) for terms in self.terms]
-        gradient = FIT.pull * away
-        for terms, rows, (_, weight) in zip(self.terms, self._rows, smoothed, strict=True):
-            gradient += terms.price * (rows @ weight)
-        return sum(value for value, _ in smoothed) + FIT.pull / 2 * float(away @ away), gradient
+        smoothed = sum(terms.smoothed(temperature)[0] for terms in self.terms)
+        return smoothed + FIT.pull / 2 * float(away @ away)
 
-    def hessian(self, temperature: float) -> Array:
-        """Return the spread of the gradients."""
-        total = FIT.pull * np.eye(len(self.start))
-        for terms, rows in zip(self.terms, self._rows, strict=True):
-            weight = terms.smoothed(temperature)[1]
+    def derivatives(self, temperature: float) -> tuple[Array, Array]:
+        """Return the gradient, and the spread of the gradients."""
+        gradient = FIT.pull * (self.sections.parameters - self.start)
+        spread, slopes = FIT.pull * np.eye(len(self.start)), self.sections.slopes(self.problem.tau)
+        for terms in self.terms:
+            rows, weight = terms.shares[:, self.sections.owner].T * slopes[:, terms.at], terms.smoothed(temperature)[1]
             mean = rows @ weight
-            total += terms.price / temperature * ((rows * weight) @ rows.T - np.outer(mean, mean))
-        return total
+            gradient += terms.price * mean
+            spread += terms.price / temperature * ((rows * weight) @ rows.T - np.outer(mean, mean))
+        return gradient, spread
 
     def step(self, temperature: float, damping: float) -> tuple[_State, float] | None:
         """Return the state after one damped step and the damping of the next; None where no step is better."""
-        (before, gradient), hessian = self.value(temperature), self.hessian(temperature)
+        before, (gradient, spread) = self.value(temperature), self.derivatives(temperature)
         for _ in range(FIT.trials):
-            move = -np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
+            move = -np.linalg.solve(spread + damping * np.diag(np.diag(spread)), gradient)
             move *= min(1.0, FIT.farthest / max(float(np.abs(move).max()), _TINY))
             trial = replace(self, sections=self.sections.at(self.sections.parameters + move, self.problem.ends))
-            if trial.value(temperature)[0] < before:
+            if trial.value(temperature) < before:
                 return trial, max(damping / 4, 1e-6)
             damping *= 8
         return None

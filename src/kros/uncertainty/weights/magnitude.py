@@ -31,7 +31,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
+from itertools import chain, pairwise
 from typing import Any
 
 import numpy as np
@@ -128,7 +129,6 @@ def fit_magnitude(
 class Bound:
     """Best bound of one order."""
 
-    order: int
     sections: Sections  # above the data
     excess_db: float
 
@@ -145,7 +145,7 @@ def rising_bounds(tau: Array, magnitude: Array, max_order: int) -> Iterator[Boun
             best, ratio = better, float((better(tau) / targets).max())
             try:
                 sections = best.factor().lifted(slice(0, 1), float(np.log(unit)))
-                bound = Bound(order, sections, 10 * float(np.log10(ratio)))
+                bound = Bound(sections, 10 * float(np.log10(ratio)))
             except KrosError as error:
                 _LOG.debug("Magnitude fit: %s", error)
         if bound is not None:
@@ -278,10 +278,14 @@ class RationalMagnitude:
         phi = basis(np.asarray(tau, float), self.knots)
         return (phi @ self.numerator) / (phi @ self.denominator)
 
+    @cached_property
+    def sides(self) -> tuple[Sequence[complex], ...]:
+        """Roots in tau of numerator and denominator."""
+        return tuple(roots(c, self.knots) for c in (self.numerator, self.denominator))
+
     def not_positive(self) -> list[float]:
         """Return the tau >= 0 at which numerator or denominator vanish."""
-        sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
-        return sorted(r.real for side in sides for r in side if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
+        return sorted(r.real for r in chain(*self.sides) if r.real >= 0 and abs(r.imag) <= _ROUNDING * abs(r))
 
     def factor(self) -> Sections:
         """Return the stable, minimum-phase system whose squared magnitude this is, or raise a `KrosError`."""
@@ -290,8 +294,7 @@ class RationalMagnitude:
         if bad or not (np.isfinite(ends).all() and (ends > 0).all()):
             problem = f"is {ends} at DC and Nyquist, and zero or infinite at tau = {bad}"
             raise KrosError(f"Spectral factor: the squared magnitude {problem}; try another order.")
-        sides = (roots(c, self.knots) for c in (self.numerator, self.denominator))
-        zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in sides)
+        zeros, poles = ([-np.sqrt(-complex(r)) for r in side] for side in self.sides)
         distance = np.array([1 - abs((1 + w) / (1 - w)) for w in (*zeros, *poles)])
         if not (distance > _ROUNDING / 10).all():
             problem = f"a pole or zero is {distance.min():.1e} from the unit circle, too near for double precision"

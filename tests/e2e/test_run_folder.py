@@ -17,11 +17,11 @@ import pytest
 from run_results import files, results
 
 from kros.core.errors import IdentificationError
-from kros.core.files import NAME as LOCK
-from kros.core.files import locked
 from kros.report.manifest import recorded_files
 from kros.study import load_config
 from kros.study import run as run_study
+from kros.study.engine.lock import NAME as LOCK
+from kros.study.engine.lock import locked
 from kros.study.stages import learning
 
 pytestmark = pytest.mark.usefixtures("few_figures")

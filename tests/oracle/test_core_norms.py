@@ -8,7 +8,7 @@ import pytest
 import scipy.linalg as sl
 
 from kros.core import StateSpace, gain, h2_norm, hinf_norm
-from kros.core.precise import precise_gain
+from kros.core.norms import precise_gain
 
 
 def oscillator(zeta, omega):

@@ -1,13 +1,10 @@
-"""Files: opened only when they are regular, read up to a limit, written whole; folders locked while they are used."""
+"""Files: opened only when they are regular, read up to a limit, written whole."""
 
 from __future__ import annotations
 
-import errno
-import logging
 import os
 import re
 import shutil
-import socket
 import stat
 import tempfile
 import tomllib
@@ -134,60 +131,3 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     """Return a hint for a message where a name is nearly one that is known, else nothing."""
     close = get_close_matches(str(name), list(known), n=1, cutoff=0.6)
     return f"; did you mean {close[0]!r}?" if close else ""
-
-
-try:
-    import fcntl
-except ImportError:  # Windows, where a locked file cannot be read
-    fcntl = None  # type: ignore[assignment]
-
-log = logging.getLogger(__name__)
-NAME = ".kros.lock"
-
-
-@contextmanager
-def locked(folder: Path, shared: bool = False) -> Iterator[None]:
-    """Hold a folder for writing alone, or for reading together with other readers, where it may be locked at all."""
-    path = folder / NAME
-    try:
-        handle = os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0), 0o644)
-    except OSError as error:
-        if not shared or error.errno not in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise
-        yield
-        return
-    try:
-        _take(handle, path, shared)
-        if not shared:
-            os.ftruncate(handle, 0)
-            os.write(handle, f"process {os.getpid()} on {socket.gethostname()}".encode())
-        try:
-            yield
-        finally:
-            with suppress(OSError):  # other readers hold it: the last one removes it
-                _lock(handle, shared=False)
-                path.unlink()
-    finally:
-        os.close(handle)
-
-
-def _lock(handle: int, shared: bool) -> None:
-    """Lock a file for all readers together, or for one writer."""
-    if fcntl is None:
-        raise OSError(errno.ENOLCK, "none on Windows")
-    fcntl.flock(handle, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-
-
-def _take(handle: int, path: Path, shared: bool) -> None:
-    """Lock a file, or refuse where another process holds it or has just removed it."""
-    try:
-        _lock(handle, shared)
-        busy = not path.exists() or not os.path.samestat(os.fstat(handle), path.stat())
-    except BlockingIOError:
-        busy = True
-    except OSError as error:
-        log.warning("%s: no file locks here (%s); do not run two studies in one folder at once", path, error)
-        busy = False
-    if busy:
-        holder = os.read(handle, 200).decode(errors="replace") or "another process"
-        raise ConfigError(f"Folder {path.parent}: {holder} is using it; wait until it ends, or name another.")

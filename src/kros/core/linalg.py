@@ -32,15 +32,6 @@ def qr_triangle(matrix: Array) -> Array:
     return np.asarray(np.linalg.qr(matrix, mode="r"))
 
 
-def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its size."""
-    largest = np.abs(regressors).max(axis=0, initial=0.0)
-    largest[largest == 0] = 1.0
-    size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
-    size[size == 0] = 1.0
-    return np.asarray(np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None])
-
-
 def balanced_size(A: Array) -> Array:
     """Sizes of the states, powers of two, in which rows and columns of A are of alike size, shape (n,)."""
     from scipy.linalg import matrix_balance
@@ -59,12 +50,6 @@ def balancing(
     k = int(np.sum(values > negligible * values.max(initial=0.0)))
     root = np.sqrt(values[:k])
     return (U[:, :k] / root).T @ S.T, R @ Vh[:k].T / root, values[:k]
-
-
-def solve_balanced(A: Array, values: Array, rcond: float | None = None) -> Array:
-    """Return X that makes ``A X - values`` smallest for a square A between states, which is balanced first."""
-    size = balanced_size(A)
-    return np.asarray(np.linalg.lstsq(A * size / size[:, None], values / size[:, None], rcond=rcond)[0] * size[:, None])
 
 
 def entries_first(matrices: npt.NDArray[Any]) -> npt.NDArray[Any]:

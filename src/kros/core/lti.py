@@ -153,13 +153,9 @@ class StateSpace:
             sizes = f"{self.n_inputs} inputs at {self.dt} s against {other.n_outputs} outputs at {other.dt} s"
             raise DimensionError(f"Series connection: {sizes}; match them.")
         zero = np.zeros((other.n_states, self.n_states))
-        return StateSpace(
-            np.block([[self.A, self.B @ other.C], [zero, other.A]]),
-            np.block([[self.B @ other.D], [other.B]]),
-            np.block([[self.C, self.D @ other.C]]),
-            self.D @ other.D,
-            self.dt,
-        )
+        A = np.block([[self.A, self.B @ other.C], [zero, other.A]])
+        B, C = np.block([[self.B @ other.D], [other.B]]), np.block([[self.C, self.D @ other.C]])
+        return StateSpace(A, B, C, self.D @ other.D, self.dt)
 
 
 def gain(matrix: npt.ArrayLike, dt: float) -> StateSpace:

@@ -10,6 +10,7 @@ import json
 import logging
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from operator import call
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -151,9 +152,5 @@ class Work:
     def begin(self, title: str, work: Iterable[Callable[[], T]]) -> Callable[[], list[T]]:
         """Begin independent pieces of work, and return what waits for their results; other work may run meanwhile."""
         pieces = list(work)
-        running = self.executor.map(_call, pieces)
+        running = self.executor.map(call, pieces)
         return lambda: list(self._followed(title, len(pieces), running))
-
-
-def _call(work: Callable[[], T]) -> T:
-    return work()

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DimensionError
-from ..core.linalg import solve_balanced
+from ..core.linalg import balanced_size
 from ..core.lti import StateSpace
 from ..core.rounding import ITERATED
 from ..core.settings import member
@@ -157,7 +157,9 @@ class ObserverData:
         n = self.lifting.n_states
         if self.bank is not None:
             return np.eye(n)[:, list(self.measured)]
-        return solve_balanced(self.A[:n, :n], (self.into @ self.controller.D)[:n], rcond=ITERATED)
+        A, size = self.A[:n, :n], balanced_size(self.A[:n, :n])[:, None]
+        values = (self.into @ self.controller.D)[:n] / size
+        return np.linalg.lstsq(A * size.T / size, values, rcond=ITERATED)[0] * size
 
     @property
     def one_step(self) -> Array:

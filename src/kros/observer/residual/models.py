@@ -23,7 +23,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DataError
-from ...core.linalg import least_squares
 from ...core.rounding import TINY
 from ...data import EpisodeBatch
 from ...lifting import Lifting
@@ -104,3 +103,12 @@ def _choices(measured: tuple[int, ...], hidden: Sequence[int]) -> list[tuple[int
     others = [i for i in hidden if i not in measured]
     sizes = range(len(others) + 1) if len(others) <= _MOST_HIDDEN else (0, len(others))
     return [(), *(tuple(sorted(measured + some)) for size in sizes for some in combinations(others, size))]
+
+
+def least_squares(regressors: Array, values: Array, rcond: float | None = None) -> Array:
+    """Return the smallest least-squares X of ``regressors X = values``, every regressor in units of its size."""
+    largest = np.abs(regressors).max(axis=0, initial=0.0)
+    largest[largest == 0] = 1.0
+    size = largest * np.sqrt(np.mean((regressors / largest) ** 2, axis=0))
+    size[size == 0] = 1.0
+    return np.asarray(np.linalg.lstsq(regressors / size, values, rcond=rcond)[0] / size[:, None])

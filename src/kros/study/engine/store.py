@@ -23,10 +23,11 @@ from typing import Any
 
 from ...core.artifacts import digest_of, file_digest, read_json, with_checksum, write_json
 from ...core.errors import ConfigError, DataError, DimensionError
-from ...core.files import NAME as LOCK
-from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy, locked
+from ...core.files import TEMPORARY, draft_beside, is_file, link_or_copy
 from ...report.manifest import INDEX, MANIFEST, Artefact, describe, place, read_manifest, recorded_files, write_manifest
 from ..config import Stage, StudyConfig, stored_config
+from .lock import NAME as LOCK
+from .lock import locked
 
 log = logging.getLogger(__name__)
 

@@ -57,6 +57,10 @@ class Factor:
     n_samples: npt.NDArray[np.int64]  # (...)
     input_range: Array | None = None  # (..., 2, m), smallest and largest value of every recorded input
 
+    def __getitem__(self, rows: Any) -> Factor:
+        """Return some factors of a batch."""
+        return Factor(self.R[rows], self.peak[rows], self.n_samples[rows])
+
     @classmethod
     def stack(cls, factors: Sequence[Factor]) -> Factor:
         """Stack factors along a new first axis."""

@@ -91,13 +91,13 @@ class Evidence:
     """Episodes that a unit is identified from."""
 
     factor: Factor  # parameter-free, batch (episode,)
-    lifted: Array  # (episode, q, q): factors of ``[Psi | Theta_plus]``
+    lifted: Factor  # of ``[Psi | Theta_plus]``
 
     @classmethod
     def of(cls, factor: Factor, models: ModelSet, parameters: Mapping[str, float]) -> Evidence:
         """Lift the factors of one unit's episodes."""
         values = {name: np.full(len(factor.R), parameters[name]) for name in models.lifting.parameters}
-        return cls(factor, lifted_factor(factor, models.lifting, values, models.lifting).R)
+        return cls(factor, lifted_factor(factor, models.lifting, values, models.lifting))
 
     @property
     def n_samples(self) -> int:
@@ -106,8 +106,7 @@ class Evidence:
 
     def part(self, episodes: Sequence[int]) -> Evidence:
         """Return some of the episodes."""
-        rows, f = list(episodes), self.factor
-        return Evidence(Factor(f.R[rows], f.peak[rows], f.n_samples[rows]), self.lifted[rows])
+        return Evidence(self.factor[list(episodes)], self.lifted[list(episodes)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,11 +120,10 @@ class Recorded:
     @classmethod
     def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:
         """Take the units of models from the factors of all training episodes of a condition."""
-        f, units = factors.factor, {}
-        for unit in models.unit_ids:
-            rows, at = factors.rows_of(unit), models.index(unit)
-            factor = Factor(f.R[rows], f.peak[rows], f.n_samples[rows])
-            units[unit] = Evidence.of(factor, models, {k: float(v[at]) for k, v in models.parameters.items()})
+        units = {}
+        for row, unit in enumerate(models.unit_ids):
+            values = {k: float(v[row]) for k, v in models.parameters.items()}
+            units[unit] = Evidence.of(factors.factor[factors.rows_of(unit)], models, values)
         return cls(models, units, freqs_hz)
 
     @cached_property
@@ -135,7 +133,7 @@ class Recorded:
 
     def response(self, evidence: Sequence[Evidence]) -> Array:
         """Return responses of estimates, shape (estimate, frequency, n, m)."""
-        factors = [combine(Factor(e.lifted, e.factor.peak, e.factor.n_samples)).R for e in evidence]
+        factors = [combine(e.lifted).R for e in evidence]
         sizes = np.sqrt([self.usual / e.n_samples for e in evidence])
         fitted = self.models.fit(np.stack(factors) * sizes[:, None, None])
         names = tuple(map(str, range(len(factors))))
@@ -143,8 +141,8 @@ class Recorded:
 
     def halves(self) -> tuple[Array, Array] | None:
         """Return the responses of all units from every second episode, and from the others."""
-        several = [e for e in self.units.values() if len(e.lifted) > 1]
-        one, other = ([e.part(range(k, len(e.lifted), 2)) for e in several] for k in (0, 1))
+        several = [e for e in self.units.values() if len(e.factor.R) > 1]
+        one, other = ([e.part(range(k, len(e.factor.R), 2)) for e in several] for k in (0, 1))
         return (self.response(one), self.response(other)) if several else None
 
     def same_motions(self, factor: Factor) -> bool:

@@ -60,7 +60,6 @@ class OutlierScore:
     status: Status = Status.CANNOT_TELL
     detectable_percent: float = float("inf")  # smallest change of gain of one entry that would be flagged, first order
     detectable_hz: float | None = None  # where that is; None where nothing could be flagged
-    detectable_entry: tuple[int, int] = (0, 0)  # output and input
     more_data: float = 1.0  # how many times as long the unit would have to be recorded; one where recordings suffice
 
 
@@ -98,12 +97,12 @@ class Comparison:
         """Return a score with the smallest change of gain that is an excess of the bound, and what follows from it."""
         cover = float(self.distances.levels[unit].max()) - score.excess_db
         percent = OUTLIER.percent * 10 ** ((cover + bound_db - self._changes) / 20)
-        i, j, row = (int(k) for k in np.unravel_index(int(np.argmin(percent)), percent.shape))
-        smallest, hz = float(percent[i, j, row]), float(self.freqs_hz[row])
+        percent = percent.min(axis=(0, 1))
+        smallest, hz = float(percent.min()), float(self.freqs_hz[percent.argmin()])
         shows = bound_db <= OUTLIER.largest_db and smallest <= OUTLIER.largest_percent
         inlier = Status.OK if shows else Status.CANNOT_TELL
         status = Status.OUTLIER if score.outlier else inlier
-        return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz, detectable_entry=(i, j))
+        return replace(score, status=status, detectable_percent=smallest, detectable_hz=hz)
 
     @cached_property
     def _changes(self) -> Array:

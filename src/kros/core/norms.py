@@ -25,7 +25,7 @@ import numpy.typing as npt
 from .errors import DimensionError, KrosError, SynthesisError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
-from .rounding import AGREED, EPS, ITERATED
+from .rounding import AGREED, EPS, ITERATED, TINY
 
 Array = npt.NDArray[Any]
 
@@ -224,7 +224,7 @@ def _rounding(system: StateSpace, nu: float) -> float:
 def first_frequencies(poles: Array) -> Array:
     """Frequencies for the first lower bound, rad/s: DC, all poles of a continuous system, a grid around them."""
     sizes = np.abs(poles)
-    low, high = np.maximum([sizes.min(), sizes.max()], np.finfo(float).tiny)
+    low, high = np.maximum([sizes.min(), sizes.max()], TINY)
     # A pole a + jb peaks at sqrt(b^2 - a^2) in the transfer function of second order.
     peaks = np.sqrt(np.maximum(poles.imag**2 - poles.real**2, 0.0))
     grid = np.geomspace(low / 10, 10 * high, 100)

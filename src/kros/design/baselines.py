@@ -87,7 +87,7 @@ def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Arr
         np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
-        {name: float(v[row]) for name, v in models.parameters.items()},
+        models.parameters_of(unit),
         delay_of(training.sensor),
     )
     short = batch.head(DEFAULT.extended_samples)

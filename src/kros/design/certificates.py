@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..core.errors import SynthesisError
 from ..core.lti import StateSpace, gain
+from ..core.rounding import TINY
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey
 from ..evaluate.errors import error_rms
@@ -147,7 +148,7 @@ def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Ar
     lost = losses(np.random.default_rng(0), len(y), len(rows))
     lost[len(y) // 4 :, 0] = True
     estimates = run_observers(observers, np.where(lost[..., None], np.nan, y), some.inputs, first.own(some.parameters))
-    size = np.maximum(np.abs(x).max(axis=(0, 1)), np.finfo(float).tiny)
+    size = np.maximum(np.abs(x).max(axis=(0, 1)), TINY)
     with np.errstate(over="ignore", invalid="ignore"):
         errors = np.array([(np.abs(e[..., : x.shape[-1]] - x).max(axis=(0, 1)) / size).max() for e in estimates])
     return np.where(np.isfinite(errors), 100 * errors, np.inf)
@@ -172,7 +173,7 @@ def guards_of(observers: Sequence[Observer], batches: Sequence[EpisodeBatch]) ->
     extents = [_extents(observers, batch, first) for batch in batches for first in (0, len(batch.states) // 2)]
     low, high, size, corrections = zip(*extents, strict=True)
     least, most, largest = np.min(low, axis=0), np.max(high, axis=0), DEFAULT.largest * np.max(size, axis=0)
-    room = DEFAULT.room * np.maximum(most - least, np.finfo(float).tiny)
+    room = DEFAULT.room * np.maximum(most - least, TINY)
     least = np.maximum(least - room, np.minimum(least, -largest))
     most = np.minimum(most + room, np.maximum(most, largest))
     of_corrections = [np.max(one, axis=0) for one in zip(*corrections, strict=True)]
@@ -205,7 +206,7 @@ def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Gu
         return None
     at, q, screen = list(observer.measured), len(observer.measured), Screen.of(observer)
     low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
-    correction = (1 + 2 * DEFAULT.room) * np.maximum(correction, np.finfo(float).tiny)
+    correction = (1 + 2 * DEFAULT.room) * np.maximum(correction, TINY)
     return Guard(low, high, correction, settling(observer))
 
 

@@ -16,7 +16,6 @@ from ..core.errors import SynthesisError
 from ..core.lti import gain
 from ..identify import ModelSet
 from ..identify.model_set import kind_of
-from ..lifting import Lifting
 from ..observer import Observer, ReliftCertificate, Runtime
 from ..observer.sensor import Sensors, delay_of
 from ..synthesis import Injection, ObserverProblem, Status, Synthesis
@@ -126,17 +125,15 @@ class DesignTask:
     noise: Array  # (q,)
     training: TrainingSet
     recordings: TrainingSet
-    covered: tuple[str, ...] = ()
-    limits: tuple[Array, Array] | None = None  # of states, (n,) each, infinite where there is none
+    covered: tuple[str, ...]
+    limits: tuple[Array, Array]  # of states, (n,) each, infinite where there is none
 
-    def observer(
-        self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None, lifting: Lifting | None = None
-    ) -> Observer:
+    def observer(self, synthesis: Synthesis, A: Array | None = None, B: Array | None = None) -> Observer:
         """Return the observer of a synthesis, with the nominal model or another one."""
         models, row = self.models, self.models.index(self.unit)
         return Observer(
             name=self.name,
-            lifting=models.lifting if lifting is None else lifting,
+            lifting=models.lifting,
             A=models.A[row] if A is None else A,
             B=models.B[row] if B is None else B,
             measured=models.measured,
@@ -144,7 +141,7 @@ class DesignTask:
             controller=synthesis.controller,
             injection=synthesis.injection,
             sample_period_s=models.sample_period_s,
-            parameters={name: float(values[row]) for name, values in models.parameters.items()},
+            parameters=models.parameters_of(self.unit),
             runtime=self.runtime,
             seen=self.training.seen,
             sensor=self.sensor,
@@ -162,8 +159,8 @@ class DesignTask:
     @property
     def runtime(self) -> Runtime:
         """What observers have to know of the machine: the delay of measurements, and limits that clip estimates."""
-        limited = self.limits is not None and bool(np.isfinite(self.limits).any())
-        return Runtime(delay_of(self.sensor), *(self.limits if self.limits and limited else (None, None)))
+        limits = self.limits if np.isfinite(self.limits).any() else (None, None)
+        return Runtime(delay_of(self.sensor), *limits)
 
     @property
     def selector(self) -> Array:

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from ..core.rounding import TINY
 from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
@@ -133,11 +134,11 @@ def spread(keys: Sequence[T], count: int) -> list[T]:
 def hidden_mean(values: Array, measured: Sequence[int]) -> Array:
     """Return the geometric mean of values (..., n) over the hidden states (all, where none is hidden)."""
     hidden = [i for i in range(values.shape[-1]) if i not in measured] or list(measured)
-    return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], np.finfo(float).tiny)), axis=-1)))
+    return np.asarray(np.exp(np.mean(np.log(np.maximum(values[..., hidden], TINY)), axis=-1)))
 
 
 def rank(percent: Array, limit: Array, measured: Sequence[int]) -> tuple[bool, float]:
     """Order candidates: those that exceed the open loop in no state first, by the error of hidden states over its."""
-    ratio = percent / np.maximum(limit, np.finfo(float).tiny)
+    ratio = percent / np.maximum(limit, TINY)
     worst = float(ratio.max())
     return (False, float(hidden_mean(ratio, measured))) if worst <= 1 else (True, worst)

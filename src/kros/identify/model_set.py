@@ -125,6 +125,10 @@ class ModelSet(Storable):
         """Return the row of a unit."""
         return self._rows[unit]
 
+    def parameters_of(self, unit: str) -> dict[str, float]:
+        """Return the values of the lifting's parameters of a unit."""
+        return {name: float(values[self.index(unit)]) for name, values in self.parameters.items()}
+
     @cached_property
     def _rows(self) -> dict[str, int]:
         return {unit: row for row, unit in enumerate(self.unit_ids)}

@@ -25,18 +25,15 @@ class Estimator(Method):
     def design(self, task: DesignTask) -> Design:
         """Identify the estimator."""
         began, models, training = time.perf_counter(), task.models, task.recordings
-        nominal = {name: float(values[models.index(task.unit)]) for name, values in models.parameters.items()}
         bias = np.array([task.sensor.get(models.lifting.states[i], Sensor()).bias for i in models.measured])
         recordings = Recordings.of(training.keys, training.read_one, bias)
         channels = models.lifting, models.measured, models.recorded_inputs
-        settings = models.sample_period_s, nominal, self.settings
+        settings = models.sample_period_s, models.parameters_of(task.unit), self.settings
         identified = identify_estimator(task.name, *channels, recordings, *settings)
-        runtime = identified.observer.runtime
-        if task.limits is not None:
-            n = len(task.limits[0])
-            lower, upper = (side.copy() for side in runtime.sides(identified.observer.lifting.n_states))
-            lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
-            runtime = replace(runtime, lower=lower, upper=upper)
+        runtime, n = identified.observer.runtime, len(task.limits[0])
+        lower, upper = (side.copy() for side in runtime.sides(identified.observer.lifting.n_states))
+        lower[:n], upper[:n] = np.maximum(lower[:n], task.limits[0]), np.minimum(upper[:n], task.limits[1])
+        runtime = replace(runtime, lower=lower, upper=upper)
         observer = replace(identified.observer, runtime=runtime, seen=self._seen(task), sensor=task.sensor)
         seconds = time.perf_counter() - began
         synthesis = Synthesis(self.name, observer.controller, Status.CERTIFIED, observer.injection, solve_s=seconds)

@@ -13,7 +13,7 @@ import numpy as np
 from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.baselines.kalman import kalman_candidates
-from ...observer.residual.models import ResidualModel, one_step_rows, residual_models, with_rows
+from ...observer.residual.models import one_step_rows, residual_models, with_rows
 from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance, one_step_residual
 from ...synthesis import Synthesis
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
@@ -78,10 +78,16 @@ class ResidualH2(Method):
 
     def design(self, task: DesignTask) -> Design:
         """Return the best of the models that promise the smallest errors."""
-        models, n = promising(task)[: self.compared], task.models.lifting.n_states
-        C, scale, dt = task.selector[:, :n], task.models.output_scale[:n], task.models.sample_period_s
+        given, n, row = task.models, task.models.lifting.n_states, task.models.index(task.unit)
+        C, scale, dt = task.selector[:, :n], given.output_scale[:n], given.sample_period_s
+        nominal = given.lifting, given.A[row], given.B[row], given.measured
+        tried = residual_models(*nominal, task.training.read(), task.noise, scale)
+        models = [model for model in tried if np.isfinite(model.promised).all()][: self.compared]
+        if not models:
+            problem = "no model promises bounded errors; check what is measured and the recordings"
+            raise SynthesisError(f"Residual-shaped observer: {problem}.")
         problems = [ResidualProblem(m.dynamics, C, m.spectra, task.noise, scale, dt) for m in models]
-        lifted, order = task.models.lifting.n_lifted, self.max_order
+        lifted, order = given.lifting.n_lifted, self.max_order
         syntheses = [residual_h2(problem, n_lifted=lifted, max_order=order) for problem in problems]
         observers = [
             task.observer(one, model.A, model.B) if model.refitted else task.observer(one)
@@ -93,20 +99,6 @@ class ResidualH2(Method):
         facts = {
             "training_error_to_open_loop": error,
             "order_reduction_percent": syntheses[best].gap_percent,
-            "rows_fitted_to_single_steps": [task.models.lifting.states[i] for i in models[best].refitted],
+            "rows_fitted_to_single_steps": [given.lifting.states[i] for i in models[best].refitted],
         }
         return Design(task.name, observers[best], syntheses[best], facts)
-
-
-def promising(task: DesignTask) -> list[ResidualModel]:
-    """Return models with bounded promised errors, the smallest first."""
-    models, row = task.models, task.models.index(task.unit)
-    nominal = models.lifting, models.A[row], models.B[row], models.measured
-    scale = models.output_scale[: models.lifting.n_states]
-    tried = residual_models(*nominal, task.training.read(), task.noise, scale)
-    usable = [model for model in tried if np.isfinite(model.promised).all()]
-    if not usable:
-        raise SynthesisError(
-            "Residual-shaped observer: no model promises bounded errors; check what is measured and the recordings."
-        )
-    return usable

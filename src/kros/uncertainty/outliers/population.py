@@ -120,10 +120,8 @@ class Recorded:
     @classmethod
     def of(cls, factors: EpisodeFactors, models: ModelSet, freqs_hz: Array) -> Recorded:
         """Take the units of models from the factors of all training episodes of a condition."""
-        units = {}
-        for row, unit in enumerate(models.unit_ids):
-            values = {k: float(v[row]) for k, v in models.parameters.items()}
-            units[unit] = Evidence.of(factors.factor[factors.rows_of(unit)], models, values)
+        rows = {unit: factors.factor[factors.rows_of(unit)] for unit in models.unit_ids}
+        units = {unit: Evidence.of(factor, models, models.parameters_of(unit)) for unit, factor in rows.items()}
         return cls(models, units, freqs_hz)
 
     @cached_property

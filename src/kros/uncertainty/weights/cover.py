@@ -27,13 +27,13 @@ import numpy.typing as npt
 
 from ...core.linalg import entries_first, multiply, sigma_max_first, squared
 from ...core.lti import StateSpace
+from ...core.rounding import EPS, TINY
 from ..settings import FIT, PROOF
 from .proof import Method
 
 Array = npt.NDArray[Any]
 
-_TINY = np.finfo(float).tiny
-_STEP = np.cbrt(np.finfo(float).eps)  # nepers, of differences
+_STEP = np.cbrt(EPS)  # nepers, of differences
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +53,7 @@ class Cover:
 
     def ratio(self, E: Array) -> Array:
         """Return `sigma_max(W_L^-1 E_k W_R^-1)`, shape (unit, frequency), of residuals at the same frequencies."""
-        left, right = (1 / np.maximum(v.T, _TINY) for v in (self.left, self.right))
+        left, right = (1 / np.maximum(v.T, TINY) for v in (self.left, self.right))
         return sigma_max_first(entries_first(E) * left[:, None, None, :] * right[None, :, None, :])
 
 
@@ -141,7 +141,7 @@ def _newton(smooth: _Smooth, x: Array) -> Array:
     hessian = np.stack([(smooth.cost(other)[1] - gradient).T / _STEP for other in ahead], axis=-1)
     hessian = (hessian + hessian.swapaxes(1, 2)) / 2 + FIT.pull / 1000 * np.eye(len(x))
     step = -np.linalg.solve(hessian, gradient.T[..., None])[..., 0].T
-    step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), _TINY))
+    step *= np.minimum(1.0, 2 / np.maximum(np.abs(step).max(axis=0), TINY))
     slope = (gradient * step).sum(axis=0)
     best, length = x, np.ones(x.shape[1])
     pending = np.ones(x.shape[1], bool)

@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ...core.rounding import TINY
 from ..settings import FIT
 from .cover import Cover
 from .magnitude import Bound, rising_bounds
@@ -33,7 +34,6 @@ from .sections import Sections
 Array = npt.NDArray[Any]
 
 NEPER_DB = 20 / np.log(10.0)
-_TINY = np.finfo(float).tiny
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,7 +170,7 @@ class _State:
         before, (gradient, spread) = self.value(temperature), self.derivatives(temperature)
         for _ in range(FIT.trials):
             move = -np.linalg.solve(spread + damping * np.diag(np.diag(spread)), gradient)
-            move *= min(1.0, FIT.farthest / max(float(np.abs(move).max()), _TINY))
+            move *= min(1.0, FIT.farthest / max(float(np.abs(move).max()), TINY))
             trial = replace(self, sections=self.sections.at(self.sections.parameters + move, self.problem.ends))
             if trial.value(temperature) < before:
                 return trial, max(damping / 4, 1e-6)
@@ -190,6 +190,6 @@ def _singular(matrices: Array) -> tuple[Array, Array]:
     wide = matrices.shape[1] <= matrices.shape[2]
     squares, short = np.linalg.eigh(matrices @ adjoint if wide else adjoint @ matrices)
     long = np.abs((adjoint if wide else matrices) @ short) ** 2
-    long /= np.maximum(long.sum(axis=1, keepdims=True), _TINY)
+    long /= np.maximum(long.sum(axis=1, keepdims=True), TINY)
     parts = (np.abs(short) ** 2, long) if wide else (long, np.abs(short) ** 2)
-    return np.log(np.maximum(squares, _TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)
+    return np.log(np.maximum(squares, TINY)) / 2, np.swapaxes(np.concatenate(parts, axis=1), 1, 2)

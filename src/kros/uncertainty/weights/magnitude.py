@@ -41,6 +41,7 @@ import numpy.typing as npt
 from ...core.errors import ConfigError, DataError, DimensionError, KrosError
 from ...core.frequency import bilinear_squared, check_grid
 from ...core.lti import StateSpace, gain
+from ...core.rounding import EPS, TINY
 from ..settings import MAGNITUDE
 from .sections import Sections
 
@@ -158,7 +159,7 @@ def _touching(bound: Bound, freqs: Array, values: Array, dt: float) -> FittedMag
     """Return the system of a bound, scaled until it touches the values as evaluated."""
     (system,) = bound.sections.systems(dt)
     ratio = np.abs(system.frequency_response(freqs)[:, 0, 0]) / values
-    touch = (1 + 4 * np.finfo(float).eps) / ratio.min()
+    touch = (1 + 4 * EPS) / ratio.min()
     lifted = StateSpace(system.A, system.B, system.C * touch, system.D * touch, dt)
     return FittedMagnitude(lifted, float(20 * np.log10(ratio.max() / ratio.min())))
 
@@ -187,7 +188,7 @@ def _bends(tau: Array, log: Array, count: int) -> Array:
     x = np.log(tau[inside])
     middle = (x[1:] + x[:-1]) / 2
     bend = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(np.diff(log[inside]) / np.diff(x))))])
-    share = bend / max(bend[-1], np.finfo(float).tiny) + (middle - middle[0]) / (middle[-1] - middle[0])
+    share = bend / max(bend[-1], TINY) + (middle - middle[0]) / (middle[-1] - middle[0])
     return np.interp((np.arange(count) + 0.5) / count * share[-1], share, middle)
 
 
@@ -262,7 +263,7 @@ def _check_magnitude(magnitude: npt.ArrayLike, freqs: Array) -> Array:
     return np.maximum(values, MAGNITUDE.floor * values.max())
 
 
-_ROUNDING = 4096 * np.finfo(float).eps
+_ROUNDING = 4096 * EPS
 
 
 @dataclass(frozen=True, eq=False)

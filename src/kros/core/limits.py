@@ -1,8 +1,7 @@
 """Largest inputs that are read: a device, an archive that unpacks to terabytes or a broken file ends in a message.
 
 They are far above what recordings and studies need. Readers look them up when they read, so a program that needs more
-assigns here:
-``kros.core.limits.MAX_TEXT_BYTES = 1 << 36``.
+assigns here: ``kros.core.limits.MAX_TEXT_BYTES = 1 << 36``.
 """
 
 MAX_JSON_BYTES = 1 << 29  # an index of a million episodes takes some 30 MB

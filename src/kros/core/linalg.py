@@ -1,7 +1,6 @@
 """Small linear algebra that several layers need.
 
-LAPACK takes stacks of 2 x 2 matrices one by one. Functions of many small matrices have the matrix axes first, `(row,
-column, ...)`: every entry is a long vector over units and frequencies.
+Many small matrices have their axes first, `(row, column, ...)`: LAPACK takes stacks of 2 x 2 matrices one by one.
 """
 
 from __future__ import annotations

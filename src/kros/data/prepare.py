@@ -123,6 +123,8 @@ def prepare(population: Population, steps: Iterable[Step]) -> Population:
     ------
     ConfigError
         When a step does not fit the channels.
+    DataError
+        When a step adds a channel that is there already, or the truth of what is no state.
 
     Examples
     --------

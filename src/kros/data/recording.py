@@ -235,31 +235,28 @@ class GroupWatch:
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._channels = channels
         self._resting: list[dict[int, float]] = []
-        self._ranges: dict[EpisodeKey, Array] = {}
-        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # column, samples and values, quantiles
+        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, and values
+        self._signals: dict[EpisodeKey, tuple[Array, Array, npt.NDArray[np.intp], Array]] = {}
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
         signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
         self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
-        self._ranges[key] = np.ptp(values, axis=0)
         outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
         rows = [outside, len(values) // 2, len(values) - 1 - outside]
         quantiles = np.partition(values, rows, axis=0)[rows]
-        for i in np.flatnonzero(self._ranges[key] > CHECK.wild * (quantiles[2] - quantiles[0])):
-            far = np.flatnonzero(np.abs(values[:, i] - quantiles[1, i]) > CHECK.wild * np.ptp(quantiles[:, i]))
-            self._suspects.append((key, int(i), np.stack([far, values[far, i]]), quantiles[:, i]))
+        at = np.abs(values - quantiles[1]).argmax(axis=0)
+        self._signals[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))]
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
-        for suspect, i, (samples, values), (low, middle, high) in self._suspects:
-            usual = sorted(ranges[i] for ranges in self._ranges.values())[(len(self._ranges) - 1) // 2]
-            size = max(high - low, abs(low), abs(high), usual)
-            wild = np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))
-            if wild.size:
-                actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
-                most = f"98 % of its samples are from {low:g} to {high:g}"
-                yield suspect, f"channel {self._channels[i].name!r} is {actual}, and {most} ({wild.size} such samples)"
+        for key, ((low, middle, high), _, samples, values) in self._signals.items():
+            usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
+            size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)
+            for i in np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0)):
+                actual = f"{values[i]:g} at sample {samples[i]}"
+                most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
+                yield key, f"channel {self._channels[i].name!r} is {actual}, and {most}"
 
     def check(self) -> None:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
@@ -267,7 +264,7 @@ class GroupWatch:
             raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
         first = self._resting[0] if self._resting else {}
         for i in sorted(set(first).intersection(*self._resting)):
-            key, channel = next(iter(self._ranges)), self._channels[i]
+            key, channel = next(iter(self._signals)), self._channels[i]
             if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
                 continue  # it differs from episode to episode
             what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"

@@ -22,7 +22,7 @@ The column `late` lags by a sample, and the angle, in degrees, has an offset tha
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -53,10 +53,9 @@ class Signals:
     period_s: float
     scaling: Scalings = field(default_factory=dict)  # where channels come from
 
-    def scaled(self, names: Iterable[str], **changes: Any) -> Signals:
-        """Return the signals with changes to where some channels come from."""
-        changed = {name: replace(scaling_of(self.scaling, name), **changes) for name in names}
-        return replace(self, scaling={**self.scaling, **changed})
+    def scaled(self, name: str, **changes: Any) -> Signals:
+        """Return the signals with changes to where a channel comes from."""
+        return replace(self, scaling={**self.scaling, name: replace(scaling_of(self.scaling, name), **changes)})
 
 
 @dataclass(frozen=True)
@@ -127,10 +126,11 @@ class Scale(Step):
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels multiplied and their new unit of measure."""
         self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
-        channels = list(super().describe(signals).channels)
-        for i, name in zip(self.columns(self.channels, signals.channels), self.channels, strict=True):
-            channels[i] = channels[i] if self.unit is None else replace(channels[i], unit=self.unit)
-            signals = signals.scaled([name], factor=scaling_of(signals.scaling, name).factor * self.factor)
+        signals = super().describe(signals)
+        for name in self.channels:
+            signals = signals.scaled(name, factor=scaling_of(signals.scaling, name).factor * self.factor)
+        units = {} if self.unit is None else dict.fromkeys(self.channels, self.unit)
+        channels = (replace(c, unit=units.get(c.name, c.unit)) for c in signals.channels)
         return replace(signals, channels=tuple(channels))
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
@@ -157,7 +157,7 @@ class Shift(Step):
         signals = super().describe(signals)
         for name in self.channels:
             lag = scaling_of(signals.scaling, name).lag_samples + self.lag
-            signals = signals.scaled([name], lag_samples=lag)
+            signals = signals.scaled(name, lag_samples=lag)
         return signals
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
@@ -188,7 +188,7 @@ class Offset(Step):
         self._require(0 <= self.start < self.stop, f"0 <= start < stop, found start = {self.start}, stop = {self.stop}")
         window = f"samples {self.start} to {self.stop - 1} of every episode"
         offset = f"mean of {self.reference} - {self.channel} over {window}"
-        return super().describe(signals).scaled([self.channel], offset=offset)
+        return super().describe(signals).scaled(self.channel, offset=offset)
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
@@ -308,17 +308,10 @@ class Differentiate(Step):
     step: ClassVar[str] = "differentiate"
 
     def describe(self, signals: Signals) -> Signals:
-        """Return the signals with the new channel after those alike: it has the factor of its channel, and no column."""
+        """Return the signals with the new channel after those alike; it has the factor of its channel."""
         bound, channels = 0.5 / signals.period_s, super().describe(signals).channels
         needs = f"a cutoff_hz above zero and below the Nyquist frequency of {bound:g} Hz, found {self.cutoff_hz}"
         self._require(0 < self.cutoff_hz < bound, needs)
-        if self.name in [c.name for c in channels]:
-            raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
-        taken = [c.of for c in channels if c.of]
-        if self.of and (self.of in taken or self.of not in [c.name for c in channels if c.role is Role.STATE]):
-            raise ConfigError(
-                f"Step 'differentiate' needs as `of` a state without a truth, found {self.of!r}; name one."
-            )
         added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
         role, at = (Role.TRUTH, len(channels)) if self.of else (Role.STATE, _n_states(channels))
         channels = (*channels[:at], Channel(self.name, role, self.unit, of=self.of), *channels[at:])

@@ -77,15 +77,14 @@ class RecordingFacts:
                 episodes.setdefault((part, key.unit), []).append(key)
         return episodes
 
-    def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...] | None:
-        """Return the digests of some episodes; None where that of one of them is not known."""
-        digests = tuple(self.digests.get(key, "") for key in keys)
-        return digests if all(digests) else None
+    def marks(self, keys: Iterable[EpisodeKey]) -> tuple[str, ...]:
+        """Return the digests of some episodes."""
+        return tuple(self.digests[key] for key in keys)
 
     def content(self) -> dict[str, Any]:
         """Return the facts in JSON's types."""
         facts = {f.name: getattr(self, f.name) for f in fields(self)}
-        facts["digests"] = {part: [self.digests.get(key) for key in facts[part]] for part in _PARTS}
+        facts["digests"] = {part: self.marks(facts[part]) for part in _PARTS}
         return facts | {part: [astuple(key) for key in facts[part]] for part in _PARTS}
 
     @classmethod
@@ -95,8 +94,7 @@ class RecordingFacts:
         content, _ = load_artifact(folder, "facts")
         parts = {part: [EpisodeKey(*row) for row in content[part]] for part in _PARTS}
         pairs = [pair for part in _PARTS for pair in zip(parts[part], content["digests"][part], strict=True)]
-        digests = {key: text for key, text in pairs if text}
-        return TypeAdapter(cls).validate_python({**content, **parts, "digests": digests})
+        return TypeAdapter(cls).validate_python({**content, **parts, "digests": dict(pairs)})
 
 
 @dataclass(frozen=True)

@@ -69,7 +69,7 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     used = np.isfinite(errors) & (errors > 0)
     errors = errors.copy()
     errors[list(design.channels.measured)] *= design.settings.measured_loss
-    root = gramian_root(A.T, (C[used] / errors[used, None]).T, 1.0).T
+    root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]

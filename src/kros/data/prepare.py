@@ -60,7 +60,7 @@ class PreparedSource:
         return recording.values
 
     def blocks(self, key: EpisodeKey, rows: int) -> Iterator[npt.NDArray[np.float64]]:
-        """Return one prepared episode in blocks of samples: kros's own files, which were checked, or what is read whole."""
+        """Return one prepared episode in blocks: of kros's own files, which were checked, or of what is read whole."""
         parts = None if self.steps else self.recordings.blocks(key, rows)
         if parts is not None:
             return (part.values for part in parts)

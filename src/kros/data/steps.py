@@ -230,13 +230,6 @@ class Trim(Step):
         return recording.cut(self.start, stop)
 
 
-def longest_stretch(time_s: Float, limit_s: float) -> tuple[int, int]:
-    """Return the first sample of the longest stretch without steps of time above a limit, and its end."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > limit_s) + 1, [len(time_s)]])
-    longest = int(np.argmax(np.diff(edges)))
-    return int(edges[longest]), int(edges[longest + 1])
-
-
 @dataclass(frozen=True)
 class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
@@ -274,14 +267,17 @@ class Resample(Step):
         time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        stretch = slice(*longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed)))
-        time, values = time[stretch], recording.values[stretch]
-        median = estimate_period(replace(recording, values=values, time_s=time))
+        limit = self.max_gap_s or GAP * estimate_period(timed)
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > limit) + 1, [len(time)]])
+        longest = int(np.diff(edges).argmax())
+        stretch = slice(edges[longest], edges[longest + 1])
+        timed, time = timed.cut(stretch.start, stretch.stop), time[stretch]
+        median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
             make = f"would make {count:g} samples of {len(time)}"
             raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
-        return replace(recording, values=self.on_grid(time, values, median), time_s=None)
+        return replace(recording, values=self.on_grid(time, timed.values, median), time_s=None)
 
     def on_grid(self, time_s: Float, values: Float, median_s: float) -> Float:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""

@@ -182,9 +182,9 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 def _channel(column: TableColumn) -> dict[str, Any]:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
     role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
-    table = {"name": column.name, "column": column.reference, "role": role}
+    table: dict[str, Any] = {"name": column.name, "column": column.reference, "role": role}
     table |= {"measured": measured, "unit": column.unit, "scale": column.scale}
-    default = {"column": column.name, "measured": False, "unit": "", "scale": 1.0}
+    default: dict[str, Any] = {"column": column.name, "measured": False, "unit": "", "scale": 1.0}
     return {key: value for key, value in table.items() if value != default.get(key)}
 
 

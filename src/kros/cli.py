@@ -57,7 +57,7 @@ def edge(ctx: Any = None) -> Iterator[None]:
     except _PASSED:
         raise
     except BrokenPipeError:
-        _silence()
+        _silence_if_broken()
         raise typer.Exit(FAILED) from None
     except Exception as error:
         _silence_if_broken()
@@ -143,14 +143,10 @@ def _silence_if_broken() -> None:
     try:
         sys.stdout.flush()
     except (OSError, ValueError):
-        _silence()
-
-
-def _silence() -> None:
-    with contextlib.suppress(OSError, ValueError):
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nowhere, sys.stdout.fileno())
-        os.close(nowhere)
+        with contextlib.suppress(OSError, ValueError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, sys.stdout.fileno())
+            os.close(nowhere)
 
 
 app = typer.Typer(
@@ -178,7 +174,7 @@ Data = Annotated[
 ]
 Quiet = Annotated[bool, _option("Print JSON and nothing else on standard output.", "--json")]
 Workers = Annotated[int | None, _option("Processes for maps over units; default: one a core.")]
-Overrides = Annotated[list[str] | None, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
+Overrides = Annotated[Names, _option("Override a key of the study.", "--set", metavar="KEY=VALUE")]
 Seed = Annotated[int, typer.Option(min=0)]
 Prefix = Annotated[str | None, _option("Prefix of all names, a C identifier; default: that of the study.", "--name")]
 Precision = Annotated[str, _option("double or float")]
@@ -199,8 +195,7 @@ def _progress(quiet: bool = False) -> Progress:
 
 
 def _say(lines: Iterable[str]) -> None:
-    for line in lines:
-        typer.echo(line)
+    typer.echo("\n".join(lines))
 
 
 def _json(content: Any) -> None:
@@ -329,9 +324,7 @@ def check(
         _say(verdict_lines(scores))
     if junit is not None:
         junit.write_text(junit_text(scores), encoding="utf-8")
-    code = {Verdict.PASS: 0, Verdict.UNDECIDED: UNDECIDED, Verdict.FAIL: NOT_MET}[worst(scores)]
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit({Verdict.PASS: 0, Verdict.UNDECIDED: UNDECIDED, Verdict.FAIL: NOT_MET}[worst(scores)])
 
 
 @app.command()

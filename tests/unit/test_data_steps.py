@@ -155,13 +155,17 @@ def test_differentiate_adds_a_state_with_the_derivative() -> None:
         (steps.Offset("x", "u", 4, 4), "0 <= start < stop, found start = 4, stop = 4"),
         (steps.Trim(start=-1), "0 <= start < stop and tail >= 0"),
         (steps.Resample(0.0), r"period_s > 0, found 0\.0"),
-        (steps.Differentiate("x", "y", 1.0), "would add 'y', which is there already"),
-        (steps.Differentiate("x", "v", 1.0, of="u"), "needs as `of` a state without a truth, found 'u'"),
     ],
 )
 def test_steps_that_do_not_fit_are_refused_before_reading(step: steps.Step, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         prepare(population(counting()), [step])
+
+
+@pytest.mark.parametrize(("name", "of", "message"), [("y", "", "names should differ"), ("v", "u", "truth of")])
+def test_derivatives_that_do_not_fit_are_refused_before_reading(name: str, of: str, message: str) -> None:
+    with pytest.raises(DataError, match=message):
+        prepare(population(counting()), [steps.Differentiate("x", name, 1.0, of=of)])
 
 
 def test_steps_from_toml() -> None:

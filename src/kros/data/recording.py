@@ -58,12 +58,6 @@ class Recording:
         time = None if self.time_s is None else self.time_s[start:stop]
         return replace(self, values=self.values[start:stop], time_s=time)
 
-    def ended(self) -> Recording:
-        """Return the same without a last sample that repeats the stamp before it, as stopped recorders write."""
-        time = self.time_s
-        repeated = time is not None and len(time) > 1 and time[-1] == time[-2]
-        return self.cut(0, len(self.values) - 1) if repeated else self
-
 
 @dataclass(frozen=True, eq=False)
 class Recordings:
@@ -76,15 +70,17 @@ class Recordings:
         raise NotImplementedError
 
     def __call__(self, key: EpisodeKey) -> Recording:
-        """Return one episode."""
+        """Return one episode, without a last sample that repeats the stamp before it, as stopped recorders write."""
         if key not in self.places:
             others = f"this source has {len(self.places)} other episodes"
             raise DataError(f"Asked for {key}; {others}; take keys from population.episodes.")
-        return self.read(key, self.places[key]).ended()
+        recording = self.read(key, self.places[key])
+        stamps = () if recording.time_s is None else recording.time_s[-2:]
+        return recording if len(set(stamps)) == len(stamps) else recording.cut(0, -1)
 
-    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording]:
-        """Yield one episode in blocks of about `rows` samples where the format can, else whole."""
-        yield self(key)
+    def blocks(self, key: EpisodeKey, rows: int) -> Iterator[Recording] | None:
+        """Return one episode in blocks of at most `rows` samples where the format can."""
+        return None
 
     def file(self, place: Any) -> Path | None:
         """Return the one file that an episode is in, where it is in one."""
@@ -173,39 +169,26 @@ class NonFiniteError(DataError):
 
 def check_episode(values: Array, key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False) -> None:
     """Check one episode's samples: shape, length, numbers, and that no state stands still while others move."""
-    for _ in checked_blocks([values], key, channels, gaps=gaps):
-        pass
-
-
-def checked_blocks(
-    blocks: Iterable[Array], key: EpisodeKey, channels: Sequence[Channel], *, gaps: bool = False
-) -> Iterator[Array]:
-    """Give the blocks of one episode, none of them empty, on, and check them as `check_episode` does."""
-    count, first, resting = 0, np.empty(0), np.ones(len(channels), dtype=bool)
-    for values in blocks:
-        if values.ndim != 2 or values.shape[1] != len(channels):
-            declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
-            raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
-        if not gaps and count + len(values) >= CHECK.samples and not usable(values).all():
-            check_finite(values, key, channels, first=count)
-        first = first if count else values[:1].ravel()
-        resting &= [r and len(values) > 0 and is_constant(values[:, i], first[i]) for i, r in enumerate(resting)]
-        count += len(values)
-        yield values
-    if count < CHECK.samples:
-        need = f"at least {CHECK.samples} samples are needed, found {count}"
+    if values.ndim != 2 or values.shape[1] != len(channels):
+        declared = f"{len(channels)} channels {[c.name for c in channels]} are declared, found an array of shape"
+        raise DataError(f"{title(key)}: {declared} {values.shape}; transpose or correct it.")
+    if len(values) < CHECK.samples:
+        need = f"at least {CHECK.samples} samples are needed, found {len(values)}"
         raise DataError(f"{title(key)}: {need}; leave the episode out or record longer.")
+    if not gaps and not usable(values).all():
+        check_finite(values, key, channels)
+    resting = [is_constant(column) for column in values.T]
     still = [i for i, c in enumerate(channels) if c.role is Role.STATE and resting[i]]
     moving = [c.name for i, c in enumerate(channels) if still and not resting[i]]
     if moving:
-        stays = f"state {channels[still[0]].name!r} stays at {first[still[0]]:g} in all {count} samples"
+        stays = f"state {channels[still[0]].name!r} stays at {values[0, still[0]]:g} in all {len(values)} samples"
         reason = f"while {', '.join(map(repr, moving))} move, so its sensor is stuck or the column is wrong"
         raise DataError(f"{title(key)}: {stays} {reason}; leave the episode out, or the channel.")
 
 
-def is_constant(column: Array, first: float | None = None) -> bool:
+def is_constant(column: Array) -> bool:
     """Tell whether a signal never changes, but for rounding; a changing one is recognised early."""
-    first = column[0] if first is None else first
+    first = column[0]
     if not np.isfinite(first):
         return False
     room = CHECK.constant * abs(first)
@@ -239,31 +222,28 @@ class GroupWatch:
     def __init__(self, channels: Sequence[Channel]) -> None:
         self._channels = channels
         self._resting: list[dict[int, float]] = []
-        self._ranges: dict[EpisodeKey, Array] = {}
-        self._suspects: list[tuple[EpisodeKey, int, Array, Array]] = []  # column, samples and values, quantiles
+        # of every episode: quantiles (3, n), ranges (n,), the samples that are farthest from the median, and values
+        self._signals: dict[EpisodeKey, tuple[Array, Array, npt.NDArray[np.intp], Array]] = {}
 
     def add(self, key: EpisodeKey, values: Array) -> None:
         """Look at one more episode, all of whose samples are usable."""
         signals = [i for i, c in enumerate(self._channels) if c.role is not Role.TRUTH]
         self._resting.append({i: float(values[0, i]) for i in signals if is_constant(values[:, i])})
-        self._ranges[key] = np.ptp(values, axis=0)
         outside = max(1, len(values) // 100)  # at each end; one at least, for short episodes
         rows = [outside, len(values) // 2, len(values) - 1 - outside]
         quantiles = np.partition(values, rows, axis=0)[rows]
-        for i in np.flatnonzero(self._ranges[key] > CHECK.wild * (quantiles[2] - quantiles[0])):
-            far = np.flatnonzero(np.abs(values[:, i] - quantiles[1, i]) > CHECK.wild * np.ptp(quantiles[:, i]))
-            self._suspects.append((key, int(i), np.stack([far, values[far, i]]), quantiles[:, i]))
+        at = np.abs(values - quantiles[1]).argmax(axis=0)
+        self._signals[key] = quantiles, np.ptp(values, axis=0), at, values[at, np.arange(len(at))]
 
     def wild(self) -> Iterator[tuple[EpisodeKey, str]]:
         """Yield episodes where |x - median| > 1e3 max(q99 - q1, |q1|, |q99|, median range) > 0, and the place."""
-        for suspect, i, (samples, values), (low, middle, high) in self._suspects:
-            usual = sorted(ranges[i] for ranges in self._ranges.values())[(len(self._ranges) - 1) // 2]
-            size = max(high - low, abs(low), abs(high), usual)
-            wild = np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))
-            if wild.size:
-                actual = f"{values[wild[0]]:g} at sample {samples[wild[0]]:.0f}"
-                most = f"98 % of its samples are from {low:g} to {high:g}"
-                yield suspect, f"channel {self._channels[i].name!r} is {actual}, and {most} ({wild.size} such samples)"
+        for key, ((low, middle, high), _, samples, values) in self._signals.items():
+            usual = np.quantile([of[1] for of in self._signals.values()], 0.5, axis=0, method="lower")
+            size = np.max([high - low, np.abs(low), np.abs(high), usual], axis=0)
+            for i in map(int, np.flatnonzero((np.abs(values - middle) > CHECK.wild * size) & (size > 0))):
+                actual = f"{values[i]:g} at sample {samples[i]}"
+                most = f"98 % of its samples are from {low[i]:g} to {high[i]:g}"
+                yield key, f"channel {self._channels[i].name!r} is {actual}, and {most}"
 
     def check(self) -> None:
         """Raise DataError for wild samples, and for an input or a state that never changed."""
@@ -271,7 +251,7 @@ class GroupWatch:
             raise DataError(f"{title(key)}: {problem}; fix the source, or leave the episode out.")
         first = self._resting[0] if self._resting else {}
         for i in sorted(set(first).intersection(*self._resting)):
-            key, channel = next(iter(self._ranges)), self._channels[i]
+            key, channel = next(iter(self._signals)), self._channels[i]
             if channel.role is Role.INPUT and any(resting[i] != first[i] for resting in self._resting):
                 continue  # it differs from episode to episode
             what = f"Unit {key.unit} ({key.condition}): {channel.role.value} {channel.name!r} stays where it is"

@@ -22,7 +22,7 @@ The column `late` lags by a sample, and the angle, in degrees, has an offset tha
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -53,10 +53,9 @@ class Signals:
     period_s: float
     scaling: Scalings = field(default_factory=dict)  # where channels come from
 
-    def scaled(self, names: Iterable[str], **changes: Any) -> Signals:
-        """Return the signals with changes to where some channels come from."""
-        changed = {name: replace(scaling_of(self.scaling, name), **changes) for name in names}
-        return replace(self, scaling={**self.scaling, **changed})
+    def scaled(self, name: str, **changes: Any) -> Signals:
+        """Return the signals with changes to where a channel comes from."""
+        return replace(self, scaling={**self.scaling, name: replace(scaling_of(self.scaling, name), **changes)})
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,6 @@ class Step:
 
     step: ClassVar[str] = ""
     makes_even: ClassVar[bool] = False
-    samplewise: ClassVar[bool] = False  # whether every sample is prepared by itself
     __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
 
     @property
@@ -124,15 +122,15 @@ class Scale(Step):
     factor: float
     unit: str | None = None
     step: ClassVar[str] = "scale"
-    samplewise: ClassVar[bool] = True
 
     def describe(self, signals: Signals) -> Signals:
         """Return the signals with channels multiplied and their new unit of measure."""
         self._require(0 < abs(self.factor) < math.inf, f"a finite factor other than zero, found {self.factor}")
-        channels = list(super().describe(signals).channels)
-        for i, name in zip(self.columns(self.channels, signals.channels), self.channels, strict=True):
-            channels[i] = channels[i] if self.unit is None else replace(channels[i], unit=self.unit)
-            signals = signals.scaled([name], factor=scaling_of(signals.scaling, name).factor * self.factor)
+        signals = super().describe(signals)
+        for name in self.channels:
+            signals = signals.scaled(name, factor=scaling_of(signals.scaling, name).factor * self.factor)
+        units = {} if self.unit is None else dict.fromkeys(self.channels, self.unit)
+        channels = (replace(c, unit=units.get(c.name, c.unit)) for c in signals.channels)
         return replace(signals, channels=tuple(channels))
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
@@ -159,7 +157,7 @@ class Shift(Step):
         signals = super().describe(signals)
         for name in self.channels:
             lag = scaling_of(signals.scaling, name).lag_samples + self.lag
-            signals = signals.scaled([name], lag_samples=lag)
+            signals = signals.scaled(name, lag_samples=lag)
         return signals
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
@@ -190,7 +188,7 @@ class Offset(Step):
         self._require(0 <= self.start < self.stop, f"0 <= start < stop, found start = {self.start}, stop = {self.stop}")
         window = f"samples {self.start} to {self.stop - 1} of every episode"
         offset = f"mean of {self.reference} - {self.channel} over {window}"
-        return super().describe(signals).scaled([self.channel], offset=offset)
+        return super().describe(signals).scaled(self.channel, offset=offset)
 
     def apply(self, recording: Recording, channels: Channels, period_s: float) -> Recording:
         """Return the recording with the offset removed."""
@@ -232,13 +230,6 @@ class Trim(Step):
         return recording.cut(self.start, stop)
 
 
-def longest_stretch(time_s: Float, limit_s: float) -> tuple[int, int]:
-    """Return the first sample of the longest stretch without steps of time above a limit, and its end."""
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(time_s) > limit_s) + 1, [len(time_s)]])
-    longest = int(np.argmax(np.diff(edges)))
-    return int(edges[longest]), int(edges[longest + 1])
-
-
 @dataclass(frozen=True)
 class Resample(Step):
     """Bring uneven time, or another rate, to a fixed period.
@@ -276,14 +267,17 @@ class Resample(Step):
         time = np.arange(len(recording.values), dtype=np.float64) * period_s if time is None else time
         timed = replace(recording, time_s=time)
         check_increasing(timed)
-        stretch = slice(*longest_stretch(time, self.max_gap_s or GAP * estimate_period(timed)))
-        time, values = time[stretch], recording.values[stretch]
-        median = estimate_period(replace(recording, values=values, time_s=time))
+        limit = self.max_gap_s or GAP * estimate_period(timed)
+        edges = np.concatenate([[0], np.flatnonzero(np.diff(time) > limit) + 1, [len(time)]])
+        longest = int(np.diff(edges).argmax())
+        stretch = slice(edges[longest], edges[longest + 1])
+        timed, time = timed.cut(stretch.start, stretch.stop), time[stretch]
+        median = estimate_period(timed)
         count = (time[-1] - time[0]) / min(self.period_s, median)
         if count > limits.MAX_SAMPLES:
             make = f"would make {count:g} samples of {len(time)}"
             raise DataError(f"{what} to period_s = {self.period_s:g} {make}; correct the period.")
-        return replace(recording, values=self.on_grid(time, values, median), time_s=None)
+        return replace(recording, values=self.on_grid(time, timed.values, median), time_s=None)
 
     def on_grid(self, time_s: Float, values: Float, median_s: float) -> Float:
         """Return samples at increasing times on an even grid from the first time on, shape (n_new, n_channels)."""
@@ -310,17 +304,10 @@ class Differentiate(Step):
     step: ClassVar[str] = "differentiate"
 
     def describe(self, signals: Signals) -> Signals:
-        """Return the signals with the new channel after those alike: it has the factor of its channel, and no column."""
+        """Return the signals with the new channel after those alike; it has the factor of its channel."""
         bound, channels = 0.5 / signals.period_s, super().describe(signals).channels
         needs = f"a cutoff_hz above zero and below the Nyquist frequency of {bound:g} Hz, found {self.cutoff_hz}"
         self._require(0 < self.cutoff_hz < bound, needs)
-        if self.name in [c.name for c in channels]:
-            raise ConfigError(f"Step 'differentiate' would add {self.name!r}, which is there already; choose another.")
-        taken = [c.of for c in channels if c.of]
-        if self.of and (self.of in taken or self.of not in [c.name for c in channels if c.role is Role.STATE]):
-            raise ConfigError(
-                f"Step 'differentiate' needs as `of` a state without a truth, found {self.of!r}; name one."
-            )
         added = replace(scaling_of(signals.scaling, self.channel), column=None, offset="")
         role, at = (Role.TRUTH, len(channels)) if self.of else (Role.STATE, _n_states(channels))
         channels = (*channels[:at], Channel(self.name, role, self.unit, of=self.of), *channels[at:])

@@ -229,11 +229,10 @@ def calibrate(
     return resolve_branches(units, pooled, spec)
 
 
-def _mark(facts: RecordingFacts, task: Task) -> str | None:
+def _mark(facts: RecordingFacts, task: Task) -> str:
     """Return what the segments of a task follow from."""
     population, keys, spec = task
-    samples = facts.marks(keys)
-    return None if samples is None else digest_of(population.columns, population.sample_period_s, spec, keys, samples)
+    return digest_of(population.columns, population.sample_period_s, spec, keys, facts.marks(keys))
 
 
 def segments_of(task: Task) -> list[Segment]:

@@ -149,11 +149,10 @@ def _begin(
     return EpisodeFactors(condition, rows, together), models, refining
 
 
-def _mark(facts: RecordingFacts, task: Task) -> str | None:
+def _mark(facts: RecordingFacts, task: Task) -> str:
     """Return what the factors of a task follow from: samples, channels, and the lifting without parameters' values."""
     population, keys, lifting = task
-    samples = facts.marks(keys)
-    return None if samples is None else digest_of(samples, keys, population.channels, repr(lifting))
+    return digest_of(facts.marks(keys), keys, population.channels, repr(lifting))
 
 
 def reduce_episodes(task: Task) -> Factor:

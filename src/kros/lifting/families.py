@@ -115,7 +115,7 @@ def radial(names: Names, centres: Any, length: Lengths) -> Formulas:
     Of d quantities, or formulas, the centres (n, d) and lengths, one or (d,), are in their units; see `kmeans_centres`.
 
     >>> radial(["position", "velocity"], [[0.5, 0]], [0.1, 2])
-    ('exp(-(((position - 0.5)/0.1)**2 + (velocity/2)**2)/2)',)
+    ('exp(-(((position - 0.5)/0.1)**2 + ((velocity - 0)/2)**2)/2)',)
     """
     lengths, centres = np.asarray(length, dtype=float), _finite("radial: centres", centres)
     if lengths.shape not in ((), (len(names),)):
@@ -195,11 +195,8 @@ def wrapped(formula: str) -> str:
 
 
 def _squared_distance(names: Sequence[str], centre: Array, lengths: Array) -> str:
-    terms = []
-    for name, c, scale in zip(names, centre, lengths, strict=True):
-        offset = wrapped(name) if c == 0 else f"({wrapped(name)} {'-' if c > 0 else '+'} {number(abs(c))})"
-        terms.append(f"({offset}/{number(scale)})**2" if scale != 1 else f"{offset}**2")
-    return " + ".join(terms)
+    columns = zip(names, centre, lengths, strict=True)
+    return " + ".join(f"(({wrapped(name)} - {number(c)})/{number(scale)})**2" for name, c, scale in columns)
 
 
 def _finite(what: str, values: Any) -> Array:

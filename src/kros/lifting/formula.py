@@ -13,7 +13,7 @@ import ast
 import math
 import operator
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from typing import Any
@@ -60,7 +60,7 @@ class Formula:
     @cached_property
     def written(self) -> Any:
         """SymPy tree of the formula as it is written."""
-        return _remembered(require_text(self.text), self.names, self.delayed)
+        return parse(self.text, self.names, self.delayed)
 
     @cached_property
     def expression(self) -> Any:
@@ -103,7 +103,8 @@ def base_and_delay(name: str) -> tuple[str, int]:
     return base, -int(index[:-1]) if index else 0
 
 
-def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
+@lru_cache(maxsize=1 << 12)  # a lifting in other units of measure has the same formulas
+def parse(text: str, names: tuple[str, ...], delayed: tuple[str, ...] = ()) -> Any:
     """Read a formula into a SymPy tree; what may take long is refused before it does."""
     if len(require_text(text)) > MAX_LENGTH:
         raise ConfigError(f"Formula of {len(text)} characters: at most {MAX_LENGTH} are read; split it.")
@@ -115,7 +116,7 @@ def parse(text: str, names: Sequence[str], delayed: Sequence[str] = ()) -> Any:
         raise ConfigError(f"Formula {text!r}: not readable ({error}).") from error
     try:
         require_size(tree.body)
-        return _Reader(text, tuple(names), tuple(delayed)).read(tree.body)
+        return _Reader(text, names, delayed).read(tree.body)
     except TooCostlyError as error:
         raise ConfigError(f"Formula {text!r}: {error}") from error
 
@@ -134,9 +135,6 @@ def require_text(text: object) -> str:
     if not isinstance(text, str):
         raise ConfigError(f"Formula {text!r}: should be a text, found {type(text).__name__}.")
     return text
-
-
-_remembered = lru_cache(maxsize=1 << 12)(parse)  # a lifting in other units of measure has the same formulas
 
 
 @dataclass(frozen=True)

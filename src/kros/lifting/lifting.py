@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -178,7 +178,6 @@ class Lifting:
 
     def windows(self, x: Array, u: Array) -> Array:
         """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
-        self.window.require_inputs(u)
         return self.window.slide(x, u)
 
     def parameter_values(self, parameters: Parameters | None = None) -> dict[str, Array]:
@@ -200,17 +199,10 @@ class Lifting:
 
         The shape is (..., p, n), by the entries of the window or by the names of some of them and of parameters.
         """
-        x, names, inputs = (
-            self._windows(x),
-            names or self.window.names,
-            None if u is None else np.asarray(u, dtype=float),
-        )
+        x, names, inputs = self._windows(x), names or self.window.names, None if u is None else np.asarray(u)
         formulas = self.formulas if inputs is None else self.input_formulas
         slopes = np.empty((*x.shape[:-1], len(formulas) * len(names)))
-        if (names, formulas) not in self._derivatives:
-            trees = [formula.derivative(name) for formula in formulas for name in names]
-            self._derivatives[names, formulas] = Program.of(trees)
-        self._derivatives[names, formulas].fill(slopes, self._values(parameters, x, x[..., self.n_states :], inputs))
+        _derivatives(formulas, names).fill(slopes, self._values(parameters, x, x[..., self.n_states :], inputs))
         return slopes.reshape(*x.shape[:-1], len(formulas), len(names))
 
     def slope_bounds(self, box: Box | None = None) -> tuple[Array, Array]:
@@ -241,10 +233,6 @@ class Lifting:
         return Program.of(functions), Program.of(gamma)
 
     @cached_property
-    def _derivatives(self) -> dict[tuple[tuple[str, ...], tuple[Formula, ...]], Program]:
-        return {}
-
-    @cached_property
     def _read(self) -> frozenset[str]:
         return frozenset(name for formula in self.formulas + self.input_formulas for name in formula.used)
 
@@ -266,6 +254,12 @@ class Lifting:
             if columns is not None:
                 values |= {name: columns[..., i] for i, name in enumerate(names)}
         return values
+
+
+@lru_cache
+def _derivatives(formulas: tuple[Formula, ...], names: tuple[str, ...]) -> Program:
+    """Return the derivatives of formulas by quantities."""
+    return Program.of([formula.derivative(name) for formula in formulas for name in names])
 
 
 def _refuse_repeated(formulas: tuple[Formula, ...], originals: tuple[str, ...]) -> None:

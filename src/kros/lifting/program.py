@@ -111,23 +111,17 @@ class Writer:
         return self.known[operation]
 
     def finished(self, outputs: Sequence[int]) -> Program:
-        """Put values into registers; one that nothing reads any more is used again."""
-        given = len(self.names)
-        registers = {value: value for value in range(given)} | {-1 - i: given + i for i in range(len(self.constants))}
-        lasting = {*outputs, *registers}
-        last = {value: i for i, (_, first, second) in enumerate(self.operations) for value in (first, second)}
-        free: list[int] = []
-        count, code = len(registers), np.zeros((len(self.operations), 4), dtype=np.int32)
-        for i, (kind, first, second) in enumerate(self.operations):
-            operands = registers[first], registers[second]
-            free += [registers[value] for value in {first, second} if last[value] == i and value not in lasting]
-            if free:
-                into = free.pop()
-            else:
-                into, count = count, count + 1
-            registers[given + i], code[i] = into, (_KINDS.index(kind), into, *operands)
+        """Put values into registers."""
+        given, constants = len(self.names), len(self.constants)
+        order = [*range(given), *range(-1, -1 - constants, -1), *range(given, given + len(self.operations))]
+        registers = {value: register for register, value in enumerate(order)}
+        rows = [
+            (_KINDS.index(kind), into, registers[first], registers[second])
+            for into, (kind, first, second) in enumerate(self.operations, given + constants)
+        ]
+        code = np.array(rows, dtype=np.int32).reshape(-1, 4)
         places = np.array([registers[value] for value in outputs], dtype=np.int32)
-        return Program(tuple(self.names), np.array(self.constants, dtype=float), code, places, count)
+        return Program(tuple(self.names), np.array(self.constants, dtype=float), code, places, len(order))
 
 
 def tree_of(expression: Any) -> Tree:
@@ -195,8 +189,7 @@ class Precision:
 def c_code(expression: Any, name: Callable[[str], str], precision: Precision | None = None) -> str:
     """Return a SymPy tree as a C expression."""
     writer = Writer(sorted(symbol.name for symbol in expression.free_symbols))
-    value = writer.write(tree_of(expression))
-    return _CText(writer, name, precision or Precision()).bare(value)
+    return _CText(writer, name, precision or Precision()).of(writer.write(tree_of(expression)))
 
 
 @dataclass(frozen=True)
@@ -204,11 +197,6 @@ class _CText:
     writer: Writer
     name: Callable[[str], str]
     precision: Precision
-
-    def bare(self, value: int) -> str:
-        """Return the text of a value without the parentheses around a sum or a product."""
-        text = self.of(value)
-        return text[1:-1] if self._kind(value) in ("add", "multiply") else text
 
     def of(self, value: int) -> str:
         """Return the text of a value."""
@@ -220,9 +208,8 @@ class _CText:
             return f"({text})" if text.startswith("-") else text
         _, first, second = self.writer.operations[value - len(self.writer.names)]
         if kind in _SIGNS:
-            left = self.bare(first) if self._kind(first) == kind else self.of(first)
-            return f"({left} {_SIGNS[kind]} {self.of(second)})"
-        inner = self.bare(first)
+            return f"({self.of(first)} {_SIGNS[kind]} {self.of(second)})"
+        inner = self.of(first)
         if kind == "power":
             return f"pow{self.precision.suffix}({inner}, {literal(self.writer.constants[-1 - second])})"
         if kind == "sign":

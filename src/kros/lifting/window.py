@@ -10,7 +10,7 @@ combinations of parameter-free ones, ``sigma(w; q) = M(q) g(w)``, so that data a
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -89,7 +89,8 @@ class Window:
         return np.concatenate([x, padding, u], axis=-1)[..., self.present]
 
     def slide(self, x: Array, u: Array) -> Array:
-        """Return the windows of a recording, shape (..., n_samples - history, n_window)."""
+        """Return the windows of a recording, shape (..., n_samples - history, n_window), from sample `history` on."""
+        self.require_inputs(u)
         if not self.depths:
             return x
         self.require(x.shape[-2])
@@ -188,17 +189,13 @@ def _split_angles(expression: Any, parameters: set[Any]) -> Any:
     """Apply the angle sum formulas to ``sin(data + parameter)`` and ``cos(data + parameter)`` only."""
     import sympy as sp
 
-    def split(argument: Any) -> tuple[Any, Any]:
-        terms = sp.Add.make_args(sp.expand(argument) if argument.free_symbols & parameters else argument)
-        phase = [term for term in terms if term.free_symbols and term.free_symbols <= parameters]
-        return sp.Add(*(term for term in terms if term not in phase)), sp.Add(*phase)
+    def summed(function: Any, other: Any, sign: int) -> Callable[[Any], Any]:
+        def split(argument: Any) -> Any:
+            terms = sp.Add.make_args(sp.expand(argument) if argument.free_symbols & parameters else argument)
+            shifts = [term for term in terms if term.free_symbols and term.free_symbols <= parameters]
+            data, phase = sp.Add(*(term for term in terms if term not in shifts)), sp.Add(*shifts)
+            return function(data) * sp.cos(phase) + sign * other(data) * sp.sin(phase)
 
-    def sine(argument: Any) -> Any:
-        data, phase = split(argument)
-        return sp.sin(data) * sp.cos(phase) + sp.cos(data) * sp.sin(phase)
+        return split
 
-    def cosine(argument: Any) -> Any:
-        data, phase = split(argument)
-        return sp.cos(data) * sp.cos(phase) - sp.sin(data) * sp.sin(phase)
-
-    return expression.replace(sp.sin, sine).replace(sp.cos, cosine)
+    return expression.replace(sp.sin, summed(sp.sin, sp.cos, 1)).replace(sp.cos, summed(sp.cos, sp.sin, -1))

@@ -61,7 +61,12 @@ def discover(source: Path, wanted: Wanted | None = None, work: Work | None = Non
     """Describe a folder of text tables."""
     wanted = wanted or Wanted()
     head, alike, strange = _alike(_files(source, wanted.files))
-    mapping: dict[str, Any] = {"files": _names(list(alike), wanted.files)}
+    names = infer_names(list(alike))
+    if wanted.files is None and names.other is not None:
+        choice = f"--files '{names.other}' or --files '{names.pattern}'"
+        two = f"{some(list(alike), 3)} can be episodes of one unit or units with one recording each"
+        raise ConfigError(f"Names of files: {two}; choose, {choice}.")
+    mapping: dict[str, Any] = {"files": wanted.files or names.pattern}
     mapping |= {key: value for key, value in vars(head.dialect).items() if value != getattr(Dialect(), key)}
     columns, keys, notes = _columns(source, head, list(alike.values()), wanted.period_s)
     columns = _decided(columns, wanted)
@@ -86,16 +91,6 @@ def _files(source: Path, expression: str | None) -> dict[str, Path]:
             problem = f"there are no files of recordings ({', '.join(ENDINGS)}); save CSV, or use kros.from_frame"
         raise DataError(f"Looking at {source}: {problem}.")
     return selected
-
-
-def _names(paths: Sequence[str], expression: str | None) -> str:
-    """Return the expression that says what names of files mean."""
-    names = infer_names(paths)
-    if expression is None and names.other is not None:
-        choice = f"--files '{names.other}' or --files '{names.pattern}'"
-        two = f"{some(paths, 3)} can be episodes of one unit or units with one recording each"
-        raise ConfigError(f"Names of files: {two}; choose, {choice}.")
-    return names.pattern if expression is None else expression
 
 
 def _alike(files: dict[str, Path]) -> tuple[TableHead, dict[str, Path], list[str]]:
@@ -186,11 +181,11 @@ def _read(path: Path, head: TableHead, columns: Sequence[int]) -> Array:
 
 def _channel(column: TableColumn) -> dict[str, Any]:
     """Return the table ``[[channel]]`` of a column, with the keys that are not default."""
-    reference = column.reference if column.reference != column.name else None
-    role, unit, scale = "input" if column.part is ColumnPart.INPUT else "state", column.unit, column.scale
-    table = {"name": column.name, "column": reference, "role": role}
-    table |= {"measured": column.part is ColumnPart.MEASURED or None, "unit": unit or None}
-    return {key: v for key, v in (table | {"scale": None if scale == 1 else scale}).items() if v is not None}
+    role, measured = "input" if column.part is ColumnPart.INPUT else "state", column.part is ColumnPart.MEASURED
+    table: dict[str, Any] = {"name": column.name, "column": column.reference, "role": role}
+    table |= {"measured": measured, "unit": column.unit, "scale": column.scale}
+    default: dict[str, Any] = {"column": column.name, "measured": False, "unit": "", "scale": 1.0}
+    return {key: value for key, value in table.items() if value != default.get(key)}
 
 
 def _decided(columns: Sequence[TableColumn], wanted: Wanted) -> list[TableColumn]:

@@ -61,22 +61,20 @@ def _look(population: Population) -> list[EpisodeLook]:
     source: Any = population.source
     looks, watch = {}, GroupWatch(population.columns)
     for key in population.episodes:
-        looks[key] = EpisodeLook(key, period_s=population.sample_period_s)
         try:
             recording = source.recordings(key)
             values, time = recording.values, recording.time_s
             check_increasing(recording)
-            looks[key] = replace(looks[key], n_samples=len(values))
+            period, deviation = population.sample_period_s, np.zeros(1)
             if time is not None and len(time) > 1:
                 period = float(np.median(np.diff(time)))
                 deviation = np.abs(np.diff(time) / period - 1)
-                uneven = float(deviation.max()), int(deviation.argmax())
-                looks[key] = replace(looks[key], period_s=period, uneven=uneven)
+            look = EpisodeLook(key, "", len(values), period, (float(deviation.max()), int(deviation.argmax())))
             check_episode(values, key, population.columns)
-            looks[key] = replace(looks[key], digest=digest_of(values))
+            looks[key] = replace(look, digest=digest_of(values))
             watch.add(key, values)
         except NonFiniteError as error:
-            looks[key] = replace(looks[key], nan=str(error))
+            looks[key] = replace(look, nan=str(error))
         except DataError as error:
-            looks[key] = replace(looks[key], wrong=str(error))
+            looks[key] = EpisodeLook(key, str(error))
     return list((looks | {key: EpisodeLook(key, problem) for key, problem in watch.wild()}).values())

@@ -184,18 +184,14 @@ def time_columns(columns: Sequence[TableColumn], samples: Sequence[Array]) -> li
     """Return the columns that may be time, the likeliest first: called so, or increasing evenly."""
     rising = [i for i in range(len(columns)) if all(_rises(s[i]) for s in samples)]
     called = [i for i in rising if columns[i].kind == "time"]
-    even = [i for i in rising if all(_is_even(s[i]) for s in samples) and not all(_counts(s[i]) for s in samples)]
-    return called + [i for i in even if i not in called]
+    other = [i for i in rising if i not in called and not all(_counts(s[i]) for s in samples)]
+    steps = {i: [np.diff(s[i]) / np.median(np.diff(s[i])) for s in samples] for i in other}
+    return called + [i for i in other if all(np.mean(np.abs(s - 1) < 0.5) > 0.9 for s in steps[i])]
 
 
 def _rises(column: Array) -> bool:
     steps = np.diff(column)
     return bool(len(steps) and np.isfinite(column).all() and np.mean(steps > 0) > 0.99 and (steps >= 0).all())
-
-
-def _is_even(column: Array) -> bool:
-    steps = np.diff(column)
-    return bool(np.mean(np.abs(steps - np.median(steps)) < 0.5 * np.median(steps)) > 0.9)
 
 
 def _counts(column: Array) -> bool:

@@ -9,13 +9,11 @@ declares the preparation.
 
 from __future__ import annotations
 
-import io
 import math
 import re
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from ...core.errors import DataError
 from ...core.files import whole_folder
@@ -60,7 +58,8 @@ MAPPING = CsvMapping(
     metadata={"plant": "harmonic-drive", "gear_ratio": GEAR_RATIO},
 )
 
-HEADER = b"time_s,position_deg,velocity_deg_per_s,torque_percent,target_position_deg,target_velocity_deg_per_s\n"
+HEADER = ["time_s", "position_deg", "velocity_deg_per_s", "torque_percent"]
+HEADER += ["target_position_deg", "target_velocity_deg_per_s"]
 
 
 def find_root(source: Path) -> Path | None:
@@ -99,6 +98,9 @@ def write_raw(population: Population, out: Path | str) -> None:
     Targets are written one row later than the measurements that they belong to, so reading back gives one sample less
     (and 1000 less at rest).
     """
+    import pyarrow as pa
+    from pyarrow import csv
+
     with whole_folder(Path(out)) as folder:
         for unit, condition, keys in population.groups():
             group = OUTLIERS if population.unit(unit).group == OUTLIERS else "population"
@@ -106,20 +108,8 @@ def write_raw(population: Population, out: Path | str) -> None:
             target = folder / "batch_b" / group / name
             target.mkdir(parents=True)
             for key in keys:
-                content = raw_csv(population.read(key), population.sample_period_s)
-                (target / f"{name}_{int(key.episode):03d}.csv").write_bytes(content)
-
-
-def raw_csv(values: npt.NDArray[np.float64], sample_period_s: float) -> bytes:
-    """Return one raw file."""
-    import pyarrow as pa
-    from pyarrow import csv
-
-    recorded = values / np.array([RADIANS, RADIANS, PERCENT, RADIANS, RADIANS])
-    recorded[LAG:, 3:] = recorded[:-LAG, 3:].copy()
-    columns = [from_numpy(column) for column in (np.arange(len(values)) * sample_period_s, *recorded.T)]
-    table = pa.Table.from_arrays(columns, names=["time", *(c.name for c in CHANNELS)])
-    buffer = io.BytesIO(HEADER)
-    buffer.seek(len(HEADER))
-    csv.write_csv(table, buffer, csv.WriteOptions(include_header=False))
-    return buffer.getvalue()
+                recorded = population.read(key) / np.array([RADIANS, RADIANS, PERCENT, RADIANS, RADIANS])
+                recorded[LAG:, 3:] = recorded[:-LAG, 3:].copy()
+                columns = [np.arange(len(recorded)) * population.sample_period_s, *recorded.T]
+                table = pa.Table.from_arrays([from_numpy(column) for column in columns], names=HEADER)
+                csv.write_csv(table, target / f"{name}_{int(key.episode):03d}.csv")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +23,6 @@ from ...identify import ModelSet
 from ...identify.identified import EpisodeFactors
 from ...identify.identify import reduce_episodes
 from ...observer import Observer
-from ...observer.monitor import Monitor
 from ...observer.screen import screened
 from ...observer.simulate import run_innovations
 from ...uncertainty import OutlierModel
@@ -35,11 +35,11 @@ from .field import (
     DEPLOYED,
     FieldRecordings,
     check_channels,
-    count_status,
     hidden_states,
     identify_on,
     load_calibration,
     open_data,
+    status_counts,
     training_keys,
     unit_parameters,
 )
@@ -87,19 +87,20 @@ def require_folder(path: Path) -> None:
 def junit_text(rows: Sequence[dict[str, Any]]) -> str:
     """Return JUnit XML with a test case for every unit; UNDECIDED is an error, so that a build does not pass on it."""
     units, tags = by_unit(rows), {Verdict.FAIL: "failure", Verdict.UNDECIDED: "error"}
-    counts = {tag: sum(v is verdict for v, _ in units.values()) for verdict, tag in tags.items()}
-    numbers = f'tests="{len(units)}" failures="{counts["failure"]}" errors="{counts["error"]}"'
-    lines = ['<?xml version="1.0" encoding="UTF-8"?>', f'<testsuite name="kros check" {numbers}>']
+    counts = {f"{tag}s": str(sum(v is verdict for v, _ in units.values())) for verdict, tag in tags.items()}
+    suite = ElementTree.Element("testsuite", {"name": "kros check", "tests": str(len(units)), **counts})
     for unit, (verdict, reasons) in units.items():
-        message = f"type={_quoted(verdict)} message={_quoted('; '.join(reasons))}"
-        inside = f"<{tags[verdict]} {message}/>" if verdict in tags else ""
-        lines.append(f'  <testcase classname="kros.check" name={_quoted(unit)}>{inside}</testcase>')
-    return "\n".join([*lines, "</testsuite>", ""])
+        case = ElementTree.SubElement(suite, "testcase", classname="kros.check", name=_printable(unit))
+        if verdict in tags:
+            message = _printable("; ".join(reasons))
+            ElementTree.SubElement(case, tags[verdict], type=verdict.value, message=message)
+    ElementTree.indent(suite)
+    return ElementTree.tostring(suite, "utf-8", xml_declaration=True).decode()
 
 
-def _quoted(text: str) -> str:
-    """Return an attribute of XML; what cannot be printed becomes an underscore."""
-    return quoteattr("".join(c if c.isprintable() else "_" for c in text))
+def _printable(text: str) -> str:
+    """Return a text in which what cannot be printed is an underscore."""
+    return "".join(c if c.isprintable() else "_" for c in text)
 
 
 def _reasons(row: dict[str, Any]) -> list[str]:
@@ -156,7 +157,6 @@ def scored(config: StudyConfig, store: Store, data: Path, workers: int, same_uni
     check_population(population, allow_single=True)
     watched: Rows = []
     if observer is not None:
-        check_channels(population, observer, hidden=False)
         hidden = any(name not in population.states for name in observer.recorded)
         if hidden or observer.monitor is not None:
             watched = monitored(FieldRecordings.open(config, store, data))
@@ -224,15 +224,17 @@ def monitored(recordings: FieldRecordings) -> Rows:
     missing = [name for name in observer.recorded if name not in population.states]
     monitor = observer.monitor
     for unit, condition, keys in population.groups():
-        counts, judged, samples = dict[str, int](), Judged(), 0
+        counts, judged, samples = Counter[str](), Judged(), 0
         for arrived in map(recordings.arriving, keys):
             samples += len(arrived.y)
-            count_status(counts, screened(observer, arrived.y, arrived.u).status)
+            counts.update(status_counts(screened(observer, arrived.y, arrived.u).status))
             if monitor is not None:
                 values = arrived.parameters(observer)
                 nu, good = run_innovations(observer, arrived.y, arrived.u, values, monitor.settle)
                 judged.append((nu[:, 0], good[:, 0]))
-        level = highest_level(monitor, judged)
+        level = None
+        if monitor is not None and any(good.any() for _, good in judged):
+            level = float(monitor.level(np.concatenate(monitor.in_turn(judged))).max())
         outlier = monitor is not None and monitor.units >= FEWEST_UNITS and level is not None and level > 0
         row: dict[str, Any] = dict.fromkeys(("score", "threshold", "detectable"))
         row |= {"unit": unit, "condition": condition, "outlier": outlier, "episodes": len(keys), "left_out": []}
@@ -241,11 +243,3 @@ def monitored(recordings: FieldRecordings) -> Rows:
         row |= {"recorded_s": samples * population.sample_period_s, "samples": counts}
         rows.append(row | {"parameters": recordings.sources.get(unit)})
     return rows
-
-
-def highest_level(monitor: Monitor | None, innovations: Judged) -> float | None:
-    """Return the highest level over the bound, dB; None where nothing is judged."""
-    if monitor is None or not any(judged.any() for _, judged in innovations):
-        return None
-    squares = np.concatenate(monitor.in_turn(innovations))
-    return float(monitor.level(squares).max())

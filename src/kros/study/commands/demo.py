@@ -29,10 +29,8 @@ class Simulation:
     n_episodes: int
     seconds: float
     seed: int
-    spread: float = 1.0
     outlier: bool = True
     plant: str = HARMONIC_DRIVE
-    loop: str = "stiff"
     format: str = "parquet"
 
 
@@ -48,7 +46,7 @@ def simulate_to(out: Path, simulation: Simulation) -> None:
         raise ConfigError(f"--format raw: is the layout of motor drives; write {plant} as parquet.")
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"Output {out}: exists and is not an empty folder; name a new one.")
-    names = ("n_units", "n_episodes", "seconds", "seed", "spread", "outlier", *(["loop"] * (plant == HARMONIC_DRIVE)))
+    names = ("n_units", "n_episodes", "seconds", "seed", "outlier")
     simulated = PLANTS[plant](**{name: getattr(simulation, name) for name in names}).simulate()
     if out.exists():
         out.rmdir()

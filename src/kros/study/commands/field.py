@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -43,8 +44,8 @@ Texts = dict[str, str]  # by unit
 # Episode, first sample, columns of estimates and of the tracked parameter, bits: of an episode or a block of it
 Estimated = tuple[EpisodeKey, int, Array, Bits]
 DEPLOYED = ("observers", "deployed.json")
-_BLOCK = 50_000  # samples of an episode that are run at once
-_BATCH, _SAMPLES = 64, 4 * _BLOCK  # shorter episodes that run side by side, and their samples
+_BLOCK = 20_000  # samples of an episode that are run at once
+_BATCH = 20  # shorter episodes that run side by side
 
 
 def open_data(config: StudyConfig, data: Path, optional: Collection[str] = ()) -> Population:
@@ -209,12 +210,12 @@ class FieldRecordings:
                 sources[unit] = f"tracked from the value {start}"
         return replace(self, values=values, sources=sources)
 
-    def _start(self, unit: str, name: str, phases: int = 24, samples: int = 20_000) -> float:
+    def _start(self, unit: str, name: str, phases: int = 24) -> float:
         """Return the phase at which the observer's innovation is smallest in the first episodes of a unit."""
         chosen, values = dict[EpisodeKey, Array](), self.values[unit]
         for key in self.population.keys(unit)[:_BATCH]:
-            if sum(map(len, chosen.values())) < samples:
-                chosen[key] = next(self.population.blocks(key, samples))
+            if sum(map(len, chosen.values())) < _BLOCK:
+                chosen[key] = next(self.population.blocks(key, _BLOCK))
         arrived = arriving(self.observer, self.population, chosen, {unit: values})
         step, known = 2 * np.pi / phases, {**self.observer.parameters, **values}
         signals = (self.observer, arrived.y, arrived.u, arrived.batch.lengths, known, name)
@@ -235,8 +236,7 @@ class FieldRecordings:
         for key in self.population.episodes:
             blocks = self.population.blocks(key, _BLOCK)
             first, second = next(blocks), next(blocks, None)
-            full = (len(short) + 1) * max(len(first), *map(len, short.values()), 0) > _SAMPLES or len(short) == _BATCH
-            if short and (second is not None or full):
+            if short and (second is not None or len(short) == _BATCH):
                 yield from self._run(tuple(short), [list(short.values())])
                 short = {}
             if second is None:
@@ -266,11 +266,9 @@ class FieldRecordings:
             start, before = start + len(block[0]), [part[max(0, len(part) - late) :] for part in values]
 
 
-def count_status(counts: dict[str, int], status: Bits) -> None:
-    """Add to the samples that are missing, invalid, beyond limits, or restart the observer."""
-    for bit in SampleStatus:
-        if number := int(np.count_nonzero(status & bit)):
-            counts[str(bit.name)] = counts.get(str(bit.name), 0) + number
+def status_counts(status: Bits) -> Counter[str]:
+    """Return how many samples are missing, invalid, beyond limits, or restart the observer."""
+    return +Counter({str(bit.name): int(np.count_nonzero(status & bit)) for bit in SampleStatus})
 
 
 Write = Callable[[EpisodeKey, int, Array], None]
@@ -289,13 +287,13 @@ def estimate_recordings(
         if out.exists() or out.suffix not in ENDINGS:
             raise ConfigError(f"Output {out}: should be a new file that ends in {' or '.join(ENDINGS)}.")
         recordings = FieldRecordings.open(config, store, data, given, track)
-        counts: dict[str, dict[str, int]] = {}
+        counts = defaultdict[str, Counter[str]](Counter)
         with writer(out, facts_of(recordings)) as write:
             factors = recorded_factors(recordings.observer, recordings.observer.recorded)
             for key, start, columns, status in recordings.estimates():
                 columns[:, : len(factors)] /= factors
                 write(key, start, columns)
-                count_status(counts.setdefault(key.unit, {}), status)
+                counts[key.unit].update(status_counts(status))
     count = len(recordings.population.episodes)
     return [f"estimates of {count} episode{'s' * (count != 1)} in {out}", *unit_lines(recordings.sources, counts)]
 

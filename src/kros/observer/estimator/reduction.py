@@ -55,9 +55,10 @@ class Filters:
         return np.asarray(z @ self.C.T + v @ self.D.T)
 
 
-def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> Filters:
-    """Return the filters of a readout, reduced until errors (n,) of the estimates grow by a share, or to an order."""
+def reduced(readout: Readout, order: int | None = None) -> Filters:
+    """Return the filters of a readout, reduced until left-out errors grow by a share, or to an order."""
     design = readout.design
+    errors = readout.typical * design.recordings.size
     A, B, S = design.bank.fine.system()
     weights = design.bank.refined(readout.coefficients).T
     X, w = design.fine_sample
@@ -67,7 +68,6 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     C = weights * size @ A
     D = weights * size @ B
     used = np.isfinite(errors) & (errors > 0)
-    errors = errors.copy()
     errors[list(design.channels.measured)] *= design.settings.measured_loss
     root = gramian_root(A.T, (C[used] / errors[used, None]).T, 1.0).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
@@ -80,7 +80,7 @@ def reduced(readout: Readout, errors: Array, order: int | None, loss: float) -> 
     if order is not None:
         return whole.first(order)
     signals = design.signals(some=_EPISODES, length=round(10 * max([*design.bank.lags, design.bank.taps[-1]])))
-    wanted, most = whole.along(signals), 2 * loss
+    wanted, most = whole.along(signals), 2 * design.settings.loss
     low, high = 0, len(sigma)
     while high - low > 1:  # of errors that grow as little as asked, the least order
         middle = (low + high) // 2

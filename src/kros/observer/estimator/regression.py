@@ -93,16 +93,11 @@ class Recordings:
         """Median length of an episode in samples."""
         return float(np.median(self.lengths))
 
-    def some(self, count: int) -> Recordings:
-        """Return some episodes, spread over all."""
-        at = spread(range(len(self.keys)), count)
-        return self.only([i in at for i in range(len(self.keys))])
-
-    def some_of(self, groups: Mapping[EpisodeKey, Group], count: int) -> Recordings:
-        """Return some episodes, spread over those of every group, and one of each at least."""
-        members: dict[Group, list[EpisodeKey]] = {}
+    def some(self, count: int, groups: Mapping[EpisodeKey, Group] | None = None) -> Recordings:
+        """Return some episodes, spread over all or over those of every group, and one of each at least."""
+        members: dict[Group | None, list[EpisodeKey]] = {}
         for key in self.keys:
-            members.setdefault(groups[key], []).append(key)
+            members.setdefault((groups or {}).get(key), []).append(key)
         share = min(1.0, count / len(self.keys))
         kept = {key for keys in members.values() for key in spread(keys, max(1, round(share * len(keys))))}
         return self.only([key in kept for key in self.keys])
@@ -110,13 +105,6 @@ class Recordings:
     def only(self, which: Sequence[bool]) -> Recordings:
         """Return the episodes that are flagged."""
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
-
-    def groups(self, folds: int, parts: int) -> list[Group]:
-        """Return the group of every episode: those of one name are in one part, and a unit is in one fold."""
-        names, units = sorted({key.episode for key in self.keys}), sorted({key.unit for key in self.keys})
-        return [
-            Group(units.index(key.unit) % folds, key.condition, names.index(key.episode) % parts) for key in self.keys
-        ]
 
 
 @dataclass(frozen=True)
@@ -152,6 +140,11 @@ class Design:
     recordings: Recordings
     settings: EstimatorSettings
 
+    @classmethod
+    def of(cls, channels: Channels, recordings: Recordings, settings: EstimatorSettings) -> Design:
+        """Return the design with the bank of its channels."""
+        return cls(channels, Bank.of(channels, recordings.length, settings), recordings, settings)
+
     def rows(
         self, recordings: Recordings, rows: int, offset: Array | float = 0.0
     ) -> Iterator[tuple[EpisodeKey, Array, Array, Array]]:
@@ -161,34 +154,34 @@ class Design:
         """
         thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
-        for number, (key, length) in enumerate(zip(recordings.keys, recordings.lengths, strict=True)):
-            batch = recordings.read(key)
-            y = interpolated(batch.measurements(measured)[:length, 0]) + offset
-            v = self.channels.signals(y, batch.inputs[:length, 0], {k: p[0] for k, p in batch.parameters.items()})
-            at, weights = thinning.at(length, number)
-            targets = batch.states[at + 1, 0] / recordings.size
+        for number, key in enumerate(recordings.keys):
+            states, y, v = self.episode(key, offset)
+            at, weights = thinning.at(len(v), number)
+            targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
             targets[:, measured] -= reference / recordings.size[measured]
             yield key, self.bank.rows(self.channels.filtered(v), at), targets, weights
 
+    def episode(self, key: EpisodeKey, offset: Array | float = 0.0) -> tuple[Array, Array, Array]:
+        """Return states, measurements with an offset, and channels of an episode, (n_samples, .)."""
+        batch = self.recordings.read(key)
+        length, own = batch.lengths[0], {k: p[0] for k, p in batch.parameters.items()}
+        y = interpolated(batch.measurements(self.channels.measured)[:length, 0]) + offset
+        return batch.states[:length, 0], y, self.channels.signals(y, batch.inputs[:length, 0], own)
+
     def signals(self, some: int, length: int) -> Array:
         """Return what filters see in some episodes, cut to one length, shape (n_samples, batch, channels)."""
-        found = []
-        for key in self.recordings.some(some).keys:
-            batch = self.recordings.read(key)
-            y = interpolated(batch.measurements(self.channels.measured)[: batch.lengths[0], 0])
-            own = {k: p[0] for k, p in batch.parameters.items()}
-            v = self.channels.signals(y, batch.inputs[: batch.lengths[0], 0], own)
-            found.append(self.channels.filtered(v))
-        shortest = min(length, *(len(v) for v in found))
-        return np.stack([v[:shortest] for v in found], axis=1)
+        recordings = self.recordings.some(some)
+        shortest = min(length, *recordings.lengths)
+        return np.stack([self.channels.filtered(self.episode(key)[2])[:shortest] for key in recordings.keys], axis=1)
 
     @cached_property
     def groups(self) -> dict[EpisodeKey, Group]:
-        """The group of every episode."""
-        found = self.recordings.groups(self.settings.folds, self.settings.parts)
-        return dict(zip(self.recordings.keys, found, strict=True))
+        """The group of every episode: those of one name are in one part, and a unit is in one fold."""
+        keys, folds, parts = self.recordings.keys, self.settings.folds, self.settings.parts
+        names, units = (sorted(set(column)) for column in zip(*((k.episode, k.unit) for k in keys), strict=True))
+        return {k: Group(units.index(k.unit) % folds, k.condition, names.index(k.episode) % parts) for k in keys}
 
     @cached_property
     def fine_sample(self) -> tuple[Array, Array]:
@@ -235,11 +228,12 @@ class Whitening:
         """Find the directions from thinned rows."""
         X, weights = design.sample
         size = design.bank.sizes(np.sqrt(weights @ (X * X)))
+        scale = np.sqrt(weights)[:, None] / size
         trust, bias = np.diag(design.bank.trust(design.settings)), design.recordings.bias
         if bias is not None and bias.any():  # an offset of either sign adds its own moment to the errors
-            moved = (design.thinned(bias)[0] - X) / size * np.sqrt(weights)[:, None]
+            moved = (design.thinned(bias)[0] - X) * scale
             trust = np.vstack([trust, qr_triangle(moved)])
-        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X / size * np.sqrt(weights)[:, None], trust])))
+        _, sigma, V = np.linalg.svd(qr_triangle(np.vstack([X * scale, trust])))
         count = int(np.sum(sigma > _SMALLEST * sigma[0]))
         directions = V[:count].T / sigma[:count] / size[:, None]
         rows = trust @ (directions * size[:, None])
@@ -258,18 +252,16 @@ class Moments:
     @classmethod
     def of(cls, design: Design, whitening: Whitening) -> Moments:
         """Sum the rows of every group."""
-        sums: dict[Group, list[Array]] = {}
-        groups = design.groups
-        recordings = design.recordings.some_of(groups, design.settings.episodes)
+        sums, groups, r = dict[Group, Array](), design.groups, whitening.directions.shape[1]
+        recordings = design.recordings.some(design.settings.episodes, groups)
         for key, rows, targets, weights in design.rows(recordings, design.settings.rows):
-            group = groups[key]
-            F = (rows @ whitening.directions) * np.sqrt(weights)[:, None]
-            t = targets * np.sqrt(weights)[:, None]
-            parts = [F.T @ F, F.T @ t, (t * t).sum(axis=0), np.array(weights.sum())]
-            known = sums.get(group)
-            sums[group] = parts if known is None else [a + b for a, b in zip(known, parts, strict=True)]
-        gram, cross, power = (np.array([s[i] / s[3] for s in sums.values()]) for i in range(3))
-        return cls(tuple(sums), gram, cross, power)
+            columns = np.hstack([rows @ whitening.directions, targets, np.ones((len(rows), 1))])
+            columns *= np.sqrt(weights)[:, None]
+            sums[groups[key]] = sums.get(groups[key], 0.0) + columns.T @ columns
+        total = np.stack([*sums.values()])
+        total /= total[:, -1:, -1:]
+        power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
+        return cls(tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
 
     def of_groups(self, what: str) -> npt.NDArray[Any]:
         """Return fold, condition or part of every group."""
@@ -336,9 +328,8 @@ class Readout:
         errors = np.array(
             [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
         )
-        counted = (moments.power > 0)[
-            :, None
-        ]  # a state at zero throughout a group would ask for no estimate of it at all
+        # A state at zero throughout a group would ask for no estimate of it at all.
+        counted = (moments.power > 0)[:, None]
         best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
         n = np.arange(errors.shape[2])
         coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
@@ -358,6 +349,11 @@ class Readout:
         first = groups[recordings.keys[0]]
         same = [(groups[key].fold, groups[key].part) == (first.fold, first.part) for key in recordings.keys]
         return first, recordings.only(same)
+
+    @property
+    def typical(self) -> Array:
+        """Typical left-out error of every state over its size, shape (n,)."""
+        return np.exp(np.log(self.left_out).mean(axis=0) / 2)
 
     def without(self, group: Group) -> Readout:
         """Return the readout that does not know a group."""
@@ -391,11 +387,7 @@ def is_less(one: Array, other: Array, margin: float) -> bool:
 def condition_weights(moments: Moments, whitening: Whitening) -> Array:
     """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
-    weights = np.ones(len(conditions))
-    if len(set(conditions)) == 1:
-        return weights
-    (first,) = moments.solved(whitening, weights, [ROUNDING])
-    errors = np.exp(np.log(moments.errors(first, np.arange(len(weights)))).mean(axis=1))
-    for condition in set(conditions):
-        weights[conditions == condition] = 1 / errors[conditions == condition].mean()
-    return weights
+    alike = conditions[:, None] == conditions
+    (first,) = moments.solved(whitening, np.ones(len(alike)), [ROUNDING])
+    errors = np.exp(np.log(moments.errors(first, np.arange(len(alike)))).mean(axis=1))
+    return np.asarray(alike.sum(axis=1) / (alike @ errors))

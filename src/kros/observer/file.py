@@ -119,13 +119,13 @@ def observer_content(observer: ObserverData) -> dict[str, Any]:
         "sample_period_s": observer.sample_period_s,
         "model": {"A": observer.A, "B": observer.B},
         "controller": {key: getattr(observer.controller, key) for key in "ABCD"},
-        "runtime": {key: value for key, value in vars(observer.runtime).items() if np.any(value)},
+        "runtime": {"delay": observer.runtime.delay, **observer.runtime.limits()},
         **{key: vars(part) for key, part in parts.items() if part is not None},
         "sensor": {name: sensor.model_dump() for name, sensor in observer.sensor.items()},
         "about": observer.about,
     }
     written: dict[str, Any] = plain(content)
-    return {key: value for key, value in written.items() if value or key not in ("runtime", "sensor", "about")}
+    return {key: value for key, value in written.items() if value or key not in ("sensor", "about")}
 
 
 def write_observer(observer: ObserverData, path: Path) -> None:

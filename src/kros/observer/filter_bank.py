@@ -77,13 +77,9 @@ class FilterBank:
         ratio = age / self.half
         return np.asarray(ratio * ratio / (1 + ratio * ratio))
 
-    def times(self, x: Array, columns: Array, y: Array) -> FilterBank:
-        """Return the bank in other units of measure, by factors of states, columns of `start` and measurements."""
-        return replace(self, start=self.start * x[:, None] / columns, reach=self.reach * y)
-
-    def turned(self, turn: Array) -> FilterBank:
-        """Return the bank for states ``turn @ x``, shape (n, n), which leaves recorded states and fallback alone."""
-        return replace(self, start=turn @ self.start)
+    def times(self, columns: Array, y: Array) -> FilterBank:
+        """Return the bank in other units of measure, by factors of the columns of `start` and of measurements."""
+        return replace(self, start=self.start / columns, reach=self.reach * y)
 
 
 def longest_age(half: Array) -> Array:

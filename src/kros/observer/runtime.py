@@ -115,9 +115,9 @@ class Runtime:
         low, high = self.sides(len(x))
         return bool(np.any((x <= low) | (x >= high)))
 
-    def clip_estimate(self, x: Array) -> Array:
+    def clip_estimate(self, x: Array, out: Array | None = None) -> Array:
         """Return estimates or recorded states, the first ones, within their limits, shape (..., n)."""
-        return np.clip(x, *self.sides(x.shape[-1])) if self.limits() else x
+        return np.clip(x, *self.sides(x.shape[-1]), out=out) if self.limits() else x
 
     def times(self, x: Array) -> Runtime:
         """Return the same in other units of measure, by the factors of the states."""
@@ -157,12 +157,8 @@ class Guard:
                 f"{self.correction} of the correction above zero, and {self.settle} samples to settle at least 0."
             )
 
-    def times(self, x: Array) -> Guard:
-        """Return the guard of states multiplied by factors, shape (n,); states of the correction stay."""
-        return replace(self, lower=self.lower * x, upper=self.upper * x)
-
     def turned(self, turn: Array) -> Guard:
-        """Return the smallest box around the states ``turn @ x``, shape (n, n)."""
+        """Return the smallest box around the states ``turn @ x``, shape (n, n); states of the correction stay."""
         middle, half = turn @ (self.lower + self.upper) / 2, np.abs(turn) @ (self.upper - self.lower) / 2
         return replace(self, lower=middle - half, upper=middle + half)
 

@@ -114,15 +114,8 @@ def _run(
             if some.any():
                 run.replace(np.flatnonzero(some), course, samples)
     for run, observer in zip(runs, observers, strict=True):
-        _limit(observer, run.estimates)
+        observer.runtime.clip_estimate(run.estimates, out=run.estimates)
     return runs
-
-
-def _limit(observer: ObserverData, estimates: Array) -> None:
-    """Bring estimates, (..., n), within their limits, in place."""
-    n, sides = observer.lifting.n_states, observer.runtime.sides(observer.lifting.n_states)
-    for i in observer.runtime.limited_states(n):
-        np.clip(estimates[..., i], sides[0][i], sides[1][i], out=estimates[..., i])
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,7 +195,7 @@ class Course:
             runs, restarted = _compiled(loops, [self], samples)
             run = None if restarted.any() else runs[0]
         run = stepped(self, samples) if run is None else run
-        _limit(self.observer, run.estimates)
+        self.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
         return replace(run, status=run.status | samples.status)
 
     def even(self, samples: Screened) -> bool:

@@ -143,10 +143,6 @@ class ErrorSystem:
         A, B = self.corner(d)
         return StateSpace(A, B, self.C, np.zeros((len(self.C), B.shape[1])), self.dt)
 
-    def moved(self) -> StateSpace:
-        """Return the system from w to q, what the channels act on, with slopes in the middle: the frozen response."""
-        return StateSpace(self.A, self.B, self.M, self.D, self.dt)
-
     def mismatch(self) -> ErrorSystem:
         """Return the system from q' (frozen) to the rest: ``r+ = A r + L p``, ``p = d (M r + E p + q')``."""
         width = self.L.shape[1]

@@ -114,7 +114,8 @@ class ObserverData:
                 f"Observer {self.name}: the controller should map {q} innovations to {width} corrections "
                 f"({self.injection.value} injection), found {K.n_inputs} to {K.n_outputs}."
             )
-        self.runtime.require_fit(self.name, n)
+        for key, limit in self.runtime.limits().items():
+            self._require(f"runtime.{key}", limit.shape, (n,))
         if self.seen is not None:
             self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
         if self.monitor is not None:
@@ -127,9 +128,10 @@ class ObserverData:
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
-            self.guard.require_fit(self.name, n, K.n_states)
+            shapes = tuple(bound.shape for bound in (self.guard.lower, self.guard.upper, self.guard.correction))
+            self._require("the guard of states and correction", shapes, ((n,), (n,), (K.n_states,)))
 
-    def _require(self, what: str, shape: tuple[int, ...], wanted: tuple[int, ...]) -> None:
+    def _require(self, what: str, shape: tuple[Any, ...], wanted: tuple[Any, ...]) -> None:
         if shape != wanted:
             raise DimensionError(f"Observer {self.name}: {what} should have shape {wanted}, found {shape}.")
 

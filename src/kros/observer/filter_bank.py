@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
+from ..core.linalg import floats
 from ..core.rounding import ITERATED
 
 Array = npt.NDArray[np.float64]
@@ -49,8 +50,7 @@ class FilterBank:
     reach: Array
 
     def __post_init__(self) -> None:
-        for name in _ARRAYS:
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        floats(self, *_ARRAYS)
         starts = np.isfinite(self.start).all() and np.isfinite(self.reach).all() and (self.reach >= 0).all()
         if not (starts and np.isfinite(self.half).all() and (self.half > 0).all()):
             raise DataError(

@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import DataError
+from ..core.linalg import floats
 
 Array = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -51,8 +52,7 @@ class Monitor:
 
     def __post_init__(self) -> None:
         arrays = ("filters", "size", "limits", "weights")
-        for name in arrays:
-            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
+        floats(self, *arrays)
         shapes, (bands, q) = [getattr(self, name).shape for name in arrays], (len(self.filters), self.size.size)
         if not bands or shapes != [(bands, 3), (q,), (q, bands), (q, bands)]:
             raise DataError(

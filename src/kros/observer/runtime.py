@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DataError
+from ..core.linalg import floats
 
 Array = npt.NDArray[np.float64]
 
@@ -42,9 +43,8 @@ class Seen:
     inputs: Array
 
     def __post_init__(self) -> None:
-        for name in ("measured", "inputs"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            object.__setattr__(self, name, values)
+        floats(self, "measured", "inputs")
+        for name, values in vars(self).items():
             if values.ndim != 1 or not np.isfinite(values).all() or np.any(values < 0):
                 raise DataError(
                     f"Sizes seen in training: {name} should be one finite size of at least 0 a channel, found {values}."
@@ -90,8 +90,8 @@ class Runtime:
         what = "Runtime of an observer"
         if int(self.delay) != self.delay or self.delay < 0:
             raise DataError(f"{what}: the delay of {self.delay} should be a whole number of samples, at least 0.")
-        for name, value in self.limits().items():
-            object.__setattr__(self, name, np.asarray(value, dtype=float))
+        floats(self, *self.limits())
+        for name in self.limits():
             if np.isnan(getattr(self, name)).any():
                 raise DataError(f"{what}: {name} is not a number; leave limits out, or make them infinite.")
         if len(self.limits()) > 1 and np.any(np.greater(*self.limits().values())):
@@ -124,12 +124,6 @@ class Runtime:
         changes: dict[str, Any] = {name: limit * x for name, limit in self.limits().items()}
         return replace(self, **changes)
 
-    def require_fit(self, name: str, n: int) -> None:
-        """Refuse limits of another size than the observer's."""
-        for key, limit in self.limits().items():
-            if limit.shape != (n,):
-                raise DimensionError(f"Observer {name}: runtime.{key} should have shape ({n},), found {limit.shape}.")
-
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
         """Read the fields that a file holds; null stands for what is infinite."""
@@ -149,8 +143,7 @@ class Guard:
     settle: int  # samples after a start until the estimate is as good as before
 
     def __post_init__(self) -> None:
-        for name in ("lower", "upper", "correction"):
-            object.__setattr__(self, name, np.atleast_1d(np.asarray(getattr(self, name), dtype=float)))
+        floats(self, "lower", "upper", "correction")
         if not (np.all(self.lower < self.upper) and np.all(self.correction > 0) and self.settle >= 0):
             raise DataError(
                 f"Guard of an observer: lower bounds {self.lower} should be below the upper ones {self.upper}, sizes "
@@ -161,15 +154,6 @@ class Guard:
         """Return the smallest box around the states ``turn @ x``, shape (n, n); states of the correction stay."""
         middle, half = turn @ (self.lower + self.upper) / 2, np.abs(turn) @ (self.upper - self.lower) / 2
         return replace(self, lower=middle - half, upper=middle + half)
-
-    def require_fit(self, name: str, n: int, order: int) -> None:
-        """Refuse bounds of another size than the observer's."""
-        shapes = (self.lower.shape, self.upper.shape, self.correction.shape)
-        if shapes != ((n,), (n,), (order,)):
-            raise DimensionError(
-                f"Observer {name}: a guard of {n} states and {order} of the correction is needed, found shapes "
-                f"{shapes}."
-            )
 
 
 def bounds(guard: Guard | None, n: int, order: int) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.errors import DimensionError, KrosError
+from ...core.linalg import floats
 from ...core.lti import StateSpace
 from ...core.rounding import EPS, ROUNDING
 from ...lifting.formula import delayed_name
@@ -74,16 +75,13 @@ class ReliftScales:
     noise: Array
 
     def __post_init__(self) -> None:
-        for name in ("error", "residual", "noise"):
-            values = np.atleast_1d(np.asarray(getattr(self, name), dtype=float))
-            object.__setattr__(self, name, values)
-            sized = (
-                np.all(values > 0) and np.isfinite(values).any()
-                if name == "error"
-                else np.isfinite(values).all() and np.all(values >= 0)
+        floats(self, "error", "residual", "noise")
+        counted, others = np.isfinite(self.error), np.append(self.residual, self.noise)
+        if not (np.all(self.error > 0) and counted.any() and np.isfinite(others).all() and np.all(others >= 0)):
+            raise DimensionError(
+                "Re-lift scales: errors should be finite sizes above zero, some of them infinite, residuals and noise "
+                f"finite and not negative, found {self}."
             )
-            if not sized:
-                raise DimensionError(f"Re-lift scales: {name} should be finite sizes above zero, found {values}.")
 
     @classmethod
     def typical(cls, ranges: npt.ArrayLike, residual: Array, noise: npt.ArrayLike) -> ReliftScales:

@@ -163,14 +163,14 @@ class Course:
         return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
 
 
-def course(observer: ObserverData, batch: EpisodeBatch, estimates: Array | None = None) -> Course:
+def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     """Return what drove an observer along episodes; recorded states stand for the true ones."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.clip_estimate(batch.states)
     values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
     due = np.maximum(np.arange(len(states)) - late, 0)
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)
-    estimates = run_observer(observer, y, inputs, values) if estimates is None else estimates
+    estimates = run_observer(observer, y, inputs, values)
     # Measurements beyond the limits of their states are taken at the limit: what is left of their noise is smaller.
     taken = screened(observer, y, inputs).y
     noise = np.where(np.isfinite(taken), taken, y)[:-1] - states[due][:-1][..., at]

@@ -65,7 +65,7 @@ def test_coefficients_are_those_of_least_squares_with_the_penalty_as_rows():
     whitening = Whitening.of(made)
     moments = Moments.of(made, whitening)
     penalty = 1e-6
-    (found,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    (found,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     parts: dict = {}
     for key, rows, targets, weights in made.rows(recordings, FEW.rows):
         parts.setdefault(made.groups[key], []).append((rows @ whitening.directions, targets, weights))
@@ -138,7 +138,7 @@ def test_errors_are_those_of_units_and_episodes_that_coefficients_do_not_know():
     whitening = Whitening.of(readout.design)
     moments = Moments.of(made, whitening)
     penalty = float(readout.penalties[1])
-    (coefficients,) = moments.solved(whitening, np.ones(len(moments.groups)), [penalty])
+    (coefficients,) = moments.solved(np.ones(len(moments.groups)), [penalty])
     group = readout.design.groups[key]
     np.testing.assert_allclose(
         readout.others[group][:, 1],

@@ -180,13 +180,10 @@ class RunningObserver:
         run = stepped(course, sample)
         if course.loop is not None:
             self.parameters[course.loop.name] = float(course.values[course.loop.name][0])
-        if watch is not None and run.starts[0, 0]:
-            watch.begin()
-        moved = bool(run.moving[0, 0])
-        if watch is not None and moved:
-            watch.take(run.innovation[0, 0], not sample.status[0, 0])
+        if watch is not None:
+            watch.take(run.innovation[0, 0], sample.status[0, 0] != 0, run.starts[0, 0], run.moving[0, 0])
         self._status = SampleStatus(int(sample.status[0, 0] | run.status[0, 0]))
-        if moved and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
+        if run.moving[0, 0] and not course.steps.waiting[0] and self.observer.runtime.binds(course.steps.x[0]):
             self._status |= SampleStatus.LIMIT
         if watch is not None and watch.outside:
             self._status |= SampleStatus.UNCERTIFIED

@@ -127,9 +127,8 @@ class Runtime:
     @classmethod
     def from_content(cls, content: Mapping[str, Any]) -> Runtime:
         """Read the fields that a file holds; null stands for what is infinite."""
-        ends = {name: content.get(name) for name in ("lower", "upper")}
-        none = {"lower": -np.inf, "upper": np.inf}
-        limits = {k: np.array([none[k] if v is None else v for v in row]) for k, row in ends.items() if row}
+        ends = {name: end for name, end in (("lower", -np.inf), ("upper", np.inf)) if content.get(name)}
+        limits = {name: np.nan_to_num(np.array(content[name], dtype=float), nan=end) for name, end in ends.items()}
         return cls(content.get("delay", 0), **limits)
 
 

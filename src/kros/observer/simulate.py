@@ -82,7 +82,7 @@ def run_innovations(
 ) -> tuple[Array, Flags]:
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
-    run = _run([observer], samples, parameters, innovations=True)[0]
+    run = _run([observer], samples, parameters)[0]
     starts = run.starts.copy()
     starts[0] = True
     return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
@@ -92,7 +92,6 @@ def _run(
     observers: Sequence[ObserverData],
     samples: Screened,
     parameters: Parameters | None,
-    innovations: bool = False,
 ) -> list[Stepped]:
     """Run observers of one model: compiled, and in NumPy again the machines that leave bounds or have gaps to fill."""
     loops, batch = library(), samples.starts.shape[1]
@@ -100,7 +99,7 @@ def _run(
     if loops is None:
         runs = [stepped(course, samples) for course in courses]
     else:
-        runs, again = _compiled(loops, courses, samples, innovations)
+        runs, again = _compiled(loops, courses, samples)
         if observers[0].bank is not None:
             again = again | ~np.isfinite(samples.y).all(axis=(0, 2))
         for run, course, some in zip(runs, courses, again, strict=True):
@@ -126,7 +125,7 @@ class Stepped:
         """Put what some machines do in NumPy in the place of what they did, from the first sample of all."""
         own = {name: v[machines] for name, v in course.values.items()}
         part = stepped(Course(course.observer, len(machines), own), samples.of(machines))
-        for name in ("estimates", "status", "starts", "moving", *(("innovation",) if len(self.innovation) else ())):
+        for name in ("estimates", "innovation", "status", "starts", "moving"):
             getattr(self, name)[:, machines] = getattr(part, name)
 
 
@@ -263,19 +262,17 @@ def _compiled(
     loops: Library,
     courses: Sequence[Course],
     samples: Screened,
-    innovations: bool = False,
 ) -> tuple[list[Stepped], Flags]:
     """Run observers of one model on in the compiled loop; return which machines left bounds, (observer, batch)."""
     (samples, lead), *_ = [course.enter(samples) for course in courses]
     observers, values, delay = [c.observer for c in courses], courses[0].values, courses[0].observer.runtime.delay
     (n_samples, batch), n, m = samples.starts.shape, observers[0].lifting.n_states, samples.u.shape[2]
     late = np.zeros((lead, batch), dtype=np.intp), _pending(samples.starts[lead:], delay, courses[0].since)
-    pending, states = np.concatenate(late), _empty(n_samples, len(observers), n, batch)
-    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states}
-    innovation = _empty(*samples.y.shape) if innovations else _empty(0, *samples.y.shape[1:])
-    before = _empty(n_samples, batch, job["past"].shape[-1])
+    pending, states = np.concatenate(late), np.empty((n_samples, len(observers), n, batch))
+    innovation = np.empty(samples.y.shape)  # of the first observer
+    job = _job(courses, samples) | _begins(observers, samples, values) | {"states": states, "innovation": innovation}
+    before = np.empty((n_samples, batch, job["past"].shape[-1]))
     moving = (pending == delay) & (~samples.starts | (delay == 0))
-    job |= {"innovation": innovation} if innovations else {}
     if delay:
         job |= {"moving": moving, "before": before, "pending": pending}
     tape = formulas(observers[0].lifting, tape_of(observers[0].lifting, m), values, m, batch)
@@ -292,10 +289,6 @@ def _compiled(
         status, starts = np.zeros((n_samples - lead, batch), np.uint8), samples.starts[lead:].copy()
         runs.append(Stepped(x[lead:], innovation[lead:], status, starts, moving[lead:].copy(), np.empty(0)))
     return runs, restarted
-
-
-def _empty(*shape: int) -> Array:
-    return np.empty(shape)
 
 
 def _job(courses: Sequence[Course], samples: Screened) -> dict[str, Any]:

@@ -160,8 +160,7 @@ def _scaled(H: Complex, width: int) -> tuple[Array, Complex]:
 def _cuts(H: Complex, t: Array, g: float) -> Array:
     """Return rows (c, n_p + 2) of ``v' F_f(t, g) v = a t + b g - c`` for the eigenvectors of least value."""
     width = len(t)
-    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
-    F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    F = np.diag(np.append(t, np.full(H.shape[2] - width, g))) - _forms(H, t)
     values, vectors = np.linalg.eigh(F)
     some = np.argsort(values[:, 0])[: SETTINGS.cuts]
     v = vectors[some, :, 0]
@@ -172,11 +171,16 @@ def _cuts(H: Complex, t: Array, g: float) -> Array:
     )
 
 
+def _forms(H: Complex, t: Array) -> Complex:
+    """Return ``sum_j t_j h_fj' h_fj + H_z' H_z`` at every frequency."""
+    weight = np.append(t, np.ones(H.shape[1] - len(t)))
+    return np.asarray(np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H))
+
+
 def gain_squared(H: Complex, t: Array) -> float:
     """Return the least g that multipliers allow on the grid, by a Schur complement, or infinity."""
     width = len(t)
-    weight = np.concatenate([t, np.ones(H.shape[1] - width)])
-    F = np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
+    F = _forms(H, t)
     rest = np.diag(t) - F[:, :width, :width]
     if not np.linalg.eigvalsh(rest)[:, 0].min() > 0:
         return np.inf

@@ -103,6 +103,10 @@ def identify_estimator(
     observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings, held))
     observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
+
+    def by_state(values: Array) -> dict[str, float]:
+        return dict(zip(states, values.tolist(), strict=True))
+
     errors = readout.typical
     growth = errors / np.exp(np.log(readout.trained).mean(axis=0) / 2)
     worst = np.sqrt(readout.episode_errors().max(axis=0))
@@ -112,11 +116,11 @@ def identify_estimator(
         "input_filters": len(fallback.A),
         "bank": len(readout.design.bank),
         "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
-        "penalties": dict(zip(states, readout.penalties.tolist(), strict=True)),
+        "penalties": by_state(readout.penalties),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
-        "left_out_worst_percent": dict(zip(states, (100 * worst).tolist(), strict=True)),
-        "outside_models_percent": dict(zip(states, outside_percent(readout, lifting).tolist(), strict=True)),
+        "left_out_worst_percent": by_state(100 * worst),
+        "outside_models_percent": by_state(outside_percent(readout, lifting)),
         "settle_samples": settle_samples(filters, fallback, observer.bank),
     }
     return Identified(observer, readout, family, facts)

@@ -107,28 +107,17 @@ class Recordings:
         return replace(self, keys=tuple(compress(self.keys, which)), lengths=tuple(compress(self.lengths, which)))
 
 
-@dataclass(frozen=True)
-class Thinning:
-    """Which samples of an episode are rows, and for how many each stands: all at the start, then every `step`-th."""
+def thinned(lengths: Sequence[int], rows: int, first: int) -> Iterator[tuple[npt.NDArray[np.int64], Array]]:
+    """Yield which samples of every episode are about so many rows, and for how many each stands.
 
-    first: int
-    step: int
-    first_step: int = 1
-
-    @classmethod
-    def of(cls, lengths: Sequence[int], rows: int, first: int) -> Thinning:
-        """Return the thinning that leaves about so many rows."""
-        first = min(first, min(lengths) - 1)
-        first_step = max(1, -(-3 * len(lengths) * first // rows))
-        left = max(1, rows - len(lengths) * (first // first_step))
-        return cls(first, max(1, -(-sum(lengths) // left)), first_step)
-
-    def at(self, length: int, number: int) -> tuple[npt.NDArray[np.int64], Array]:
-        """Return the samples of episode `number`, each of which has a sample after it, and their weights."""
-        early = np.arange(number % self.first_step, self.first, self.first_step)
-        late = np.arange(self.first + number % self.step, length - 1, self.step)
-        weights = np.repeat([float(self.first_step), float(self.step)], [len(early), len(late)])
-        return np.concatenate([early, late]), weights
+    Each has a sample after it. At the start they are denser than later.
+    """
+    first = min(first, min(lengths) - 1)
+    early = max(1, -(-3 * len(lengths) * first // rows))
+    late = max(1, -(-sum(lengths) // max(1, rows - len(lengths) * (first // early))))
+    for number, length in enumerate(lengths):
+        parts = np.arange(number % early, first, early), np.arange(first + number % late, length - 1, late)
+        yield np.concatenate(parts), np.repeat([float(early), float(late)], [len(part) for part in parts])
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,11 +141,10 @@ class Design:
 
         Targets are states at the next sample, of measured ones their distance from the reference of the channels.
         """
-        thinning = Thinning.of(recordings.lengths, rows, round(10 * max(self.settings.start)))
+        samples = thinned(recordings.lengths, rows, round(10 * max(self.settings.start)))
         measured = list(self.channels.measured)
-        for number, key in enumerate(recordings.keys):
+        for key, (at, weights) in zip(recordings.keys, samples, strict=True):
             states, y, v = self.episode(key, offset)
-            at, weights = thinning.at(len(v), number)
             targets = states[at + 1] / recordings.size
             reference = v[at] @ self.channels.reference.T
             reference[:, self.channels.held] = y[at][:, self.channels.held]
@@ -244,6 +232,7 @@ class Whitening:
 class Moments:
     """Second moments of every group in whitened directions."""
 
+    whitening: Whitening
     groups: tuple[Group, ...]
     gram: Array  # (groups, r, r)
     cross: Array  # (groups, r, n)
@@ -261,28 +250,28 @@ class Moments:
         total = np.stack([*sums.values()])
         total /= total[:, -1:, -1:]
         power = np.diagonal(total, axis1=1, axis2=2)[:, r:-1]
-        return cls(tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
+        return cls(whitening, tuple(sums), total[:, :r, :r], total[:, :r, r:-1], power)
 
     def of_groups(self, what: str) -> npt.NDArray[Any]:
         """Return fold, condition or part of every group."""
         return np.array([getattr(group, what) for group in self.groups])
 
-    def errors(self, coefficients: Array, groups: npt.NDArray[np.int64]) -> Array:
-        """Return the mean squared errors of coefficients (r, n) in some groups, shape (len(groups), n)."""
+    def errors(self, coefficients: Array, groups: slice = slice(None)) -> Array:
+        """Return the mean squared errors of coefficients (r, n) in some groups, shape (groups, n)."""
         quadratic = np.einsum("in,gin->gn", coefficients, self.gram[groups] @ coefficients)
         found = self.power[groups] - 2 * np.einsum("in,gin->gn", coefficients, self.cross[groups]) + quadratic
         return np.maximum(found, 1e-30)
 
-    def solved(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
+    def solved(self, weights: Array, penalties: Sequence[float]) -> Iterator[Array]:
         """Yield ridge coefficients (r, n) of groups with weights, for every penalty."""
         from scipy.linalg import cho_factor, cho_solve
 
         weights = weights / weights.sum()
-        gram = np.tensordot(weights, self.gram, 1) + whitening.trust
+        gram = np.tensordot(weights, self.gram, 1) + self.whitening.trust
         cross = np.tensordot(weights, self.cross, 1)
         rounding = 16 * len(gram) * EPS
         for penalty in penalties:
-            A = gram + np.diag(penalty * whitening.penalty)
+            A = gram + np.diag(penalty * self.whitening.penalty)
             q = 1 / np.sqrt(np.diag(A))
             scaled = A * q[:, None] * q + rounding * np.eye(len(q))
             yield q[:, None] * cho_solve(cho_factor(scaled, check_finite=False), q[:, None] * cross)
@@ -296,13 +285,13 @@ class Moments:
                 return known
         return np.ones(len(folds), dtype=bool)
 
-    def without(self, whitening: Whitening, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
+    def without(self, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
         """Return the coefficients that do not know a group, for every group and penalty."""
         found: dict[bytes, list[Array]] = {}
         known = {group: self.known(group) for group in self.groups}
         for rest in known.values():
             if rest.tobytes() not in found:
-                found[rest.tobytes()] = list(self.solved(whitening, np.where(rest, weights, 0.0), penalties))
+                found[rest.tobytes()] = list(self.solved(np.where(rest, weights, 0.0), penalties))
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 
@@ -315,7 +304,6 @@ class Readout:
     left_out: Array  # (groups, n), mean squared errors over the squared sizes
     trained: Array  # (groups, n), of the coefficients that are returned
     penalties: Array  # (n,)
-    folds: npt.NDArray[np.int64]  # (groups,)
     others: dict[Group, Array]  # coefficients (p, n) that do not know a group, over the sizes
 
     @classmethod
@@ -323,23 +311,21 @@ class Readout:
         """Fit all states: conditions count inversely to their errors, penalties are best on what is left out."""
         whitening = Whitening.of(design)
         moments = Moments.of(design, whitening)
-        weights, penalties = condition_weights(moments, whitening), design.settings.penalties
-        others = moments.without(whitening, weights, penalties)
-        errors = np.array(
-            [[moments.errors(c, np.array([i]))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
-        )
+        weights, penalties = condition_weights(moments), design.settings.penalties
+        others = moments.without(weights, penalties)
+        left_out = [[moments.errors(c, slice(i, i + 1))[0] for c in others[g]] for i, g in enumerate(moments.groups)]
+        errors = np.array(left_out)
         # A state at zero throughout a group would ask for no estimate of it at all.
         counted = (moments.power > 0)[:, None]
         best = np.argmin(np.log(errors).mean(axis=0, where=counted | ~counted.any(axis=0)), axis=0)
         n = np.arange(errors.shape[2])
-        coefficients = np.array(list(moments.solved(whitening, weights, penalties)))[best, :, n].T
+        coefficients = np.array(list(moments.solved(weights, penalties)))[best, :, n].T
         return cls(
             design,
             whitening.directions @ coefficients * design.recordings.size,
             errors[:, best, n],
-            moments.errors(coefficients, np.arange(len(weights))),
+            moments.errors(coefficients),
             np.array(penalties)[best],
-            moments.of_groups("fold"),
             {g: whitening.directions @ np.array(each)[best, :, n].T for g, each in others.items()},
         )
 
@@ -362,7 +348,8 @@ class Readout:
     def by_fold(self, states: Sequence[int]) -> Array:
         """Return the mean logarithm of the left-out mean squared errors of some states, shape (folds,)."""
         log = np.log(self.left_out[:, list(states)]).mean(axis=1)
-        return np.array([log[self.folds == fold].mean() for fold in np.unique(self.folds)])
+        folds = np.array([group.fold for group in self.others])
+        return np.array([log[folds == fold].mean() for fold in np.unique(folds)])
 
     def episode_errors(self) -> Array:
         """Return the left-out mean squared errors of every episode over the squared sizes, shape (episodes, n)."""
@@ -384,10 +371,10 @@ def is_less(one: Array, other: Array, margin: float) -> bool:
     return bool(difference.mean() + margin * error < 0)
 
 
-def condition_weights(moments: Moments, whitening: Whitening) -> Array:
+def condition_weights(moments: Moments) -> Array:
     """Return weights of the groups: all alike within a condition, conditions inversely to the errors of a first fit."""
     conditions = moments.of_groups("condition")
     alike = conditions[:, None] == conditions
-    (first,) = moments.solved(whitening, np.ones(len(alike)), [ROUNDING])
-    errors = np.exp(np.log(moments.errors(first, np.arange(len(alike)))).mean(axis=1))
+    (first,) = moments.solved(np.ones(len(alike)), [ROUNDING])
+    errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
     return np.asarray(alike.sum(axis=1) / (alike @ errors))

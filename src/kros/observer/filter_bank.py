@@ -75,7 +75,7 @@ class FilterBank:
     def level(self, age: Array) -> Array:
         """Return m of every recorded state at ages, shape (..., n)."""
         ratio = age / self.half
-        return np.asarray(ratio * ratio / (1 + ratio * ratio))
+        return ratio * ratio / (1 + ratio * ratio)
 
     def times(self, columns: Array, y: Array) -> FilterBank:
         """Return the bank in other units of measure, by factors of the columns of `start` and of measurements."""
@@ -84,7 +84,7 @@ class FilterBank:
 
 def longest_age(half: Array) -> Array:
     """Return the largest ages that count when measurements return: m is then below 1 % after five time constants."""
-    return np.asarray(0.1 * np.exp(5) * half)
+    return 0.1 * np.exp(5) * half
 
 
 class Gaps:
@@ -126,7 +126,7 @@ class Gaps:
         last = x[:, : self.recorded].copy()
         last[:, self.measured] = y
         fallback, share = x[:, self.fallback], self.hidden * self.bank.level(self.age)
-        return np.asarray(self.bank.forget * (last - fallback + share * (self.offset - last + fallback)))
+        return self.bank.forget * (last - fallback + share * (self.offset - last + fallback))
 
     def follow(self, x: Array, following: Array, missing: npt.NDArray[np.bool_], moving: Any = slice(None)) -> None:
         """Blend the fallback into the next states (batch, n) and move ages, ramps and offsets on; x is of `fill`."""

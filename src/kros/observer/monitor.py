@@ -113,7 +113,7 @@ class Monitor:
     def level(self, mean_squares: Array) -> Array:
         """Return the level over the bound in dB, (...), of mean squares (..., q, bands)."""
         levels = 10 * np.log10(np.maximum(mean_squares / self.limits, QUIET))
-        return np.asarray((levels * self.weights).sum(axis=(-2, -1)) / WEIGHT)
+        return (levels * self.weights).sum(axis=(-2, -1)) / WEIGHT
 
 
 def octaves(count: int = 6, quality: float = 1.4) -> Array:

@@ -55,7 +55,7 @@ class Steps:
 
     def innovation(self, y: Array) -> Array:
         """Return ``y - C x_hat``, shape (batch, q); not finite where y is not."""
-        return np.asarray(y - self.x[:, self._measured])
+        return y - self.x[:, self._measured]
 
     def step(self, y: Array, u: Array, moving: Flags | None = None) -> None:
         """Take measurements, shape (batch, q), not finite where one is missing, and inputs, shape (batch, m)."""

@@ -85,7 +85,7 @@ class PhaseLockedLoop:
         pull = np.sum(psi * nu / self._sizes**2, axis=-1) * self._weight
         usable = (self._power > 0) & np.isfinite(pull) & ~steps.waiting
         seen = np.divide(pull, self._power, out=np.zeros_like(pull), where=usable)
-        return np.asarray(values[self.name] + self.forget * np.clip(seen, -MOST, MOST))
+        return values[self.name] + self.forget * np.clip(seen, -MOST, MOST)
 
 
 def measurement_sizes(observer: ObserverData) -> Array:

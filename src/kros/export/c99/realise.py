@@ -73,4 +73,4 @@ def _modes(A: Array, scale: Array) -> Array:
     basis = np.array([part for pair in parts for part in pair]).T
     if basis.shape != A.shape or not A.size or np.linalg.cond(basis) > RULE.alike:
         return np.diag(1 / scale)
-    return np.asarray(np.linalg.inv(basis) / scale)
+    return np.linalg.inv(basis) / scale

@@ -109,4 +109,4 @@ def start_covariance(scale: Array, R: Array, measured: Sequence[int]) -> Array:
     """Return the covariance of the first estimate: a state anywhere in its range, a measured one with noise."""
     P0 = np.diag(scale**2)
     P0[np.ix_(list(measured), list(measured))] = R
-    return np.asarray(P0)
+    return P0

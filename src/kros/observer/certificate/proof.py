@@ -174,7 +174,7 @@ def _cuts(H: Complex, t: Array, g: float) -> Array:
 def _forms(H: Complex, t: Array) -> Complex:
     """Return ``sum_j t_j h_fj' h_fj + H_z' H_z`` at every frequency."""
     weight = np.append(t, np.ones(H.shape[1] - len(t)))
-    return np.asarray(np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H))
+    return np.conj(np.swapaxes(H, 1, 2)) @ (weight[:, None] * H)
 
 
 def gain_squared(H: Complex, t: Array) -> float:

@@ -52,7 +52,7 @@ class SignalBound:
     def cover(self) -> Array:
         """Bound on the RMS error of every state over all units but those outside, shape (n,)."""
         inside = [unit not in self.outside for unit in self.units]
-        return np.asarray(self.bounds[inside].max(axis=0, initial=-np.inf if any(inside) else np.inf))
+        return self.bounds[inside].max(axis=0, initial=-np.inf if any(inside) else np.inf)
 
     @property
     def certified(self) -> bool:
@@ -63,7 +63,7 @@ class SignalBound:
     def ratios(self) -> Array:
         """Bounds over errors, shape (units, n)."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(np.where(self.errors > 0, self.bounds / self.errors, np.inf))
+            return np.where(self.errors > 0, self.bounds / self.errors, np.inf)
 
     def percent(self) -> dict[str, float | None]:
         """Return the bound by state, percent of the range; None where there is none."""
@@ -154,13 +154,13 @@ class Course:
     def mean_square(self, signal: Array) -> Array:
         """Return the mean square of every channel over every episode, shape (batch, k)."""
         inside = (np.arange(len(signal))[:, None] < self.lengths)[..., None]
-        return np.asarray(np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None])
+        return np.sum(np.where(inside, signal, 0.0) ** 2, axis=0) / self.lengths[:, None]
 
     def taken(self, observer: ObserverData) -> npt.NDArray[np.bool_]:
         """Whether the observer takes all samples, shape (batch,)."""
         samples = screened(observer, self.y, self.inputs)
         good = np.isfinite(samples.y).all(axis=-1) & (samples.u == self.inputs).all(axis=-1)
-        return np.asarray((good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0))
+        return (good | (np.arange(len(good))[:, None] >= self.lengths)).all(axis=0)
 
 
 def course(observer: ObserverData, batch: EpisodeBatch) -> Course:

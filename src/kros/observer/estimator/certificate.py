@@ -106,7 +106,7 @@ def outside_percent(readout: Readout, modelled: Lifting) -> Array:
     outside = np.array([texts[column] not in known for column in design.channels.columns])[design.bank.channel]
     rows, weight = design.sample
     added = rows[:, outside] @ readout.coefficients[outside]
-    return np.asarray(100 * np.sqrt(weight @ added**2) / design.recordings.size)
+    return 100 * np.sqrt(weight @ added**2) / design.recordings.size
 
 
 def filter_certificate(observer: ObserverData, scales: ReliftScales) -> ReliftCertificate:

@@ -80,7 +80,7 @@ class Channels:
             return v
         N, E = self.relative
         before = np.concatenate([v[:1], v[:-1]])
-        return np.asarray(v @ N.T - before @ E @ E.T)
+        return v @ N.T - before @ E @ E.T
 
     def signals(self, y: Array, u: Array, parameters: Mapping[str, npt.ArrayLike]) -> Array:
         """Return the channels of measurements (..., q) and inputs (..., m), shape (..., channels)."""

@@ -118,7 +118,7 @@ def earliest(errors: Array, half: Array, margin: float) -> npt.NDArray[np.int64]
     error = apart.std(axis=1, ddof=1) / np.sqrt(errors.shape[1]) if errors.shape[1] > 1 else 0.0
     alike = apart.mean(axis=1) <= margin * error
     least = np.where(alike, half[:, None], np.inf).min(axis=0)
-    return np.asarray(np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0))
+    return np.argmin(np.where(alike & (half[:, None] == least), mean, np.inf), axis=0)
 
 
 def blended_errors(

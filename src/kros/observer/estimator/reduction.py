@@ -52,7 +52,7 @@ class Filters:
     def along(self, v: Array) -> Array:
         """Return the estimates of signals v (n_samples, batch, channels), shape (n_samples, batch, n)."""
         z = recursion(self.A, v, v[0] @ self.S.T, self.B)
-        return np.asarray(z @ self.C.T + v @ self.D.T)
+        return z @ self.C.T + v @ self.D.T
 
 
 def reduced(readout: Readout, order: int | None = None) -> Filters:

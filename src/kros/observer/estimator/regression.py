@@ -377,4 +377,4 @@ def condition_weights(moments: Moments) -> Array:
     alike = conditions[:, None] == conditions
     (first,) = moments.solved(np.ones(len(alike)), [ROUNDING])
     errors = np.exp(np.log(moments.errors(first)).mean(axis=1))
-    return np.asarray(alike.sum(axis=1) / (alike @ errors))
+    return alike.sum(axis=1) / (alike @ errors)

@@ -120,7 +120,7 @@ class ObserverData:
             self._require("sizes seen in training", (len(self.seen.measured), len(self.seen.inputs)), (q, m))
         if self.monitor is not None:
             self._require("the monitor", self.monitor.size.shape, (q,))
-        require_measured(self.sensor, [self.lifting.states[i] for i in self.measured])
+        require_measured(self.sensor, self.outputs)
         if self.bank is not None:
             self.bank.require_fit(self.name, len(self.recorded), n, rows + columns, q)
             if K.D.any() or K.n_states:
@@ -139,9 +139,14 @@ class ObserverData:
         """Say what kind of observer it is, in a line."""
         states, own = ", ".join(self.recorded), f" + {self.internal} internal" if self.internal else ""
         functions = f", {len(self.lifting.functions)} lifted functions" if self.lifting.functions else ""
-        y = ", ".join(self.lifting.states[i] for i in self.measured)
+        y = ", ".join(self.outputs)
         correction = f"correction of order {self.controller.n_states}, {self.sample_period_s:g} s"
         return f"<Observer {self.name}: {states}{own}{functions} from {y}; {correction}>"
+
+    @property
+    def outputs(self) -> list[str]:
+        """Names of the measured states."""
+        return [self.lifting.states[i] for i in self.measured]
 
     @property
     def internal(self) -> int:

@@ -83,7 +83,6 @@ class RunningObserver:
         self.observer = observer
         self._screen, self._course = Screen.of(observer), Course(observer, 1, parameters)
         self._places = {name: i for i, name in enumerate(observer.lifting.states)}
-        self._measured = tuple(observer.lifting.states[i] for i in observer.measured)
         self._watch = None if observer.monitor is None else Watch(observer.monitor)
         self.parameters = parameters
         self.reset(y)
@@ -192,7 +191,7 @@ class RunningObserver:
     def _sample(self, y: npt.ArrayLike, u: npt.ArrayLike | None = None, held: Held | None = None) -> Screened:
         """Return a sample as the observer takes it; inputs are zero where none are known yet."""
         inputs = self.observer.inputs
-        y, u = self._shaped(y, "measurements", self._measured), np.zeros(len(inputs)) if u is None else u
+        y, u = self._shaped(y, "measurements", self.observer.outputs), np.zeros(len(inputs)) if u is None else u
         return self._screen.take(y[None, None], self._shaped(u, "inputs", inputs)[None, None], held)
 
     def _shaped(self, values: npt.ArrayLike, what: str, names: Sequence[str]) -> Array:

@@ -41,11 +41,6 @@ class Steps:
         if self.gaps is not None:
             self.gaps.begin(rows)
 
-    def place(self, x: Array, earlier: Array) -> None:
-        """Put states, shape (batch, n), and earlier values in place; corrections start at rest."""
-        self.x[...], self.x_c[...], self.past[...] = x, 0.0, earlier
-        self.fresh[:], self.waiting[:] = False, False
-
     def earlier(self, u: Array) -> Array:
         """Return the earlier values, (batch, n_earlier); after a start they equal the present ones."""
         if not self.fresh.any():
@@ -90,7 +85,7 @@ def forward(
 ) -> Array:
     """Predict states (batch, n) over the first ``count`` inputs of u (d, batch, m), without correction."""
     steps, missing = Steps(observer, len(x), values), np.full((len(x), len(observer.measured)), np.nan)
-    steps.place(x, earlier)
+    steps.x[...], steps.past[...], steps.fresh[:] = x, earlier, False
     for j, inputs in enumerate(u):
         steps.step(missing, inputs, j < count)
     return steps.x

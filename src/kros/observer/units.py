@@ -34,16 +34,17 @@ def in_sizes(observer: O, sizes: Mapping[str, float]) -> O:
     y, K = x[list(observer.measured)], observer.controller
     into = u if observer.injection is Injection.INPUT else x
     observer = in_coordinates(observer, np.diag(x))
+    by = {"seen": (y, u[: len(observer.inputs)]), "monitor": (y,), "bank": (np.concatenate([x, u]), y)}
+    parts = {name: getattr(observer, name) for name in by}
+    changed: dict[str, Any] = {name: part.times(*by[name]) for name, part in parts.items() if part is not None}
     return replace(
         observer,
         lifting=lifting,
         B=observer.B / u,
         controller=StateSpace(K.A, K.B / y, K.C * into[:, None], K.D * into[:, None] / y, K.dt),
         runtime=observer.runtime.times(x[: lifting.n_states]),
-        seen=None if observer.seen is None else observer.seen.times(y, u[: len(observer.inputs)]),
-        monitor=None if observer.monitor is None else observer.monitor.times(y),
-        bank=None if observer.bank is None else observer.bank.times(np.concatenate([x, u]), y),
-        sensor=in_units(observer.sensor, {lifting.states[i]: 1 / float(x[i]) for i in observer.measured}),
+        sensor=in_units(observer.sensor, dict(zip(observer.outputs, (1 / y).tolist(), strict=True))),
+        **changed,
     )
 
 

@@ -160,7 +160,7 @@ def _deployment(context: Context) -> dict[str, Any]:
     if not context.store.holds("observers", "deployed.json"):
         return {}
     observer = Observer.load(context.store.path("observers", "deployed.json"))
-    measured, sizes = [observer.lifting.states[i] for i in observer.measured], observer.seen
+    measured, sizes = observer.outputs, observer.seen
     largest = () if sizes is None else (*sizes.measured, *sizes.inputs)
     content = {
         "measured": measured,

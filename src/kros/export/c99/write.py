@@ -107,8 +107,9 @@ def c_files(
 def _golden(observer: Observer, source: Source, track: str | None, tolerance: float) -> dict[str, Any]:
     """Return the literals of golden vectors in the units of the recordings."""
     golden, factors = Golden.of(observer, track, tolerance=tolerance), source.factors()
-    measured = [observer.lifting.states[i] for i in observer.measured]
-    y, u, x = (np.array([factors[n] for n in names]) for names in (measured, observer.inputs, observer.recorded))
+    y, u, x = (
+        np.array([factors[n] for n in names]) for names in (observer.outputs, observer.inputs, observer.recorded)
+    )
     return {
         "y": [[_sample(v) for v in row] for row in golden.y / y],
         "u": [[_sample(v) for v in row] for row in golden.u / u],
@@ -127,7 +128,7 @@ def _manifest(observer: Observer, context: Mapping[str, Any]) -> dict[str, Any]:
         "name": context["name"],
         "precision": context["real"],
         "states": list(observer.recorded),
-        "measured": [observer.lifting.states[i] for i in observer.measured],
+        "measured": observer.outputs,
         "inputs": list(observer.inputs),
         "parameters": list(observer.lifting.parameters),
         "units_of_measure": {s["name"]: s["unit"] for s in context["signals"]},

@@ -90,9 +90,9 @@ class ReliftScales:
         Of ranges, shape (n,), one-step residuals of the population, shape (..., n), and the standard deviation of every
         measurement's noise, shape (q,).
         """
-        n, sigma = residual.shape[-1], np.atleast_1d(np.asarray(noise, dtype=float))
+        n, sigma = residual.shape[-1], np.atleast_1d(noise)
         rms = np.sqrt(np.mean(residual.reshape(-1, n) ** 2, axis=0))
-        return cls(np.asarray(ranges, dtype=float), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
+        return cls(np.asarray(ranges), rms * np.sqrt(n), sigma * np.sqrt(len(sigma)))
 
     @classmethod
     def ones(cls, observer: ObserverData) -> ReliftScales:

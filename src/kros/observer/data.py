@@ -122,14 +122,17 @@ class ObserverData:
             self._require("the monitor", self.monitor.size.shape, (q,))
         require_measured(self.sensor, self.outputs)
         if self.bank is not None:
-            self.bank.require_fit(self.name, len(self.recorded), n, rows + columns, q)
+            bank, recorded = self.bank, (len(self.recorded),)
+            shapes = bank.start.shape, bank.half.shape[-1:], bank.recovery.shape, bank.reach.shape
+            self._require("start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, (q,)))
+            self._require("the filters", (bank.filters,), (int(np.clip(bank.filters, 0, n - 2 * recorded[0])),))
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."
                 )
         if self.guard is not None:
-            shapes = tuple(bound.shape for bound in (self.guard.lower, self.guard.upper, self.guard.correction))
-            self._require("the guard of states and correction", shapes, ((n,), (n,), (K.n_states,)))
+            sizes = [len(bound) for bound in (self.guard.lower, self.guard.upper, self.guard.correction)]
+            self._require("the guard of states and correction", tuple(sizes), (n, n, K.n_states))
 
     def _require(self, what: str, shape: tuple[Any, ...], wanted: tuple[Any, ...]) -> None:
         if shape != wanted:
@@ -204,22 +207,20 @@ class ObserverData:
     ) -> dict[str, Any]:
         """Return the lifting's parameters, the observer's own where none is given; each broadcasts to `shape`."""
         known, values = self.lifting.parameters, {**self.parameters, **(parameters or {})}
-        unknown = [name for name in values if name not in known and name not in self.parameters]
-        missing = [name for name in known if values.get(name) is None]
-        wrong = [
-            name
-            for name in known
-            if name not in missing and not np.isfinite(np.asarray(values[name], dtype=float)).all()
-        ]
-        for names, what in ((unknown, "unknown"), (missing, "missing"), (wrong, "not finite")):
+        given = {name: np.asarray(values[name], dtype=float) for name in known if values.get(name) is not None}
+        problems = {
+            "unknown": [name for name in values if name not in known and name not in self.parameters],
+            "missing": [name for name in known if name not in given],
+            "not finite": [name for name, value in given.items() if not np.isfinite(value).all()],
+        }
+        for what, names in problems.items():
             if names:
                 raise ConfigError(
                     f"Running observer {self.name}: the parameter {', '.join(map(repr, names))} is {what}; its lifting "
                     f"has {', '.join(known) or 'no parameters'}."
                 )
-        for name in known if shape is not None else ():
-            found = np.shape(values[name])
-            if found not in ((), shape, (1,) * len(shape or ())):
+        for name, value in given.items() if shape is not None else ():
+            if (found := value.shape) not in ((), shape, (1,) * len(shape or ())):
                 raise DimensionError(
                     f"Running observer {self.name}: the parameter {name!r} should have shape {shape}, found {found}."
                 )

@@ -78,6 +78,11 @@ def _part(kind: Any) -> Any:
 _PARTS: dict[str, Any] = {"seen": Seen, "filter_bank": FilterBank, "guard": Guard, "monitor": Monitor}
 
 
+def _field(key: str) -> str:
+    """Return the observer's field of a part."""
+    return key.removeprefix("filter_")
+
+
 class _File(_Part):
     name: Name
     states: list[Name]
@@ -104,7 +109,7 @@ _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 def observer_content(observer: ObserverData) -> dict[str, Any]:
     """Return what the file of an observer holds, without its checksum."""
     lifting = observer.lifting
-    parts = {"seen": observer.seen, "filter_bank": observer.bank, "guard": observer.guard, "monitor": observer.monitor}
+    parts = {key: getattr(observer, _field(key)) for key in _PARTS}
     content = {
         "schema": SCHEMA,
         "kind": KIND,
@@ -174,7 +179,7 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
     shapes = {"A": (order, order), "B": (order, q), "C": (width, order), "D": (width, q)}
     A, B, C, D = (_matrix(content["controller"][key], shape, f"controller.{key}") for key, shape in shapes.items())
     given = {key: content[key] for key in _PARTS if content[key] is not None}
-    parts = {key: _PARTS[key](**{k: v for k, v in part.items() if v is not None}) for key, part in given.items()}
+    parts = {_field(k): _PARTS[k](**{f: v for f, v in part.items() if v is not None}) for k, part in given.items()}
     return ObserverData(
         content["name"],
         lifting,
@@ -189,7 +194,6 @@ def _observer(content: Mapping[str, Any]) -> ObserverData:
         Runtime.from_content(content["runtime"] or {}),
         sensor={name: Sensor.of(value, f"sensor.{name}") for name, value in content["sensor"].items()},
         about=content["about"],
-        bank=parts.pop("filter_bank", None),
         **parts,
     )
 

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.errors import DataError, DimensionError
+from ..core.errors import DataError
 from ..core.linalg import floats
 from ..core.rounding import ITERATED
 
@@ -59,17 +59,6 @@ class FilterBank:
         if not all(((v >= 0) & (v <= 1)).all() for v in (self.forget, self.recovery)):
             raise DataError(
                 f"Filter bank: forget {self.forget} and recovery {self.recovery} should be between 0 and 1."
-            )
-
-    def require_fit(self, name: str, recorded: int, n: int, columns: int, measured: int) -> None:
-        """Refuse arrays of another size than the observer's."""
-        sizes = tuple(getattr(self, name).shape for name in _ARRAYS if name != "half")
-        sizes = (*sizes[:2], self.half.shape[-1:], *sizes[2:])
-        if sizes != ((n, columns), *[(recorded,)] * 3, (measured,)) or not 0 <= self.filters <= n - 2 * recorded:
-            raise DimensionError(
-                f"Observer {name}: its filter bank should have a start {(n, columns)}, {recorded} values of forget, "
-                f"half and recovery and {measured} of reach, found {sizes}, and at most {n - 2 * recorded} filters, "
-                f"found {self.filters}."
             )
 
     def level(self, age: Array) -> Array:

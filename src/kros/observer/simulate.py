@@ -83,9 +83,8 @@ def run_innovations(
     """Return innovations, zero where a measurement is missing, and which samples a monitor judges."""
     samples = screened(observer, y, u)
     run = _run([observer], samples, parameters)[0]
-    starts = run.starts.copy()
-    starts[0] = True
-    return run.innovation, judged_samples(settle, samples.status | run.status, starts, run.moving)
+    run.starts[0] = True
+    return run.innovation, judged_samples(settle, samples.status | run.status, run.starts, run.moving)
 
 
 def _run(
@@ -344,6 +343,6 @@ def _begins(observers: Sequence[ObserverData], samples: Screened, values: Mappin
 
 def _padded(observer: ObserverData, order: int) -> Array:
     """Return the one-step map with silent controller states up to an order."""
-    n, nl, own = observer.lifting.n_states, observer.lifting.n_lifted, observer.controller.n_states
+    nl, own = observer.lifting.n_lifted, observer.controller.n_states
     step = np.insert(observer.one_step, [nl + own] * (order - own), 0.0, axis=1)
-    return np.ascontiguousarray(np.insert(step, [n + own] * (order - own), 0.0, axis=0))
+    return np.pad(step, ((0, order - own), (0, 0)))

@@ -181,7 +181,7 @@ class _Assembly:
         self.following[:n] = np.hstack([observer.A[:n, :n], np.zeros((n, self.h - n))]) + self.columns @ middle
         for row, (name, lag) in enumerate(lags[n:], n):
             self.following[row, lags.index((name, lag - 1))] = 1.0
-        self.slots, self.counted = _driven(observer, scales, self.h), _counted(scales)
+        self.slots, self.counted = _driven(observer, scales, self.h), np.flatnonzero(np.isfinite(scales.error))
         self.link = len(self.moving)
         late = self.delay * len(self.slots) + len(self.counted) if self.delay else 0
         self.sizes = (self.h + self.order + late, self.link * (self.delay + 1), n + q)
@@ -249,15 +249,11 @@ def _driven(observer: ObserverData, scales: ReliftScales, h: int) -> list[int]:
     return [i for i in range(h) if i < n - observer.internal or i >= n or scales.residual[i] > 0]
 
 
-def _counted(scales: ReliftScales) -> list[int]:
-    """Return the states whose errors count."""
-    return [int(i) for i in np.flatnonzero(np.isfinite(scales.error))]
-
-
 def state_sizes(observer: ObserverData, scales: ReliftScales, errors: Array) -> Array:
     """Return the sizes of xi, shape (n_xi,), from those of the errors, shape (n_window,)."""
     delay = observer.runtime.delay
-    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, errors[_counted(scales)]] if delay else []
+    counted = errors[: len(scales.error)][np.isfinite(scales.error)]
+    late = [*[errors[_driven(observer, scales, len(errors))]] * delay, counted] if delay else []
     return np.concatenate([errors, np.ones(observer.controller.n_states), *late])
 
 

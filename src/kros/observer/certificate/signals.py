@@ -29,7 +29,7 @@ from ..residual.one_step import one_step_residual
 from ..screen import screened
 from ..simulate import run_observer
 from .certificate import ReliftCertificate
-from .error import ErrorSystem, ReliftScales, error_system
+from .error import ErrorSystem, ReliftScales
 from .proof import proven_gain
 
 Array = npt.NDArray[np.float64]
@@ -104,7 +104,7 @@ def signal_bound(certificate: ReliftCertificate, observer: ObserverData, batch: 
         return replace(result, reason="it has no certificate at run time")
     ones = np.ones(observer.lifting.n_states), np.ones(len(observer.measured))
     scales = ReliftScales(certificate.scales.error, *ones)
-    system = error_system(observer, scales, certificate.box, certificate.parameters)
+    system = replace(certificate, scales=scales).system(observer)
     w = np.concatenate([seen.omega, seen.noise], axis=-1)
     frozen, acted = (rms(signal) for signal in frozen_response(system, w, seen.first))
     share = np.maximum(acted.max(axis=0), TINY)
@@ -167,7 +167,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
     """Return what drove an observer along episodes; recorded states stand for the true ones."""
     inputs, at, late = batch.inputs, list(observer.measured), observer.runtime.delay
     states = observer.runtime.clip_estimate(batch.states)
-    values = {**observer.parameters, **observer.own(batch.parameters)} if observer.lifting.parameters else None
+    values = {**observer.parameters, **observer.own(batch.parameters)}
     due = np.maximum(np.arange(len(states)) - late, 0)
     y = batch.states[due][..., at] if batch.shown is None else batch.measurements(at, arrived=False)
     estimates = run_observer(observer, y, inputs, values)
@@ -181,7 +181,7 @@ def course(observer: ObserverData, batch: EpisodeBatch) -> Course:
 
 
 def held_residual(
-    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike] | None
+    observer: ObserverData, states: Array, inputs: Array, parameters: Mapping[str, npt.ArrayLike]
 ) -> Array:
     """Return the one-step residual, shape (n_samples - 1, batch, n); values before the first sample equal it."""
     h = observer.lifting.history

@@ -280,18 +280,13 @@ class Moments:
         """Return the groups without units and episodes of one; if none is left in its condition, without either."""
         alike = self.of_groups("condition") == group.condition
         folds, parts = self.of_groups("fold") != group.fold, self.of_groups("part") != group.part
-        for known in (folds & parts, folds, parts):
-            if (known & alike).any():
-                return known
-        return np.ones(len(folds), dtype=bool)
+        return next(known for known in (folds & parts, folds, parts, folds | True) if (known & alike).any())
 
     def without(self, weights: Array, penalties: Sequence[float]) -> dict[Group, list[Array]]:
         """Return the coefficients that do not know a group, for every group and penalty."""
-        found: dict[bytes, list[Array]] = {}
         known = {group: self.known(group) for group in self.groups}
-        for rest in known.values():
-            if rest.tobytes() not in found:
-                found[rest.tobytes()] = list(self.solved(np.where(rest, weights, 0.0), penalties))
+        several = {rest.tobytes(): np.where(rest, weights, 0.0) for rest in known.values()}
+        found = {key: list(self.solved(rest, penalties)) for key, rest in several.items()}
         return {group: found[rest.tobytes()] for group, rest in known.items()}
 
 

@@ -125,7 +125,11 @@ class ObserverData:
             bank, recorded = self.bank, (len(self.recorded),)
             shapes = bank.start.shape, bank.half.shape[-1:], bank.recovery.shape, bank.reach.shape
             self._require("start, half, recovery and reach", shapes, ((n, rows + columns), recorded, recorded, (q,)))
-            self._require("the filters", (bank.filters,), (int(np.clip(bank.filters, 0, n - 2 * recorded[0])),))
+            if not 0 <= bank.filters <= (most := n - 2 * recorded[0]):
+                raise DimensionError(
+                    f"Observer {self.name}: its states leave at most {most} filters of measurements, found "
+                    f"{bank.filters}."
+                )
             if K.D.any() or K.n_states:
                 raise DimensionError(
                     f"Observer {self.name}: a filter bank has no correction, found one of order {K.n_states}."

@@ -167,9 +167,9 @@ class Course:
         samples = screened(self.observer, y, u, self.held)
         loops, run = library(), None
         if loops is not None and self.even(samples):
-            runs, restarted = _compiled(loops, [self], samples)
-            run = None if restarted.any() else runs[0]
-        run = stepped(self, samples) if run is None else run
+            (run,), restarted = _compiled(loops, [self], samples)
+        if run is None or restarted.any():
+            run = stepped(self, samples)
         self.observer.runtime.clip_estimate(run.estimates, out=run.estimates)
         return replace(run, status=run.status | samples.status)
 

@@ -32,7 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.lti import StateSpace
-from ...core.norms import gramian, hinf_norm
+from ...core.norms import first_frequencies, gramian, hinf_norm, to_continuous
 from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 from .error import ErrorSystem
 
@@ -45,7 +45,6 @@ Integers = npt.NDArray[Any]
 class ProofSettings:
     """How a proof is looked for; a gain that is proven is one whatever these are."""
 
-    frequencies: int = 200  # of the grid, beside those of the poles
     accuracy: float = 5e-4  # of the least squared gain on the grid
     rounds: int = 60  # of cutting planes
     cuts: int = 30  # of a round
@@ -189,17 +188,12 @@ def gain_squared(H: Complex, t: Array) -> float:
 
 
 def _responses(system: ErrorSystem) -> Complex:
-    """H at many frequencies: those of the poles and a logarithmic grid; shape (f, n_p + n_z, n_p + n_w)."""
+    """H at the frequencies at which `hinf_norm` begins; shape (f, n_p + n_z, n_p + n_w)."""
     C, D = np.vstack([system.M, system.C]), np.hstack([np.broadcast_to(system.E, 2 * (system.L.shape[1],)), system.D])
     D = np.vstack([D, np.zeros((len(system.C), D.shape[1]))])
     plant = StateSpace(system.A, np.hstack([system.L, system.B]), C, D, system.dt)
-    poles = np.log(plant.poles().astype(complex) + TINY)
-    nyquist, angle, width = 0.5 / system.dt, np.abs(poles.imag), np.abs(poles.real)
-    beside = np.maximum(angle + np.multiply.outer([-1.0, -0.5, 0.5, 1.0], width), 0.0).ravel()
-    marks = np.concatenate([angle, width, np.abs(poles), beside]) / (2 * np.pi * system.dt)
-    low = max(min(marks[marks > 0].min(initial=nyquist), nyquist) / 30, ITERATED * nyquist)
-    grid = np.geomspace(low, nyquist, SETTINGS.frequencies)
-    return plant.frequency_response(np.unique(np.concatenate([[0.0], grid, marks[marks <= nyquist]])))
+    nu = first_frequencies(to_continuous(plant).poles())
+    return plant.frequency_response(np.unique(np.append(np.arctan(nu) / (np.pi * system.dt), 0.5 / system.dt)))
 
 
 def lyapunov_factor(system: ErrorSystem, multipliers: Array, gain: float) -> Array | None:

@@ -59,15 +59,9 @@ class _Controller(_Model):
     D: Matrix
 
 
-class _Runtime(_Part):
-    delay: int = 0
-    lower: Limits | None = None
-    upper: Limits | None = None
-
-
 def _part(kind: Any) -> Any:
     """Return what the file holds of a part whose fields are numbers, arrays of them, or numbers by name."""
-    types: dict[str, Any] = {"Array": Row | Matrix, "float": float, "int": int, "Mapping[str, float]": dict[str, float]}
+    types: dict[str, Any] = {"Array": Row | Matrix, "Array | None": Limits, "float": float, "int": int}
     held: dict[str, Any] = {}
     for f in fields(kind):
         needed = f.default is MISSING and f.default_factory is MISSING
@@ -97,12 +91,11 @@ class _File(_Part):
     sample_period_s: float = Field(gt=0)
     model: _Model
     controller: _Controller
-    runtime: _Runtime | None = None
     sensor: dict[str, Any] = Field(default_factory=dict)
     about: dict[str, Any] = Field(default_factory=dict)
 
 
-_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in _PARTS.items()}
+_KINDS: dict[str, Any] = {key: (_part(kind) | None, None) for key, kind in {**_PARTS, "runtime": Runtime}.items()}
 _Whole = create_model("_Whole", __base__=_File, **_KINDS)
 
 

@@ -129,7 +129,7 @@ class Runtime:
         """Read the fields that a file holds; null stands for what is infinite."""
         ends = {name: end for name, end in (("lower", -np.inf), ("upper", np.inf)) if content.get(name)}
         limits = {name: np.nan_to_num(np.array(content[name], dtype=float), nan=end) for name, end in ends.items()}
-        return cls(content.get("delay", 0), **limits)
+        return cls(content.get("delay") or 0, **limits)
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,7 +83,7 @@ class ExtendedKalman:
     def _corrected(self, x: Array, P: Array, y: Array) -> tuple[Array, Array]:
         """Return estimate and covariance with a measurement; one of which a channel is missing is left out whole."""
         C = list(self.measured)
-        PC, nu, lost = P[..., C], y - x[..., C], ~np.isfinite(y).all(axis=-1, keepdims=True)
+        PC, nu, lost = P[..., C], y - x[..., C], np.asarray(~np.isfinite(y).all(axis=-1, keepdims=True))
         S = PC[..., C, :] + self.R
         L, nu = np.where(lost[..., None], 0.0, PC @ np.linalg.inv(S)), np.where(lost, 0.0, nu)
         return x + (L @ nu[..., None])[..., 0], P - L @ PC.swapaxes(-1, -2)

@@ -134,7 +134,7 @@ class ReliftCertificate:
         """Write ``relift.json`` and ``arrays.npz``."""
         content = {name: getattr(self, name) for name in _PLAIN}
         arrays = {name: getattr(self, name) for name in _ARRAYS}
-        arrays |= {f"scales/{name}": getattr(self.scales, name) for name in ReliftScales.__dataclass_fields__}
+        arrays |= {f"scales/{name}": value for name, value in vars(self.scales).items()}
         save_artifact(Path(folder), "relift", content, arrays)
 
     @classmethod

@@ -113,10 +113,6 @@ def identify_estimator(
     facts = {
         "channels": family,
         "filters": len(filters.A),
-        "input_filters": len(fallback.A),
-        "bank": len(readout.design.bank),
-        "singular_values": filters.singular_values[: 2 * len(filters.A)].tolist(),
-        "penalties": by_state(readout.penalties),
         "left_out_percent": {states[i]: 100 * float(errors[i]) for i in hidden},
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),

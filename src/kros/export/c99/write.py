@@ -118,7 +118,10 @@ def _golden(observer: Observer, source: Source, track: str | None, tolerance: fl
         "last": [f"{int(s)}u" for s in golden.last_status],
         "sure": [[f"{int(bits)}u" for bits in row] for row in golden.sure],
         "passes": golden.passes,
-        "tolerance": [f"{tolerance * v:.9g}" for v in golden.size / np.abs(x)],
+        "tolerance": [
+            f"{tolerance * v:.9g}"
+            for v in np.maximum(np.abs(golden.x_hat).max(axis=0), np.finfo(float).tiny) / np.abs(x)
+        ],
     }
 
 
@@ -171,7 +174,6 @@ class Golden:
     u: Array  # (n_samples, m)
     x_hat: Array  # (n_samples, n_recorded)
     status: npt.NDArray[Any]  # (n_samples,)
-    size: Array  # (n_recorded,)
     passes: int
     last_status: npt.NDArray[Any]  # (n_samples,)
     # (2, n_samples): bits of `status` and `last_status` that no change of the samples by the tolerance turns over
@@ -204,5 +206,4 @@ class Golden:
         x_hat, status = run(1.0)
         turned = (run(1 - tolerance)[1] ^ status) | (run(1 + tolerance)[1] ^ status)  # at a threshold but for rounding
         sure = ~np.stack([turned[:count], turned[-count:]])
-        size = np.maximum(np.abs(x_hat).max(axis=0), np.finfo(float).tiny)
-        return cls(y, u, x_hat, status[:count], size, passes, status[-count:], sure)
+        return cls(y, u, x_hat, status[:count], passes, status[-count:], sure)

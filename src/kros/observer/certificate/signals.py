@@ -76,11 +76,14 @@ class SignalBound:
             return {"set_certified": False, "set_reason": self.reason}
         hidden = [j for j in range(len(self.states)) if j not in measured] or list(range(len(self.states)))
         ratios = self.ratios[:, hidden]
-        ratios = ratios[np.isfinite(ratios)]
-        facts: dict[str, Any] = {"set_certified": True, "set_bound_percent": self.percent()}
-        least, most = (float(ratios.min()), float(ratios.max())) if ratios.size else (None, None)
-        ratio = {"set_bound_to_error_min": least, "set_bound_to_error_max": most}
-        return facts | ratio | {"set_outside": list(self.outside)}
+        finite = ratios[np.isfinite(ratios)].tolist()
+        return {
+            "set_certified": True,
+            "set_bound_percent": self.percent(),
+            "set_bound_to_error_min": min(finite, default=None),
+            "set_bound_to_error_max": max(finite, default=None),
+            "set_outside": list(self.outside),
+        }
 
     def in_sizes(self, factors: npt.ArrayLike) -> SignalBound:
         """Return the same for states in other units of measure, by their factors, shape (n,)."""

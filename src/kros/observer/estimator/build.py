@@ -100,8 +100,8 @@ def identify_estimator(
     smaller = (filters, readout), (fallback, blind)
     trial = observer_of(*(reduced(r.without(group), len(f.A)) for f, r in smaller))
     assert observer.bank is not None
-    observer = replace(observer, bank=with_gaps(observer.bank, trial, unseen, settings, held))
-    observer = replace(observer, runtime=bounded(observer, recordings, settings.room))
+    bank = with_gaps(observer.bank, trial, unseen, settings, held)
+    observer = replace(observer, bank=bank, runtime=bounded(observer, recordings, settings.room))
     states = lifting.states
 
     def by_state(values: Array) -> dict[str, float]:
@@ -117,7 +117,7 @@ def identify_estimator(
         "left_out_to_training": {states[i]: float(growth[i]) for i in hidden},
         "left_out_worst_percent": by_state(100 * worst),
         "outside_models_percent": by_state(outside_percent(readout, lifting)),
-        "settle_samples": settle_samples(filters, fallback, observer.bank),
+        "settle_samples": settle_samples((filters, fallback), bank.recovery),
     }
     return Identified(observer, readout, family, facts)
 
@@ -232,8 +232,8 @@ def assembled(
     )
 
 
-def settle_samples(filters: Filters, fallback: Filters, bank: FilterBank | None) -> int:
+def settle_samples(systems: Sequence[Filters], recovery: Array) -> int:
     """Return the samples after which a disturbance is below one percent: five of the slowest time constants."""
-    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in (filters, fallback)]
-    slowest = max([*poles, *(bank.recovery if bank is not None else ())])
+    poles = [float(np.abs(np.linalg.eigvals(f.A)).max(initial=0.0)) for f in systems]
+    slowest = max([*poles, *recovery])
     return int(np.ceil(-5 / np.log(slowest))) if slowest > 0 else 1

@@ -156,7 +156,7 @@ def studied(folder: Path, loop: str, spread: float, options: argparse.Namespace)
     methods = json.dumps(["paper", *SynthesisSettings().methods])
     study.write_text(
         f'[data]\nsource = "recordings"\nreader = "parquet"\n[synthesis]\nmethods = {methods}\n'
-        f"[evaluate]\nfolds = {options.folds}\nrobustness = false\n"
+        f"[evaluate]\nfolds = {options.folds}\n"
     )
     config = load_config(study, options.set)
     result = kros.run(config, folder / "run", until=Stage.LEFT_OUT, workers=options.workers, progress=Lines())

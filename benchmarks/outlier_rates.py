@@ -74,7 +74,7 @@ def header() -> str:
     return f"{alarms} | {detected}"
 
 
-def count(populations: list[dict[float, tuple[Array, Array, Array]]], form: str, rate: float) -> list[str]:
+def count(populations: list[dict[float, Array]], form: str, rate: float) -> list[str]:
     """Return false alarms without and with a planted drive, and detections at every severity."""
     good = np.array([[s.outlier for s in scored(p[0.0], form, rate).scores] for p in populations])
     bad = {s: [scored(p[s], form, rate).scores for p in populations] for s in SEVERITIES}
@@ -83,10 +83,9 @@ def count(populations: list[dict[float, tuple[Array, Array, Array]]], form: str,
     return [share(good), share(good.any(axis=1)), share(beside), *detected]
 
 
-def scored(population: tuple[Array, Array, Array], form: str, rate: float) -> OutlierModel:
+def scored(population: Array, form: str, rate: float) -> OutlierModel:
     """Score one population."""
-    G, output_scale, input_scale = population
-    return score_outliers(G, grid(), form, output_scale=output_scale, input_scale=input_scale, false_alarm_rate=rate)
+    return score_outliers(population, grid(), form, false_alarm_rate=rate)
 
 
 def share(hits: npt.NDArray[np.bool_]) -> str:
@@ -104,8 +103,8 @@ def grid() -> Array:
     return log_grid(PERIOD_S, 1000)
 
 
-def responses(factors: dict[str, Any], condition: str, kind: str) -> dict[float, tuple[Array, Array, Array]]:
-    """Return responses and ranges of the population without outlier (0) and with one of each severity."""
+def responses(factors: dict[str, Any], condition: str, kind: str) -> dict[float, Array]:
+    """Return responses of the population without outlier (0) and with one of each severity."""
     lifting = KOOPMAN if kind == "koopman" else Lifting(STATES)
     found = {}
     for k, severity in enumerate((0.0, *SEVERITIES)):
@@ -119,9 +118,7 @@ def responses(factors: dict[str, Any], condition: str, kind: str) -> dict[float,
         factor, n = both[lifting], lifting.n_lifted
         matrices = edmd(factor.R, n, alpha)
         C, D = np.broadcast_to(np.eye(n), matrices.A.shape), np.zeros(matrices.B.shape)
-        G = StateSpace(matrices.A, matrices.B, C, D, PERIOD_S).frequency_response(grid())
-        ranges = factor.peak.max(axis=0)
-        found[severity] = (G, ranges[:n], ranges[n:])
+        found[severity] = StateSpace(matrices.A, matrices.B, C, D, PERIOD_S).frequency_response(grid())
     return found
 
 

@@ -21,9 +21,7 @@ settings.load_profile("kros")
 os.environ["PYTHONWARNINGS"] = "error::RuntimeWarning"
 
 # Files that need the demo's study, which is made once for all of them, and what takes longest and begins first, that processes end together.
-DEMO = {
-    f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "report", "robustness")
-}
+DEMO = {f"tests/e2e/test_{name}.py" for name in ("demo", "edge", "faults", "field", "motor_drives", "report")}
 LONGEST = [
     "demo",
     *(

@@ -33,7 +33,6 @@ WRITTEN = "out"  # name of every output
 Damage = Callable[[Path, random.Random], None]
 QUICK = (
     "identify.refine=false",
-    "evaluate.robustness=false",
     'synthesis.methods=["residual_h2"]',
     "uncertainty.n_freqs=60",
 )

@@ -1,4 +1,4 @@
-"""Reliability of H-infinity synthesis, of mu and of infeasible mixed problems: random plants against norms that others compute.
+"""Reliability of H-infinity synthesis: random plants against norms that others compute.
 
     python benchmarks/reliability/hinf.py --count 1000
 
@@ -20,7 +20,7 @@ import numpy as np
 from campaign import Tally, main
 
 from kros.core import KrosError, StateSpace
-from kros.synthesis import GeneralizedPlant, hinf, mixed
+from kros.synthesis import GeneralizedPlant, hinf
 
 SLYCOT = importlib.util.find_spec("slycot") is not None
 LEVELS = (0.3, 0.7, 0.9, 0.98, 0.999, 1.0001, 1.002, 1.05, 2.0)
@@ -203,45 +203,6 @@ def optimum(rng: np.random.Generator, dt: float, family: str) -> Callable[[], tu
     return tried
 
 
-def constrained(rng: np.random.Generator) -> Callable[[], tuple[str, bool]]:
-    """One case of `mixed`: T22 = c + share theta K, theta an all-pass with a zero outside, so that nothing below c is within reach."""
-    c, a, share = rng.uniform(0.3, 3), rng.uniform(1.2, 5), (0.0, 1e-6, 1e-3, 1e-1)[int(rng.integers(4))]
-    feasible = rng.random() < 0.3
-    gamma = c * (rng.uniform(1.05, 2) if feasible else rng.uniform(0.3, 0.98))
-    n = int(rng.integers(1, 4))
-    A = random_dynamics(rng, n, 1.0, None)
-    A = A * (0.9 / max(np.abs(np.linalg.eigvals(A)).max(), 0.9))
-    # (z - a) / (1 - a z) = -b - b (b - a) / (z - b) with b = 1 / a
-    b = 1 / a
-    pole, gain, direct = b, -b * (b - a), -b
-    A = np.block([[A, np.zeros((n, 1))], [np.zeros((1, n)), np.array([[pole]])]])
-    B1 = np.zeros((n + 1, 3))
-    B1[:n, 0] = rng.standard_normal(n)
-    C1 = np.zeros((3, n + 1))
-    C1[0, :n], C1[2, n] = rng.standard_normal(n), share * gain
-    B2, C2 = np.append(rng.standard_normal(n), 1.0)[:, None], np.append(rng.standard_normal(n), 0.0)[None]
-    noise = np.array([[0.0, 0.3, rng.integers(0, 2) * 1.0]])
-    plant = GeneralizedPlant(
-        A, B1, B2, C1, C2, np.diag([0, 0, c]), [[0.0], [0.3], [share * direct]], noise, [[0.0]], 1.0, 2, 2
-    )
-
-    def tried() -> tuple[str, bool]:
-        try:
-            found = mixed(plant, gamma=gamma, time_limit_s=10)
-        except KrosError as error:
-            shown = "is infeasible, no controller has" in str(error)
-            if feasible:
-                return ("false claim of infeasibility", True) if shown else ("feasible, nothing found", False)
-            return (
-                ("infeasible: refused with the least within reach", False) if shown else ("infeasible: not shown", True)
-            )
-        closed = closed_loop(plant, found.controller)
-        value = norm(closed[0], closed[1][:, 2:], closed[2][2:], closed[3][2:, 2:], 1.0)
-        return ("feasible: solved", False) if value < gamma * (1 + FALSE) else ("constraint violated", True)
-
-    return tried
-
-
 def run(count: int, seed: int) -> list[Tally]:
     """Try `count` plants, and a tenth as many of the other kinds."""
     truth = (
@@ -259,11 +220,6 @@ def run(count: int, seed: int) -> list[Tally]:
         name = f"H-infinity optimum, {kind.get(family, family)}, {'discrete' if dt else 'continuous'}"
         make = partial(optimum, family=family)
         tallies.append(_tried(Tally(name, truth), make, dt, count // 8, np.random.default_rng([seed, len(tallies)])))
-    rng = np.random.default_rng([seed, len(tallies)])
-    least = Tally(
-        "Mixed synthesis, constraint within reach or not, discrete", "the least norm by interpolation at a zero"
-    )
-    tallies.append(_tried(least, lambda rng, dt: constrained(rng), 1.0, count // 10, rng))
     return tallies
 
 
@@ -277,4 +233,4 @@ def _tried(
 
 if __name__ == "__main__":
     warnings.simplefilter("error", RuntimeWarning)
-    main("hinf", "H-infinity bounds, infeasible mixed problems", run, 1000)
+    main("hinf", "H-infinity bounds", run, 1000)

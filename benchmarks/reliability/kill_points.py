@@ -39,8 +39,6 @@ n_freqs = 60
 methods = ["residual_h2"]
 [observer]
 baselines = ["open_loop", "kalman_tuned"]
-[evaluate]
-robustness = false
 """
 TIMES = {"seconds", "solve_s", "timing_s", "checksum"}  # a checksum is of the times too
 STAGES = ("simulate", "read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report")

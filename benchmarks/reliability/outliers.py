@@ -81,8 +81,6 @@ def scored(recorded: Recorded) -> OutlierModel:
         recorded.response(evidence),
         FREQS,
         unit_ids=models.unit_ids,
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
         false_alarm_rate=RATE,
     )
 

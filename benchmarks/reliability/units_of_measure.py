@@ -90,7 +90,6 @@ def study(plant: str, population: Population, factors: Factors, folder: Path, *,
             "methods": ["worst_case_h2", "residual_h2", "estimator"] if refine else ["residual_h2", "estimator"],
         },
         "sensor": {"position": {"noise": NOISE[plant] * factors.get("position", 1.0)}},
-        "evaluate": {"robustness": False},
     }
     if plant == "harmonic-drive":
         raw["calibrate"] = {"ratio": RATIO / factors.get("position", 1.0)}

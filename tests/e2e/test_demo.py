@@ -6,8 +6,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from kros.evaluate.disturb import Kind
 from kros.identify import ModelSet
+from kros.observer import Observer, run_observer
+from kros.observer.sensor_gains import sensor_gains
 from kros.plants.harmonic_drive.parameters import VELOCITY_POLE
 
 STAGES = ["read", "calibrate", "identify", "quantify", "synthesize", "evaluate", "report"]
@@ -188,18 +189,14 @@ def test_noise_is_kept_and_summarised(demo, metrics, name):
     assert (demo / "uncertainty" / name / "noise" / "noise_share.json").exists()
 
 
-def test_every_disturbance_is_told_for_the_observers_of_the_kind_that_is_handed_over(metrics):
-    rows = metrics["robustness"]
-    kind = metrics["study"]["deployed"].rpartition("/")[0]
-    observers = {r["observer"] for r in rows}
-    made = {n for n, o in metrics["observers"].items() if o.get("status") != "failed" and n.startswith(f"{kind}/")}
-    assert observers == made | {"filtered_difference", "learned"} | (
-        {"koopman/ekf"} if "koopman/ekf" in metrics["observers"] else set()
-    )
-    assert {r["disturbance"] for r in rows} == {"none", *(k.value for k in Kind)}
-    assert {r["condition"] for r in rows} == {metrics["study"]["identify_on"]}
-    for row in rows:
-        mean, worst = row["error_percent"]["mean"], row["error_percent"]["worst"]
-        assert (mean is None) == (worst is None)
-        assert mean is None or 0 < mean <= worst
-    assert {r["channel"] for r in rows if r["observer"] == "filtered_difference"} == {"velocity"}
+def test_the_report_says_what_sensor_the_deployed_observer_needs(demo, metrics):
+    """Gains are told, and that of an offset is what the filter bank of the linear lifting makes of one at rest."""
+    gains = metrics["deployment"]["sensor_gains"]["position"]
+    assert gains["noise"].keys() == gains["bias"].keys() == {"position", "velocity", "current"}
+    assert all(gains["bounded"][s] >= max(gains["noise"][s], 0.999 * gains["bias"][s]) > 0 for s in gains["noise"])
+    assert "costs 1 % of the largest value" in (demo / "report.html").read_text(encoding="utf-8")
+    observer = Observer.load(demo / "observers" / "linear" / "estimator.json")
+    offsets = np.broadcast_to([[0.0], [1e-9]], (60_000, 2, 1))
+    states = run_observer(observer, offsets, np.zeros((60_000, 2, 2)))[-1]
+    told = sensor_gains(observer, dict.fromkeys(observer.recorded, 1.0))["position"]["bias"]
+    np.testing.assert_allclose(np.abs(states[1] - states[0])[:3] / 1e-9, list(told.values()), rtol=1e-3)

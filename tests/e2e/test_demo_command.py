@@ -9,7 +9,6 @@ FAST = (
     "uncertainty.n_freqs=60",
     'synthesis.methods=["residual_h2"]',
     'observer.baselines=["open_loop", "learned"]',
-    "evaluate.robustness=false",
 )
 
 

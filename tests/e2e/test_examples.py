@@ -25,7 +25,6 @@ def test_double_pendulum(recordings, tmp_path):
         'synthesis.methods=["residual_h2"]',
         'observer.baselines=["open_loop", "learned"]',
         "uncertainty.n_freqs=100",
-        "evaluate.robustness=false",
     ]
     metrics = run_example(
         "double_pendulum", recordings, tmp_path / "run", *(part for setting in quick for part in ("--set", setting))

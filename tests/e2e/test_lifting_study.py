@@ -32,8 +32,6 @@ refine = false
 [uncertainty]
 n_freqs = 100
 
-[evaluate]
-robustness = false
 [synthesis]
 methods = ["worst_case_h2"]
 

@@ -26,7 +26,6 @@ def pendulums(kros, tmp_path_factory):
         "[identify]\nrefine = true\n"
         "[uncertainty]\nn_freqs = 200\n"
         '[synthesis]\nmethods = ["worst_case_h2"]\n'
-        "[evaluate]\nrobustness = false\n"
         '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
     )
     result = kros("run", folder / "study.toml", "--out", folder / "run", "--workers", 1)

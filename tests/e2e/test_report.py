@@ -24,7 +24,7 @@ from kros.identify import PhaseCalibration, PhaseSpec
 from kros.identify.calibration import UnitPhase
 from kros.report import plot
 from kros.report.figures import FIGURES, draw, draw_all
-from kros.report.figures.entries import beside, entry_names
+from kros.report.figures.entries import entry_names
 from kros.report.figures.recordings import phase_figure
 from kros.report.figures.synthesis import scaled_filter
 from kros.report.figures.uncertainty import published_bounds
@@ -35,6 +35,7 @@ from kros.report.run_folder import RunFolder
 from kros.study.pipeline import RunResult
 from kros.synthesis.result import Injection, Status, Synthesis
 from kros.uncertainty import Form
+from kros.uncertainty.quantify import residuals_beside_weights
 
 HOSTILE, LOST = "0<b>4", "linear_edmd/mixed"
 
@@ -235,7 +236,7 @@ def test_output_forms_of_the_paper_never_fall_below_one_and_entries_have_names(r
     assert set(bounds) == {Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE}
     assert all(np.all(bound > 1 - 1e-9) for _, bound in bounds.values())
     sizes = tuple(len(names) for names in entry_names(model.form, models))
-    assert beside(model, models).largest.shape[1:] == sizes
+    assert residuals_beside_weights(models, model).largest.shape[1:] == sizes
 
 
 def test_filter_is_scaled_by_the_ranges(run) -> None:

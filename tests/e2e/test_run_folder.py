@@ -31,7 +31,6 @@ FAST = (
     "[uncertainty]\nn_freqs = 60\n"
     '[synthesis]\nmethods = ["residual_h2"]\n'
     '[observer]\nbaselines = ["open_loop", "kalman_tuned"]\n'
-    "[evaluate]\nrobustness = false\n"
 )
 
 
@@ -235,8 +234,6 @@ def test_leftovers_are_not_believed(kros, run, pendulums, fast):
         for folder in sorted((run / kind).glob("*")) if (run / kind).is_dir() else ():
             if folder.is_dir():
                 shutil.copytree(folder, run / kind / f"{folder.name}_ghost")
-    shutil.copytree(run / "evaluation", run / "disturbed")
-    (run / "disturbed" / "disturbed.json").write_text("{")
     assert kros("report", run).exit_code == 0
     assert (run / "report.html").read_bytes() == page
     assert kros("check", run, pendulums, "--json", "--workers", 1).stdout == known.stdout

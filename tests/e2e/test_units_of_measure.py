@@ -51,7 +51,6 @@ def study(population, factors, folder, until=Stage.EVALUATE, alpha="auto"):
         "synthesis": {"methods": ["worst_case_h2", "residual_h2", "estimator"]},
         "sensor": {"position": {"noise": 4e-4 * factors[0]}},
         "estimator": {"rows": 10000},
-        "evaluate": {"robustness": False},
     }
     metrics = run_study(validate_config(raw, folder), folder / "run", until=until).metrics
     return json.loads(json.dumps(metrics)), folder / "run"

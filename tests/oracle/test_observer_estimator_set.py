@@ -58,7 +58,7 @@ def problem(form, size=0.3, seed=0, dynamic=False, **changes):
 
 def maps_of(case, observer, lifting=LIFTING):
     estimate, mean = linear_estimate(observer, lifting)
-    return estimate, case.estimate_error(estimate), case.W_p.D @ mean
+    return estimate, case.estimate_error(estimate), np.diag(1 / case.output_scale)[: case.n_original] @ mean
 
 
 def connected(case, estimate, true):

@@ -1,17 +1,15 @@
 """Mixed synthesis: the inequalities against Riccati optima and recomputed norms, on general plants and on drive-like
 observers."""
 
-import re
 from dataclasses import replace
 
 import cvxpy as cp
 import numpy as np
 import pytest
-from paper_plant import paper_plant
 from scipy.linalg import expm
 
-from kros.core import StateSpace, SynthesisError, block_diagonal, gain, h2_norm, hinf_norm
-from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, Status, h2, mixed
+from kros.core import StateSpace, block_diagonal, gain, h2_norm, hinf_norm
+from kros.synthesis import GeneralizedPlant, Injection, ObserverProblem, h2, mixed
 from kros.synthesis.mixed_norms.barrier import minimise
 from kros.synthesis.mixed_norms.inequalities import MixedInequalities, balance
 from kros.synthesis.mixed_norms.mixed import by_inequalities, scaled, truncate, verify
@@ -80,16 +78,19 @@ def free_optimum(plant):
     return found, hinf_norm(plant.uncertainty.close(found.controller))
 
 
+def at_level(plant, gamma):
+    """The plant whose constraint is one for a level gamma of channel 2."""
+    size = np.ones(plant.sizes[3])
+    size[plant.rows(2)] = 1 / gamma
+    return plant.transformed(z=np.diag(size))
+
+
 def test_inactive_constraint_gives_the_riccati_optimum():
+    """But for the margin of the Lyapunov matrix."""
     for seed in range(2):
         plant = two_channel(np.random.default_rng(seed), size2=1e-4)
         optimum, _ = free_optimum(plant)
-        found = mixed(plant)
-        assert found.status is Status.OPTIMAL
-        assert found.h2_norm == pytest.approx(optimum.h2_norm, rel=1e-9)
-        assert found.gap_percent == pytest.approx(0, abs=1e-6)
-        # The inequalities come close to it too, but for the margin of the Lyapunov matrix.
-        by_lmi = by_inequalities(plant, 1.0, 8, 60.0)
+        by_lmi = by_inequalities(plant, 60.0)
         assert optimum.h2_norm * (1 - 1e-9) <= by_lmi.h2_norm <= optimum.h2_norm * 1.01
 
 
@@ -97,13 +98,13 @@ def test_inequalities_bound_the_norms_and_agree_with_another_solver():
     plant = two_channel(np.random.default_rng(10))
     free, peak = free_optimum(plant)
     gamma = 0.9 * peak
-    balanced = balance(scaled(plant, 16.0))
-    inequalities = MixedInequalities(balanced, gamma)
+    balanced = balance(scaled(at_level(plant, gamma), 16.0))
+    inequalities = MixedInequalities(balanced)
     own = minimise(inequalities.objective(), inequalities.blocks(), inequalities.start(), rtol=1e-6)
     assert own.value == pytest.approx(by_clarabel(inequalities), rel=1e-4)
-    checked = verify(plant, inequalities.controller(own.x), gamma, "inequalities")
+    checked = verify(at_level(plant, gamma), inequalities.controller(own.x))
     assert free.h2_norm <= checked.h2_norm <= balanced.size * np.sqrt(own.value)
-    assert checked.hinf_norm < gamma
+    assert checked.hinf_norm < 1
 
 
 def by_clarabel(inequalities):
@@ -115,40 +116,6 @@ def by_clarabel(inequalities):
             value = cp.reshape(basis.reshape(len(basis), -1).T @ x, constant.shape, order="C") + constant
             constraints.append((value + value.T) / 2 >> 0)
     return cp.Problem(cp.Minimize(inequalities.objective() @ x), constraints).solve(solver="CLARABEL")
-
-
-# Seed, states, gamma, the norm that a free filter Q of up to 32 taps attains around the H2 optimum (Youla program,
-# computed once), and how many times as much one Lyapunov matrix for both channels may cost.
-SMALL = [
-    (0, 2, 0.0822, 1.636558, 1.1),
-    (1, 3, 0.076, 0.1355849, 1.15),
-    (2, 4, 0.329, 2.113431, 1.05),
-    (3, 2, 0.087, 0.4080596, 1.1),
-    (11, 4, 0.262, 2.216258, 1.05),
-    (13, 3, 0.658, 3.157932, 1.5),
-]
-
-
-@pytest.mark.parametrize(("seed", "n", "gamma", "upper", "cost"), SMALL)
-def test_between_a_lower_bound_and_a_long_filter(seed, n, gamma, upper, cost):
-    plant = two_channel(np.random.default_rng(seed), n=n)
-    free, _ = free_optimum(plant)
-    found = mixed(plant, gamma=gamma)
-    assert found.hinf_norm == pytest.approx(hinf_norm(plant.uncertainty.close(found.controller)))
-    assert found.h2_norm == pytest.approx(h2_norm(plant.performance.close(found.controller)))
-    assert found.hinf_norm < gamma
-    assert found.controller.n_states == n
-    assert found.h2_norm <= cost * upper
-    assert found.lower_bound == pytest.approx(free.h2_norm)
-    assert found.gap_percent == pytest.approx(100 * (found.h2_norm / found.lower_bound - 1))
-
-
-def test_feedthrough_is_absorbed():
-    plant = two_channel(np.random.default_rng(3), n=2)
-    gamma = 0.2
-    found = mixed(replace(plant, D22=[[0.3]]), gamma=gamma)
-    assert found.h2_norm == pytest.approx(mixed(plant, gamma=gamma).h2_norm, rel=1e-6)
-    assert found.hinf_norm < gamma
 
 
 @pytest.mark.parametrize(
@@ -168,25 +135,12 @@ def test_drive_like_observers_are_solved_and_certified(seed, order, injection):
     assert found.worst_case_h2 < certify(case, nothing)[0]
 
 
-def test_the_published_plant_itself_is_refused_with_what_it_lacks():
-    """18 states, singular: what it needs is named, and `mixed_plant` has it."""
-    case = drive_problem(0, Injection.INPUT, 5)
-    A, B, C, W_p = case.scaled
-    nominal = StateSpace(A, B, np.eye(4), np.zeros((4, 2)), DT)
-    plant = paper_plant(nominal, C, gain(W_p, DT), gain(np.eye(2), DT), case.W_L)
-    assert plant.sizes[0] == 18
-    with pytest.raises(
-        SynthesisError, match=r"A2a: D12 .*add a small correction penalty.* A2b: D21 .*add measurement noise"
-    ):
-        mixed(plant)
-
-
 def test_splitting_the_weight_differently_changes_nothing():
     """(W_L, W_R) and (W_L / c, c W_R) are the same set, and give the same observer."""
     case = drive_problem(1, Injection.INPUT, 1)
     W = case.W_L
     other = replace(case, W_L=StateSpace(W.A, W.B, W.C / 20, W.D / 20, DT), W_R=gain(20 * np.eye(2), DT))
-    one, two = mixed(case, max_states=6), mixed(other, max_states=6)
+    one, two = mixed(case), mixed(other)
     assert two.worst_case_h2 == pytest.approx(one.worst_case_h2, rel=1e-2)
 
 
@@ -222,34 +176,3 @@ def test_truncation_error_is_within_its_bound():
     )
     assert small.sizes[0] <= 8
     assert hinf_norm(difference) <= 2 * tail * hinf_norm(full) * 1.01 + 1e-9 * hinf_norm(full)
-
-
-def fixed_at(c, share):
-    """T22 = c + share theta K with theta an all-pass with a zero outside the stable region: no controller brings it
-    below c."""
-    b = 0.5
-    A, B1, C1 = np.diag([0.9, b]), np.zeros((2, 3)), np.zeros((3, 2))
-    B1[0, 0] = C1[0, 0] = 1.0
-    C1[2, 1] = -share * b * (b - 1 / b)
-    D12, D21 = [[0.0], [0.3], [-share * b]], [[0.0, 0.3, 1.0]]
-    return GeneralizedPlant(
-        A, B1, [[1.0], [1.0]], C1, [[1.0, 0.0]], np.diag([0.0, 0.0, c]), D12, D21, [[0.0]], 1.0, 2, 2
-    )
-
-
-@pytest.mark.parametrize("share", [0.0, 1e-6, 1e-2, 1.0])
-def test_a_constraint_out_of_reach_is_refused_with_what_is_within(share):
-    with pytest.raises(
-        SynthesisError, match=r"gamma = 0\.5 is infeasible, no controller has \|\|T22\|\| below 0\.(8|79999)"
-    ):
-        mixed(fixed_at(0.8, share), gamma=0.5, time_limit_s=1e4)
-    assert mixed(fixed_at(0.8, share), gamma=0.9).hinf_norm < 0.9
-
-
-def test_an_observer_whose_constraint_cannot_be_met_is_told_so():
-    # K does not enter T22 = W_R W_L
-    case = drive_problem(0, Injection.INPUT, 1)
-    least = hinf_norm(case.W_R @ case.W_L)
-    with pytest.raises(SynthesisError, match="is infeasible, no controller has") as caught:
-        mixed(case, gamma=0.6 * least, time_limit_s=1e4)
-    assert float(re.search(r"below ([0-9.e+-]+);", str(caught.value)).group(1)) == pytest.approx(least, rel=1e-4)

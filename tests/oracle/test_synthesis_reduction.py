@@ -20,7 +20,7 @@ def random_plant(rng, n=5):
 @pytest.mark.parametrize("distance", [1e-2, 1e-6, 1e-10])
 def test_root_of_the_gramian_keeps_its_digits_near_the_circle(distance):
     a, b = 1 - distance, np.array([[1.0, 0.5]])
-    R = gramian_root(np.array([[a]]), b, 1.0)
+    R = gramian_root(np.array([[a]]), b)
     exact = 1.25 / ((1 - a) * (1 + a))
     assert float(R[0] @ R[0]) == pytest.approx(exact, rel=1e-12 + 2e-16 / distance), (
         "as many digits as rounding a to a double leaves"

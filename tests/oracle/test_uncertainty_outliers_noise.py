@@ -66,7 +66,7 @@ def test_a_unit_is_not_held_against_itself() -> None:
     rng = np.random.default_rng(9)
     G = plants(rng, 12)
     G[0] *= 1.05
-    whole, others = score_outliers(G, FREQS), score_outliers(G[1:], FREQS, output_scale=[1.0, 1.0], input_scale=[1.0])
+    whole, others = score_outliers(G, FREQS), score_outliers(G[1:], FREQS)
     itself = whole.score("0", G[0], without={"0"})
     assert itself.excess_db == pytest.approx(others.score("0", G[0]).excess_db, abs=1e-6)
     assert whole.score("0", G[0]).excess_db < itself.excess_db

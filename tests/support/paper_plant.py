@@ -1,4 +1,4 @@
-r"""The published generalized plant (37)-(39) of Figure 9, and its minimal form in the error.
+r"""The published generalized plant (37)-(39) of Figure 9 in its minimal form, in the error.
 
 Three facts shape what kros does with it: it is not minimal (the copies of the plant and a static input weight drop out in
 ``e = x - x_hat``); it is singular (``D12 = 0``, ``D21 = 0``), so Riccati methods refuse it; and problem (7)-(8) is degenerate for it: ``T11 = 0``
@@ -28,50 +28,10 @@ from kros.synthesis.generalized_plant import GeneralizedPlant
 Array = npt.NDArray[Any]
 
 
-def paper_plant(
-    nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace
-) -> GeneralizedPlant:
-    """(37)-(39) with all states (x, x_hat, x_p, x_u, x_D); W_p is (p, n), W_u and W_D are (m, m)."""
-    A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
-    n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
-    k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states
-    zero = np.zeros
-    return GeneralizedPlant(
-        np.block(
-            [
-                [A, zero((n, n)), zero((n, k_p)), B @ W_u.C, B @ W_D.C],
-                [zero((n, n)), A, zero((n, k_p)), B @ W_u.C, zero((n, k_d))],
-                [W_p.B, -W_p.B, W_p.A, zero((k_p, k_u + k_d))],
-                [zero((k_u, 2 * n + k_p)), W_u.A, zero((k_u, k_d))],
-                [zero((k_d, 2 * n + k_p + k_u)), W_D.A],
-            ]
-        ),
-        np.block(
-            [
-                [B @ W_u.D, B @ W_D.D],
-                [B @ W_u.D, zero((n, m))],
-                [zero((k_p, 2 * m))],
-                [W_u.B, zero((k_u, m))],
-                [zero((k_d, m)), W_D.B],
-            ]
-        ),
-        np.vstack([zero((n, m)), B, zero((k_p + k_u + k_d, m))]),
-        np.block([[W_p.D, -W_p.D, W_p.C, zero((p, k_u + k_d))], [zero((m, 2 * n + k_p)), W_u.C, W_D.C]]),
-        np.hstack([C, -C, zero((q, k_p + k_u + k_d))]),
-        np.block([[zero((p, 2 * m))], [W_u.D, W_D.D]]),
-        zero((p + m, m)),
-        zero((q, 2 * m)),
-        zero((q, m)),
-        nominal.dt,
-        n_w1=m,
-        n_z1=p,
-    )
-
-
 def reduced_plant(
     nominal: StateSpace, C: npt.ArrayLike, W_p: StateSpace, W_u: StateSpace, W_D: StateSpace
 ) -> GeneralizedPlant:
-    """The same transfer matrices in the error, states (e, x_p, x_u, x_D): `e+ = A e + B (C^D x_D + D^D w2) - B u`."""
+    """Transfer matrices of (37)-(39) in the error, states (e, x_p, x_u, x_D): `e+ = A e + B (C^D x_D + D^D w2) - B u`."""
     A, B, C = nominal.A, nominal.B, np.asarray(C, dtype=float)
     n, m, p, q = nominal.n_states, nominal.n_inputs, W_p.n_outputs, C.shape[0]
     k_p, k_u, k_d = W_p.n_states, W_u.n_states, W_D.n_states

@@ -12,7 +12,7 @@ from batches import batch_of
 
 from kros.core.errors import DimensionError, SynthesisError
 from kros.core.lti import gain
-from kros.design.certificates import CertificateSettings, certify_model, guards_of
+from kros.design.certificates import certify_model, guards_of
 from kros.design.synthesize import choose_deployed
 from kros.design.task import Design
 from kros.lifting import Lifting
@@ -52,18 +52,18 @@ def task() -> Any:
 
 def test_slopes_without_a_bound_get_an_operating_box(task: Any, caplog: pytest.LogCaptureFixture) -> None:
     scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
-    found = certify_model(observer("square", "x**2", 0.01), scales, task, 1.5)
+    found = certify_model(observer("square", "x**2", 0.01), scales, task)
     assert found.box["x"] == (-3.0, 3.0)
     assert found.gain == pytest.approx(1 / (1 - 0.8 - 0.06), rel=5e-3)
     assert any("x in [-3, 3]" in text for text in found.assumptions)
-    steep = certify_model(observer("steep", "x**2", 0.1), scales, task, 1.5)
+    steep = certify_model(observer("steep", "x**2", 0.1), scales, task)
     assert steep.status is ReliftStatus.UNSTABLE
     assert "steep: no certificate for the nonlinear observer" in caplog.text
 
 
 def test_global_slopes_need_no_box_and_no_phase(task: Any) -> None:
     scales = ReliftScales(np.ones(1), np.ones(1), np.ones(1))
-    found = certify_model(observer("sine", "sin(x + phase)", 0.1), scales, task, 1.5)
+    found = certify_model(observer("sine", "sin(x + phase)", 0.1), scales, task)
     assert found.certified
     assert not found.box
     assert "any value of phase" in found.assumptions
@@ -92,7 +92,7 @@ def test_no_pattern_of_losses_brings_an_estimate_beyond_twice_the_largest_value(
     corrected = Observer("o", Lifting(("x", "v")), *model, K, Injection.STATE, 0.1, seen=seen)
     t = 0.1 * np.arange(300)
     batch = batch_of(np.stack([np.sin(t), np.cos(t)], axis=-1)[:, None], np.zeros((300, 1, 1)), 0.1)
-    (guard,) = guards_of([corrected], [batch], CertificateSettings())
+    (guard,) = guards_of([corrected], [batch])
     size, rng = np.abs(batch.states).max(axis=(0, 1)), np.random.default_rng(0)
     assert guard is not None
     assert (np.maximum(np.abs(guard.lower), np.abs(guard.upper)) <= 2 * size * (1 + 1e-12)).all()

@@ -5,20 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.core import ConfigError, DataError, DimensionError
+from kros.core import DataError
 from kros.data import Channel, EpisodeKey, Population, Role, Unit
-from kros.identify import Factor
-from kros.identify.refine import GaussNewton, RefineOptions, refine_population
+from kros.identify.refine import GaussNewton
 from kros.identify.refine.segments import Segments, held_segments, read_segments
-from kros.lifting import Lifting
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"horizons": ()}, {"horizons": (20, 5)}, {"segments": 0}, {"strengths": (0.0,)}, {"balance": 1.5}]
-)
-def test_options_out_of_range_are_refused(wrong: dict) -> None:
-    with pytest.raises(ConfigError, match=next(iter(wrong))):
-        RefineOptions(**wrong)
 
 
 def population(lengths: list[int]) -> tuple[Population, dict]:
@@ -70,13 +60,6 @@ def test_unit_without_training_episodes_is_named() -> None:
     made, _ = population([50])
     with pytest.raises(DataError, match="unit u has no training episode"):
         read_segments(made, {"u": ()}, 5, 2, 0)
-
-
-def test_factors_of_another_size_are_refused() -> None:
-    made, keys = population([50, 50])
-    wrong = Factor(np.zeros((1, 4, 4)), np.ones((1, 2)), np.array([98]))
-    with pytest.raises(DimensionError, match="episode_factors"):
-        refine_population(made, keys, Lifting(("x",)), {}, wrong)
 
 
 def test_search_stays_within_the_constraint_and_finds_both_minima() -> None:

@@ -7,7 +7,7 @@ from kros.core.errors import ConfigError, DataError, DimensionError, Identificat
 from kros.core.lti import StateSpace
 from kros.data import Channel, EpisodeBatch, EpisodeKey, Role, from_arrays
 from kros.identify import combine, edmd, free_run
-from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation, require_independent
+from kros.identify.factors import Factor, lifted_factor, reduce_episode, require_excitation
 from kros.lifting import Lifting
 from kros.observer import Observer, run_observer
 from kros.synthesis import Injection
@@ -230,10 +230,3 @@ def test_what_recordings_do_not_show_is_named(caplog):
     silent = Factor.stack([reduce_episode(x, u * [1.0, 0.0], lifting)] * 2)
     with pytest.raises(IdentificationError, match="declare it as another role"):
         require_excitation(silent, INPUTS, ("a", "b"), "load", alpha=1.0)
-    lifted = lifted_factor(factor, lifting, {}, lifting)
-    with pytest.raises(IdentificationError, match=r"unit a \(load\): '3\*position\*\*2 \+ current' follows from"):
-        require_independent(lifted, lifting.names + INPUTS, ("a", "b"), "load")
-    good = Lifting(STATES, ("position**2",))
-    require_independent(
-        lifted_factor(Factor.stack([reduce_episode(x, u, good)]), good, {}, good), good.names + INPUTS, ("a",), "load"
-    )

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from kros.report.content import Column, build
-from kros.report.disturbances import doublings
 from kros.report.error_tables import error_tables
 from kros.report.facts import Facts
 from kros.report.sections.errors import errors
@@ -136,19 +135,6 @@ def test_the_best_certified_observer_is_one_that_was_designed() -> None:
     signals = {**metrics()["observers"], NAME: {"set_certified": True}}
     first = errors(Facts(metrics(observers=signals, evaluation=rows))).tables[0]
     assert first.rows[first.chosen[0]][0].note.startswith("deployed and best with a certificate")
-
-
-def test_an_error_doubles_where_it_was_tried() -> None:
-    tried = [("none", 0.0, 1.0), ("noise", 1e-3, 2.0), ("dropped", 0.1, 1.5), ("delay", 1, 9.0)]
-    shared = {"observer": NAME, "condition": "default", "channel": "velocity"}
-    rows = [{**shared, "disturbance": k, "severity": s, "error_percent": {"mean": e}} for k, s, e in tried]
-    found = doublings(Facts(metrics(robustness=rows)))
-    assert {kind.value: text for kind, text in found[NAME].items()} == {
-        "noise": "0.10",
-        "delay": "< 1.0",
-        "dropped": "> 10",
-    }
-    assert doublings(Facts(metrics())) == {}
 
 
 def test_tables_leave_out_what_is_not_known() -> None:

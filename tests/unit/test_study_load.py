@@ -11,7 +11,7 @@ from kros.data.survey import RecordingFacts
 from kros.lifting import Lifting
 from kros.observer import Observer
 from kros.plants import HarmonicDrivePopulation
-from kros.report.figures.disturbed import load_torque
+from kros.report.figures.load import load_torque
 from kros.study.config import LoadConfig
 from kros.study.engine.store import Store
 from kros.study.stages.load import load_metrics, run_load

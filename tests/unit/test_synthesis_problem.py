@@ -44,14 +44,14 @@ def uncertain(models):
 
 
 def test_nothing_is_left_out(models, uncertain):
-    case = ObserverProblem.from_uncertain(models, uncertain, [1e-3], injection=Injection.INPUT, correction_penalty=1e-2)
+    case = ObserverProblem.from_uncertain(models, uncertain, [1e-3])
     assert uncertain.remainder is not None
     assert case.remainder_left is uncertain.remainder.left
     assert case.remainder_right is uncertain.remainder.right
     assert (case.W_L, case.W_R, case.form) == (uncertain.weight.left, uncertain.weight.right, uncertain.form)
     assert np.array_equal(case.nominal.A, models.A[uncertain.nominal])
     assert np.array_equal(case.C, [[1.0, 0.0, 0.0]])
-    assert (case.n_original, case.injection, case.correction_penalty) == (2, Injection.INPUT, 1e-2)
+    assert (case.n_original, case.injection) == (2, Injection.STATE)
     assert np.array_equal(case.output_scale, models.output_scale)
 
 

@@ -61,7 +61,7 @@ def test_order_of_units_and_units_of_measure_do_not_matter() -> None:
     order = np.random.default_rng(0).permutation(8)
     shuffled = score_outliers(G[order], FREQS)
     out, into = np.array([10.0, 1e-3, 7.0]), np.array([100.0, 0.2])
-    scaled = score_outliers(G * out[:, None] / into, FREQS, output_scale=out, input_scale=into)
+    scaled = score_outliers(G * out[:, None] / into, FREQS)
     reference = np.array([s.score_db for s in plain.scores])
     np.testing.assert_allclose([s.score_db for s in shuffled.scores], reference[order], atol=1e-9)
     np.testing.assert_allclose([s.score_db for s in scaled.scores], reference, atol=1e-6)
@@ -69,8 +69,7 @@ def test_order_of_units_and_units_of_measure_do_not_matter() -> None:
 
 def test_new_units_are_scored_against_a_stored_population(tmp_path: Path) -> None:
     G = responses(13, 4, outlier=True)
-    out = np.array([1.0, 5.0, 2.0])
-    score_outliers(G[:11], FREQS, output_scale=out).save(tmp_path)
+    score_outliers(G[:11], FREQS).save(tmp_path)
     model = OutlierModel.load(tmp_path)
     rows = np.searchsorted(FREQS, model.freqs_hz)
     good, bad = model.score("new", G[11][rows]), model.score("loose", G[12][rows])
@@ -111,8 +110,6 @@ def test_bad_input_is_refused() -> None:
         score_outliers(G[0], FREQS)
     with pytest.raises(DimensionError, match="'c' has the shape"):
         score_outliers([G[0], G[1], G[2, :, :2]], FREQS, unit_ids=("a", "b", "c"))
-    with pytest.raises(DimensionError, match="positive numbers"):
-        score_outliers(G, FREQS, output_scale=[1.0, 0.0, 1.0])
     with pytest.raises(ConfigError, match="form"):
         score_outliers(G, FREQS, "sideways")
     broken = G.copy()

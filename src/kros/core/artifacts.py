@@ -183,21 +183,6 @@ def loader(load: Callable[[Any, Any], T]) -> Callable[[Any, Any], T]:
     return guarded
 
 
-def check_shapes(
-    arrays: Mapping[str, np.ndarray], axes: Mapping[str, str], sizes: Mapping[str, int], path: Path
-) -> None:
-    """Check arrays against named axes, a letter each."""
-    known = dict(sizes)
-    for name, letters in axes.items():
-        shape, dtype = arrays[name].shape, arrays[name].dtype
-        if len(shape) == len(letters):
-            known = dict(zip(letters, shape, strict=True)) | known
-        if dtype.kind not in "biufc" or shape != tuple(known[letter] for letter in letters if letter in known):
-            expected = tuple(known.get(letter, letter) for letter in letters)
-            wanted = f"{name} should hold numbers of shape {expected}"
-            raise DataError(f"Reading {path}: {wanted}, found {dtype} of shape {shape}.")
-
-
 MANIFEST, INDEX = "manifest.json", "artefact.json"
 Described = tuple[str, int, int]  # SHA-256, size in bytes, time of the last change in ns
 

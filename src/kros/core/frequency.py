@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .errors import ConfigError
+from .rounding import ROUNDING
 
 Array = npt.NDArray[np.float64]
 
@@ -47,7 +48,7 @@ def check_grid(freqs_hz: npt.ArrayLike, sample_period_s: float | None) -> Array:
     if np.any(np.diff(freqs) <= 0) or freqs[0] < 0 or (sample_period_s is None and freqs[-1] == 0):
         problem = f"frequencies should increase from zero or above, found {freqs[:5]} ... {freqs[-1]} Hz"
         raise ConfigError(f"Frequency grid: {problem}; sort them and drop doubles.")
-    if freqs[-1] > top * (1 + 1e-12):
+    if freqs[-1] > top * (1 + ROUNDING):
         limit = f"the Nyquist frequency {top} Hz of the sampling period {sample_period_s} s"
         raise ConfigError(f"Frequency grid: {freqs[-1]} Hz is above {limit}; end the grid there.")
     return freqs
@@ -65,5 +66,5 @@ def bilinear_squared(freqs_hz: npt.ArrayLike, sample_period_s: float) -> Array:
     """Return tau = tan^2(theta / 2); infinity at Nyquist, and full relative precision near DC."""
     freqs = np.asarray(freqs_hz, dtype=float)
     half = np.pi * freqs * sample_period_s
-    at_top = np.abs(freqs * sample_period_s - 0.5) <= 1e-12
+    at_top = np.abs(freqs * sample_period_s - 0.5) <= ROUNDING
     return np.where(at_top, np.inf, np.tan(np.where(at_top, 0.0, half)) ** 2)

@@ -121,7 +121,7 @@ class StateSpace:
 
     def poles(self) -> Array:
         """Return the eigenvalues of A, shape (..., n)."""
-        return np.linalg.eigvals(self.A) if self.n_states else np.zeros(self.A.shape[:-1], complex)
+        return np.linalg.eigvals(self.A)
 
     def spectral_radius(self) -> Array:
         """Return the largest pole magnitude, shape (...); zero without states."""

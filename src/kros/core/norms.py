@@ -26,11 +26,11 @@ from .errors import DimensionError, KrosError
 from .linalg import balanced_size, qr_triangle
 from .lti import StateSpace
 from .precise import precise_gain, precise_h2_norm
+from .rounding import AGREED, EPS, ITERATED
 
 Array = npt.NDArray[Any]
 
 _MAX_ITERATIONS = 60
-_EPSILON = float(np.finfo(float).eps)
 _AGREE = 1e-7  # relative difference of what should be equal, beyond which double precision is not trusted
 
 
@@ -55,26 +55,23 @@ def gramian(A: Array, B: Array, dt: float) -> Array:
     for _ in range(_MAX_ITERATIONS):
         step = power @ P @ power.T
         P = P + step
-        if np.all(np.diag(step) <= _EPSILON * np.diag(P)):  # state by state, in whatever units of measure
+        if np.all(np.diag(step) <= EPS * np.diag(P)):  # state by state, in whatever units of measure
             break
         power = power @ power
     return (P + P.T) / 2
 
 
-def gramian_root(A: Array, B: Array, dt: float) -> Array:
-    """Return R with ``R R'`` the controllability Gramian of a stable pair, shape (n, at most n) in discrete time.
+def gramian_root(A: Array, B: Array) -> Array:
+    """Return R with ``R R'`` the controllability Gramian of a stable discrete pair, shape (n, at most n).
 
-    Discrete time: ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor, ``R_2k`` is the triangle of
+    ``P = sum_k A^k B B' A'^k`` is summed by doubling on its factor, ``R_2k`` is the triangle of
     ``[R_k, A^k R_k]``. Poles near one cost a few more doublings and no accuracy.
     """
-    if dt == 0:
-        values, vectors = np.linalg.eigh(gramian(A, B, dt))
-        return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
     power, R = A, qr_triangle(B.T).T
     for _ in range(_MAX_ITERATIONS):
         step = power @ R
         R = qr_triangle(np.hstack([R, step]).T).T
-        if np.all(np.abs(step).max(axis=1, initial=0.0) <= _EPSILON * np.abs(R).max(axis=1, initial=0.0)):
+        if np.all(np.abs(step).max(axis=1, initial=0.0) <= EPS * np.abs(R).max(axis=1, initial=0.0)):
             break
         power = power @ power
     return R
@@ -119,7 +116,7 @@ def _near_the_limit(system: StateSpace) -> bool:
     """Whether rounding, ``eps ||A||``, decides if a pole of a balanced system is stable."""
     poles = system.poles()
     distance = np.abs(1 - np.abs(poles)) if system.dt > 0 else np.abs(poles.real)
-    return bool((distance <= 10 * _EPSILON * np.linalg.norm(system.A)).any())
+    return bool((distance <= 10 * EPS * np.linalg.norm(system.A)).any())
 
 
 def balanced(system: StateSpace) -> StateSpace:
@@ -128,7 +125,7 @@ def balanced(system: StateSpace) -> StateSpace:
     return StateSpace(system.A * size / size[:, None], system.B / size[:, None], system.C * size, system.D, system.dt)
 
 
-def hinf_norm(system: Any, tol: float = 1e-6) -> float:
+def hinf_norm(system: Any, tol: float = AGREED) -> float:
     r"""H-infinity norm (3)-(4): largest gain over all frequencies.
 
     The level :math:`\gamma` is attained exactly where the Hamiltonian matrix of the bounded-real lemma has eigenvalues
@@ -200,17 +197,17 @@ def _largest(system: StateSpace, nu: Array) -> tuple[float, float]:
 
 def _peak(system: StateSpace, nu: Array) -> tuple[float, float]:
     """Return the mapped frequency of the largest gain and that gain, searched for around the largest of those given."""
+    from scipy.optimize import minimize_scalar
+
     nu = np.unique(nu)
     gains = _gains(system, nu)
     best = int(np.argmax(gains))
-    at, most, low, high = nu[best], gains[best], nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
-    while high - low > 1e-9 * high:
-        inside = np.linspace(low, high, 12)
-        gains = _gains(system, inside)
-        best = int(np.argmax(gains))
-        at, most = max((inside[best], gains[best]), (at, most), key=lambda pair: pair[1])
-        low, high = inside[max(best - 1, 0)], inside[min(best + 1, 11)]
-    return float(at), float(most)
+    bounds = nu[max(best - 1, 0)], nu[min(best + 1, len(nu) - 1)]
+    options = {"xatol": ITERATED * bounds[1]}
+    peak = minimize_scalar(
+        lambda at: -_gains(system, np.array([at]))[0], bounds=bounds, method="bounded", options=options
+    )
+    return max((float(peak.x), float(-peak.fun)), (float(nu[best]), float(gains[best])), key=lambda pair: pair[1])
 
 
 def _in_hz(system: StateSpace, nu: Any) -> Any:
@@ -232,7 +229,7 @@ def _rounding(system: StateSpace, nu: float) -> float:
     eye = np.eye(system.n_states)
     R = np.linalg.inv(z * eye - system.A)
     inside = np.abs(system.C @ R) @ (np.abs(z) * eye + np.abs(system.A)) @ np.abs(R @ system.B)
-    return float(_EPSILON * np.linalg.norm(inside, 2))
+    return float(EPS * np.linalg.norm(inside, 2))
 
 
 def first_frequencies(poles: Array) -> Array:
@@ -256,7 +253,7 @@ def crossings(system: StateSpace, gamma: float) -> Array:
     Q = C.T @ C + C.T @ D @ F[:, :n]
     H = np.block([[closed, gamma * (B @ F[:, n:])], [-Q / gamma, -closed.T]])
     eigenvalues = np.linalg.eigvals(H)
-    axis = np.maximum(1e-3 * np.abs(eigenvalues), 100 * _EPSILON * np.linalg.norm(H))
+    axis = np.maximum(1e-3 * np.abs(eigenvalues), 100 * EPS * np.linalg.norm(H))
     near = eigenvalues[(np.abs(eigenvalues.real) <= axis) & (eigenvalues.imag >= 0)]
     points = np.unique(np.concatenate([[0.0], near.imag]))
     between = np.concatenate([(points[1:] + points[:-1]) / 2, np.sqrt(points[1:] * points[:-1])])

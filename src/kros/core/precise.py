@@ -8,6 +8,7 @@ import numpy as np
 
 from .errors import SynthesisError
 from .lti import StateSpace
+from .rounding import ITERATED
 
 DIGITS, MOST_DIGITS, MOST_STATES = 40, 160, 60
 
@@ -23,7 +24,7 @@ def precise_h2_norm(system: StateSpace) -> float:
     while digits <= MOST_DIGITS:
         with mpmath.workdps(digits):
             norm = _h2_norm(mpmath, system)
-        if before is not None and (norm == before or abs(norm - before) <= 1e-9 * abs(norm)):
+        if before is not None and (norm == before or abs(norm - before) <= ITERATED * abs(norm)):
             return norm
         before, digits = norm, 2 * digits
     problem = f"no two results agree with up to {MOST_DIGITS} digits"

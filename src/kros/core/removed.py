@@ -18,7 +18,7 @@ Noise is declared with the sensor, for example [sensor.position] noise = 1e-6; m
 Keys for details of a method are no longer part of a study; remove the key, or call the function of the stage in Python.
     uncertainty: structure nominal max_order tolerance_db false_alarm_rate lifting: parameters calibrate: settle_s
     identify: margin largest_residual alpha_factor synthesis: set injection max_states tune input_weight penalty
-    time_limit_s evaluate: monte_carlo robustness=all observer: false_alarm_rate load: angle_rad memories condition
+    time_limit_s evaluate: monte_carlo observer: false_alarm_rate load: angle_rad memories condition
     angle current limit level_s
 Limits, requirements and dropped units are no longer part of a study; remove the key, see metrics.json and data.exclude.
     limits require require: robust no_outliers uncertainty: drop_outliers
@@ -91,6 +91,8 @@ The residual-shaped observer is no longer a public function; use kros.synthesize
     kros.synthesis: ResidualProblem residual_h2
 The start and the gaps of an observer are no longer a public class; kros.synthesize makes them, observers hold them.
     kros.observer: FilterBank
+Undeclared disturbances are no longer simulated; remove the key, and see sensor_gains under deployment in metrics.json.
+    evaluate: robustness
 Parts of the evaluation are no longer public; a study computes them, error_percent and unit_interval remain.
     kros.evaluate: Kind error_rms error_spectrum next_unit_bound true_errors
 """

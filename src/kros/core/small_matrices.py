@@ -62,8 +62,3 @@ def sigma_max_first(matrices: Array) -> Array:
     second = squared(columns[:, 1]).sum(axis=0)
     cross = np.einsum("i...,i...->...", np.conj(columns[:, 0]), columns[:, 1])
     return np.sqrt((first + second) / 2 + np.sqrt((first - second) ** 2 / 4 + squared(cross)))
-
-
-def pseudo_inverse_first(matrices: Array) -> Array:
-    """Return pseudo-inverses, entries first, of matrices (..., p, m)."""
-    return entries_first(np.linalg.pinv(matrices))

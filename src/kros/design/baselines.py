@@ -10,7 +10,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.errors import ConfigError, DataError, SynthesisError
-from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..evaluate import error_percent
 from ..identify import ModelSet
@@ -20,7 +19,7 @@ from ..observer.baselines.extended_kalman import ExtendedKalman, start_covarianc
 from ..observer.baselines.kalman import like_measurement_noise
 from ..observer.baselines.learned import Moments, Ridge
 from ..observer.residual.one_step import one_step_covariance, one_step_residual
-from ..observer.screen import Screen, Screened
+from ..observer.screen import Screen
 from ..observer.sensor import delay_of
 from .validation import TrainingSet, rank
 
@@ -55,49 +54,24 @@ class Baseline:
     measured: tuple[int, ...]
     estimated: tuple[int, ...]
     facts: dict[str, Any]
-    restarts: bool = True
     limits: tuple[Array, Array] | None = None
     seen: Seen | None = None
 
-    def run(self, batch: EpisodeBatch, parameters: Parameters) -> Array:
-        """Estimate all episodes, each with the estimator of its unit; NaN for states that are not estimated."""
-        return self.estimate(batch.keys, batch.measurements(self.measured), batch.inputs, parameters)
-
     def estimate(self, keys: Sequence[EpisodeKey], y: Array, u: Array, parameters: Parameters) -> Array:
-        """Estimate episodes from measurements and inputs, shape (n_samples, batch, q) and (..., m), NaN where lost."""
+        """Estimate episodes, each with the estimator of its unit; NaN for states that are not estimated."""
         units: dict[str, list[int]] = {}
         for i, key in enumerate(keys):
             units.setdefault(key.unit if key.unit in self.by_unit else "", []).append(i)
         samples, parts = Screen.sized(self.seen, y.shape[-1], u.shape[-1]).take(y, u), list[Array]()
         for unit, rows in units.items():
             values = {k: v[rows] for k, v in parameters.items()}
-            estimator, some = self.by_unit[unit], samples.of(rows)
-            if self.restarts:
-                parts.append(restarted(estimator, some, values))
-            else:
-                parts.append(estimator.run(some.y, some.u, values))
+            some = samples.of(rows)
+            parts.append(self.by_unit[unit].run(some.y, some.u, values))
         estimate = np.concatenate(parts, axis=1)[:, np.argsort(np.concatenate(list(units.values())))]
         return estimate if self.limits is None else np.clip(estimate, *self.limits)
 
 
-def restarted(estimator: Estimator, samples: Screened, parameters: Mapping[str, npt.ArrayLike]) -> Array:
-    """Run a batch, every member again from each sample at which it starts again."""
-    n_samples, batch = samples.starts.shape
-    estimate = estimator.run(samples.y, samples.u, parameters)
-    for begin in np.flatnonzero(samples.starts[1:].any(axis=1)) + 1:
-        members = np.flatnonzero(samples.starts[begin])
-        again = samples.starts[begin + 1 :, members]
-        lasts = np.where(again.any(axis=0), begin + 1 + again.argmax(axis=0), n_samples - 1) if len(again) else begin
-        rows = slice(begin, int(np.max(lasts)) + 1)
-        part = {name: np.broadcast_to(np.asarray(v, dtype=float), (batch,))[members] for name, v in parameters.items()}
-        y, u = samples.y[rows, members], samples.u[rows, members]
-        estimate[begin + 1 : rows.stop, members] = estimator.run(y, u, part)[1:]
-    return estimate
-
-
-def make_extended(
-    training: TrainingSet, models: ModelSet, unit: str, noise: Array, settings: BaselineSettings = DEFAULT
-) -> Baseline:
+def make_extended(training: TrainingSet, models: ModelSet, unit: str, noise: Array) -> Baseline:
     """Tune the extended Kalman filter of a nominal model: process noise of many sizes, all run side by side."""
     batch, lifting, n = training.read(), models.lifting, models.lifting.n_states
     row, C, R = models.index(unit), list(models.measured), np.diag(noise**2)
@@ -110,20 +84,20 @@ def make_extended(
         models.B[row],
         models.measured,
         models.recorded_inputs,
-        np.stack([10**level * shape for level in settings.levels]),
+        np.stack([10**level * shape for level in DEFAULT.levels]),
         R,
         start_covariance(models.output_scale[:n], R, models.measured),
         {name: float(v[row]) for name, v in models.parameters.items()},
         delay_of(training.sensor),
     )
-    short = batch.head(settings.extended_samples)
+    short = batch.head(DEFAULT.extended_samples)
     estimates = filters.run_all(short.measurements(models.measured), short.inputs, short.parameters)
     percents = [error_percent(estimate, short.states, short.lengths).mean(axis=0) for estimate in estimates]
     bounded = [np.where(np.isfinite(p), p, np.inf) for p in percents]
     first = min(range(len(bounded)), key=lambda i: rank(bounded[i], np.full(n, 100.0), models.measured))
     if not np.isfinite(bounded[first]).all():
         raise SynthesisError("Extended Kalman filter: every candidate diverges on the training episodes.")
-    facts = {"status": "tuned", "process_noise_level": 10 ** settings.levels[first]}
+    facts = {"status": "tuned", "process_noise_level": 10 ** DEFAULT.levels[first]}
     tuned = {"": replace(filters, Q=filters.Q[first])}
     return Baseline(tuned, models.measured, tuple(range(n)), facts, seen=training.seen)
 
@@ -196,28 +170,26 @@ def make_mean_profile(
     measured: tuple[int, ...],
     population: Population,
     keys: Iterable[EpisodeKey],
-    settings: BaselineSettings = DEFAULT,
 ) -> Baseline:
     """Average the states of training episodes that have the same motions, over units, and without each unit."""
-    n, same = len(population.states), settings.same_motion
+    n, same = len(population.states), DEFAULT.same_motion
     estimated = tuple(i for i in range(n) if i not in measured)
     if not population.inputs or not estimated:
         raise DataError("Mean profile: it needs inputs that identify a motion, and a state that is not measured.")
     motions = different_motions(population, keys, same)
-    means, closest, episodes = unit_means(training, list(motions.values()), estimated, same)
-    for key, of_units, apart in zip(motions, means, closest, strict=True):
+    means = unit_means(training, list(motions.values()), estimated, same)
+    for key, of_units in zip(motions, means, strict=True):
         if len(of_units) < 2:
             reason = f"the inputs of held-out {key} do not occur in training episodes of two units"
-            distance = f"{100 * apart:.3g} % of the largest (RMS), at most {100 * same:g} % is allowed"
-            raise DataError(f"Mean profile: {reason}; the nearest inputs differ by {distance}.")
+            raise DataError(f"Mean profile: {reason}; they may differ by {100 * same:g} % of the largest (RMS).")
 
     def without(left_out: str) -> MeanProfile:
         states = [np.mean([p for unit, p in of_units.items() if unit != left_out], axis=0) for of_units in means]
         return MeanProfile(n, estimated, list(motions.values()), states)
 
     by_unit = {unit: without(unit) for unit in (*dict.fromkeys(unit for one in means for unit in one), "")}
-    facts = {"status": "averaged", "motions": len(motions), "episodes": episodes, "left_out": "the unit under test"}
-    return Baseline(by_unit, measured, estimated, facts, restarts=False, seen=training.seen)
+    facts = {"status": "averaged", "motions": len(motions), "left_out": "the unit under test"}
+    return Baseline(by_unit, measured, estimated, facts, seen=training.seen)
 
 
 def different_motions(population: Population, keys: Iterable[EpisodeKey], same: float) -> dict[EpisodeKey, Array]:
@@ -233,16 +205,14 @@ def different_motions(population: Population, keys: Iterable[EpisodeKey], same: 
 
 def unit_means(
     training: TrainingSet, motions: Sequence[Array], estimated: Sequence[int], same: float
-) -> tuple[list[dict[str, Array]], Array, int]:
-    """Return the mean states of every motion by unit, how near inputs came to it, and the episodes that were used."""
-    sizes, closest, used = largest_of(motions), np.full(len(motions), np.inf), 0
+) -> list[dict[str, Array]]:
+    """Return the mean states of every motion by unit."""
+    sizes = largest_of(motions)
     profiles: list[dict[str, list[Array]]] = [{} for _ in motions]
     for part in training.one_by_one():
         apart = np.array([difference(motion, part.inputs[:, 0], sizes) for motion in motions])
-        closest, at = np.minimum(closest, apart), int(apart.argmin())
+        at = int(apart.argmin())
         if apart[at] <= same:
             states = held(part.states[:, 0, list(estimated)], len(motions[at]))
             profiles[at].setdefault(part.units[0], []).append(states)
-            used += 1
-    means = [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]
-    return means, closest, used
+    return [{unit: np.asarray(np.mean(some, axis=0)) for unit, some in one.items()} for one in profiles]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,11 +28,10 @@ from ..observer.simulate import run_observers
 from ..observer.units import factors
 from ..synthesis import ObserverProblem
 from ..synthesis.worst_case.certificate import attained, certify_errors
-from ..synthesis.worst_case.unit_check import unit_ratios
 from ..uncertainty import UncertainModel
 from .monitor import settling
 from .task import Design, DesignTask
-from .validation import hidden_mean, percent_of
+from .validation import TRAINING, hidden_mean, percent_of
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -50,17 +49,32 @@ class CertificateSettings:
 
 
 DEFAULT = CertificateSettings()
+Parts = tuple[Guard | None, ReliftCertificate, SignalBound]
 
 
-def certify(task: DesignTask, designs: Sequence[Design], settings: CertificateSettings = DEFAULT) -> list[Design]:
+def certify(task: DesignTask, designs: Sequence[Design]) -> list[Design]:
     """Certify observers of one lifting; return them with guards and facts, certificates in the recordings' units."""
-    batches = certified_on(task, settings)
-    if designs[0].observer.bank is not None:
-        return [_certified_filters(design, batches, task, settings) for design in designs]
-    return _certified_models(designs, batches, task, settings)
+    batches, observers = certified_on(task), [design.observer for design in designs]
+    bank = observers[0].bank is not None
+    parts = (
+        [_filter_parts(design, batches[0], task) for design in designs]
+        if bank
+        else _model_parts(observers, batches, task)
+    )
+    growth = [design.facts.get("left_out_to_training", {}) for design in designs]
+    by = np.array([[of.get(name, 1.0) for name in observers[0].recorded] for of in growth])
+    errors = hidden_error_percent(observers, batches, by), loss_error_percent(observers, batches[0])
+    certified = []
+    for design, (guard, certificate, bound), *percents in zip(
+        designs, parts, *map(np.ndarray.tolist, errors), strict=True
+    ):
+        facts = {**design.facts, **_facts(certificate, bound, design.observer.measured, percents)}
+        observer = replace(design.observer, guard=guard)
+        certified.append(replace(design, observer=observer, certificate=certificate, facts=facts))
+    return certified
 
 
-def certified_on(task: DesignTask, settings: CertificateSettings) -> list[EpisodeBatch]:
+def certified_on(task: DesignTask) -> list[EpisodeBatch]:
     """Return the starts of the first episodes of units, all of short ones, and the same of other conditions."""
     home, units = ({getattr(k, name) for k in task.training.keys} for name in ("condition", "unit"))
     others: dict[str, list[EpisodeKey]] = {}
@@ -68,56 +82,38 @@ def certified_on(task: DesignTask, settings: CertificateSettings) -> list[Episod
         others.setdefault(key.condition, []).append(key)
     batches = []
     for training in (task.training, *(replace(task.recordings, keys=tuple(keys)) for keys in others.values())):
-        first = training.first_of_units().read().head(settings.samples)
-        batches.append(first if len(first.states) > training.settings.short else training.read())
+        first = training.first_of_units().read().head(DEFAULT.samples)
+        batches.append(first if len(first.states) > TRAINING.short else training.read())
     return batches
 
 
-def _certified_models(
-    designs: Sequence[Design], batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
-) -> list[Design]:
-    """Certify corrected models, which run side by side."""
-    observers, batch, certified = [design.observer for design in designs], batches[0], []
-    guards, scales = guards_of(observers, batches, settings), scales_of(observers, batch, task)
-    errors = np.stack(
-        [hidden_error_percent(observers, batches), loss_error_percent(observers, batch, settings)], axis=1
-    )
-    for design, guard, scale, (hidden, lost) in zip(designs, guards, scales, errors.tolist(), strict=True):
-        observer = design.observer
-        certificate = certify_model(observer, scale, task, settings.box)
-        bound = signal_bound(certificate, observer, batch).in_sizes(factors(observer, {})[0][: len(observer.recorded)])
-        certificate = certificate.in_sizes(observer, {})
-        facts = {**design.facts, **_facts(certificate, bound, observer.measured, (hidden, lost))}
-        certified.append(replace(design, observer=replace(observer, guard=guard), certificate=certificate, facts=facts))
-    return certified
+def _model_parts(observers: Sequence[Observer], batches: Sequence[EpisodeBatch], task: DesignTask) -> Iterator[Parts]:
+    """Yield guards, certificates and bounds of corrected models, which run side by side."""
+    guards, scales = guards_of(observers, batches), scales_of(observers, batches[0], task)
+    for observer, guard, scale in zip(observers, guards, scales, strict=True):
+        certificate = certify_model(observer, scale, task)
+        bound = signal_bound(certificate, observer, batches[0])
+        by = factors(observer, {})[0][: len(observer.recorded)]
+        yield guard, certificate.in_sizes(observer, {}), bound.in_sizes(by)
 
 
-def _certified_filters(
-    design: Design, batches: Sequence[EpisodeBatch], task: DesignTask, settings: CertificateSettings
-) -> Design:
-    """Certify a filter bank; its errors in training are raised to those on units that were left out."""
-    observer, batch = design.observer, batches[0]
-    n, measured = len(observer.recorded), observer.measured
-    estimates = run_observer(observer, batch.measurements(measured), batch.inputs, observer.own(batch.parameters))
+def _filter_parts(design: Design, batch: EpisodeBatch, task: DesignTask) -> Parts:
+    """Return guard, certificate and bound of a filter bank."""
+    observer = design.observer
+    n, at = len(observer.recorded), list(observer.measured)
+    estimates = run_observer(observer, batch.measurements(at), batch.inputs, observer.own(batch.parameters))
     square = error_rms(estimates[..., :n], batch.states, batch.lengths) ** 2
     units = list(dict.fromkeys(batch.units))
     errors = np.sqrt([square[[u == unit for u in batch.units]].mean(axis=0) for unit in units])
     sizes, by = task.models.output_scale[:n], factors(observer, {})[0]
-    scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(measured)))
-    growth = design.facts["left_out_to_training"]
-    left_out = np.array([growth.get(name, 1.0) for name in observer.recorded])
-    hidden = float(hidden_error_percent([observer], batches, left_out)[0])
-    lost = float(loss_error_percent([observer], batch, settings)[0])
-    certificate = filter_certificate(observer, scales)
-    scales = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[list(measured)])
-    certificate = replace(certificate, scales=scales)
-    bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"]).in_sizes(by[:n])
-    facts = _facts(certificate, bound, measured, (hidden, lost))
-    return replace(design, certificate=certificate, facts={**design.facts, **facts})
+    scales = ReliftScales(sizes, np.sqrt(n * square.mean(axis=0)), task.noise * np.sqrt(len(at)))
+    recorded = ReliftScales(scales.error * by[:n], scales.residual * by[:n], scales.noise * by[at])
+    bound = left_out_bound(observer, sizes, units, errors, design.facts["left_out_worst_percent"])
+    return observer.guard, replace(filter_certificate(observer, scales), scales=recorded), bound.in_sizes(by[:n])
 
 
 def _facts(
-    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: tuple[float, float]
+    certificate: ReliftCertificate, bound: SignalBound, measured: Sequence[int], errors: Sequence[float]
 ) -> dict[str, Any]:
     """Return what the metrics say of certificates, and of errors in training, where measurements are lost too."""
     facts: dict[str, Any] = {"relift_certified": certificate.certified, "relift_gain": certificate.gain}
@@ -128,10 +124,8 @@ def _facts(
     return facts if certificate.certified else facts | {"relift_reason": certificate.reason}
 
 
-def hidden_error_percent(
-    observers: Sequence[Observer], batches: Sequence[EpisodeBatch], by: float | Array = 1.0
-) -> Array:
-    """Return the mean error of hidden states over conditions, (observer,); errors are multiplied by factors, (n,)."""
+def hidden_error_percent(observers: Sequence[Observer], batches: Sequence[EpisodeBatch], by: Array) -> Array:
+    """Return the mean error of hidden states over conditions, (observer,), errors times factors, (observer, n)."""
     percents = [percent_of(observers, batch) * by for batch in batches]
     logs = [np.log(hidden_mean(percent, observers[0].measured)) for percent in percents]
     return np.asarray(np.exp(np.mean(logs, axis=0)))
@@ -145,9 +139,9 @@ def scales_of(observers: Sequence[Observer], batch: EpisodeBatch, task: DesignTa
     return [ReliftScales.typical(sizes, residual, task.noise) for residual in residuals]
 
 
-def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, settings: CertificateSettings) -> Array:
+def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     """Return the largest error in percent of the largest value where measurements are lost, shape (observer,)."""
-    rows, first = np.arange(settings.losses) % len(batch.keys), observers[0]
+    rows, first = np.arange(DEFAULT.losses) % len(batch.keys), observers[0]
     some = batch.take(rows.tolist()).head(int(batch.lengths[rows].min()))
     y, x = some.measurements(first.measured), some.states
     lost = losses(np.random.default_rng(0), len(y), len(rows))
@@ -159,13 +153,13 @@ def loss_error_percent(observers: Sequence[Observer], batch: EpisodeBatch, setti
     return np.where(np.isfinite(errors), 100 * errors, np.inf)
 
 
-def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, size: float) -> ReliftCertificate:
+def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask) -> ReliftCertificate:
     """Certify one observer everywhere, or in an operating box where slopes have no global bound."""
     certificate, models = relift_certificate(observer, scales=scales), task.models
     if certificate.status is ReliftStatus.UNBOUNDED:
         ranges = dict(zip(models.lifting.states, models.output_scale, strict=False))
         ranges |= dict(zip(models.recorded_inputs, models.input_scale, strict=False))
-        box = {name: (-size * value, size * value) for name, value in ranges.items()}
+        box = {name: (-DEFAULT.box * value, DEFAULT.box * value) for name, value in ranges.items()}
         values = {name: (float(np.min(v)), float(np.max(v))) for name, v in models.parameters.items()}
         certificate = relift_certificate(observer, box, scales, values)
     if not certificate.certified:
@@ -173,18 +167,16 @@ def certify_model(observer: Observer, scales: ReliftScales, task: DesignTask, si
     return certificate
 
 
-def guards_of(
-    observers: Sequence[Observer], batches: Sequence[EpisodeBatch], settings: CertificateSettings
-) -> list[Guard | None]:
+def guards_of(observers: Sequence[Observer], batches: Sequence[EpisodeBatch]) -> list[Guard | None]:
     """Return guards: bounds of all states from estimates and recordings in training, from the first sample and amid."""
     extents = [_extents(observers, batch, first) for batch in batches for first in (0, len(batch.states) // 2)]
     low, high, size, corrections = zip(*extents, strict=True)
-    least, most, largest = np.min(low, axis=0), np.max(high, axis=0), settings.largest * np.max(size, axis=0)
-    room = settings.room * np.maximum(most - least, np.finfo(float).tiny)
+    least, most, largest = np.min(low, axis=0), np.max(high, axis=0), DEFAULT.largest * np.max(size, axis=0)
+    room = DEFAULT.room * np.maximum(most - least, np.finfo(float).tiny)
     least = np.maximum(least - room, np.minimum(least, -largest))
     most = np.minimum(most + room, np.maximum(most, largest))
     of_corrections = [np.max(one, axis=0) for one in zip(*corrections, strict=True)]
-    return [_guard(*one, settings) for one in zip(observers, least, most, of_corrections, strict=True)]
+    return [_guard(*one) for one in zip(observers, least, most, of_corrections, strict=True)]
 
 
 def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> tuple[Array, Array, Array, list[Array]]:
@@ -207,15 +199,13 @@ def _extents(observers: Sequence[Observer], batch: EpisodeBatch, first: int) -> 
     return low, high, np.maximum(np.abs(least), np.abs(most)), corrections
 
 
-def _guard(
-    observer: Observer, low: Array, high: Array, correction: Array, settings: CertificateSettings
-) -> Guard | None:
+def _guard(observer: Observer, low: Array, high: Array, correction: Array) -> Guard | None:
     """Return the guard of one observer, None where it diverges; estimates may be what measurements may be."""
     if not all(np.isfinite(side).all() for side in (low, high, correction)):
         return None
     at, q, screen = list(observer.measured), len(observer.measured), Screen.of(observer)
     low[at], high[at] = np.minimum(low[at], screen.least[:q]), np.maximum(high[at], screen.most[:q])
-    correction = (1 + 2 * settings.room) * np.maximum(correction, np.finfo(float).tiny)
+    correction = (1 + 2 * DEFAULT.room) * np.maximum(correction, np.finfo(float).tiny)
     return Guard(low, high, correction, settling(observer))
 
 
@@ -231,7 +221,7 @@ def usable_problem(models: ModelSet, uncertain: UncertainModel, noise: Array) ->
 
 
 def certificate(task: DesignTask, design: Design, problem: ObserverProblem | None) -> dict[str, Any]:
-    """Return what holds for an observer on every member of the set, and whether it holds for every unit's model."""
+    """Return what holds for an observer on every member of the set."""
     observer = design.observer
     order = observer.controller.n_states + observer.lifting.n_states - len(observer.recorded)
     facts: dict[str, Any] = {"order": order, "spectral_radius_max": None, "worst_case_h2": None}
@@ -245,9 +235,7 @@ def certificate(task: DesignTask, design: Design, problem: ObserverProblem | Non
         errors, mean = error_maps(task, design, problem)
         facts["spectral_radius_max"] = float(max(errors.spectral_radius(), task.models.spectral_radius().max()))
         bound = certify_errors(problem, errors, mean)[0]
-        if observer.bank is None:
-            facts |= of_units(task, design, problem)
-        else:
+        if observer.bank is not None:
             facts["constant_h2"] = float(np.linalg.norm(mean))
             facts["worst_case_h2_attained"] = attained(problem, errors, mean)
             require_useful(problem, observer, bound)
@@ -272,14 +260,4 @@ def error_maps(task: DesignTask, design: Design, problem: ObserverProblem) -> tu
     if design.observer.bank is None:
         return problem.error_system(design.synthesis.controller), np.zeros(1)
     estimate, mean = linear_estimate(design.observer, task.models.lifting, design.facts["outside_models_percent"])
-    weight = problem.performance.frequency_response([0.0])[0].real
-    return problem.estimate_error(estimate), weight @ (mean / problem.output_scale)
-
-
-def of_units(task: DesignTask, design: Design, problem: ObserverProblem) -> dict[str, Any]:
-    """Return whether the bound holds for the models of all units."""
-    ratios = unit_ratios(problem, design.synthesis.controller, task.models.systems(task.covered))
-    of_norm, of_density = (float(ratio.max(initial=0.0)) for ratio in ratios)
-    if of_norm > 1:
-        log.warning("%s: the error of a unit's model is %.3g times its certified bound", task.name, of_norm)
-    return {"bound_holds": of_norm <= 1, "unit_to_h2_bound_max": of_norm, "unit_to_density_max": of_density}
+    return problem.estimate_error(estimate), problem.scaled[3] @ (mean / problem.output_scale)

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, product
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -63,7 +62,11 @@ def fit_monitor(
     if len(units) < LEAST_SCORES:
         log.info("%s has no monitor: it needs %d units, found %d.", observer.name, LEAST_SCORES, len(units))
         return None
-    size = np.sqrt(np.mean([np.mean(np.minimum(nu[judged] ** 2, 1e300), axis=0) for nu, judged in every], axis=0))
+    size = np.sqrt(
+        np.mean(
+            [np.mean(np.minimum(nu[judged] ** 2, np.sqrt(np.finfo(float).max)), axis=0) for nu, judged in every], axis=0
+        )
+    )
     if not np.isfinite(size).all() or np.any(size <= 0):
         return None
     filters = octaves()
@@ -87,14 +90,13 @@ def _groups(training: TrainingSet, settings: MonitorSettings) -> Iterator[tuple[
     units = set(spread(list(dict.fromkeys(unit for unit, _ in groups)), settings.units))
     for unit, condition in (group for group in groups if group[0] in units):
         keys = [key for key in training.keys if (key.unit, key.condition) == (unit, condition)]
-        parts: dict[str, Any] = {"population": training.population.select([unit], [condition])}
-        parts |= {"parameters": {unit: training.parameters.get(unit, {})}}
-        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), **parts)
+        population = training.population.select([unit], [condition])
+        yield (unit, condition), replace(training, keys=tuple(spread(keys, settings.episodes)), population=population)
 
 
 def _judged(observer: Observer, training: TrainingSet, settle: int) -> list[Judged]:
     """Run the observer on episodes as the sensor shows them, and return those in which something is judged."""
-    batch = training.read_whole()
+    batch = training.read(None)
     y = batch.measurements(observer.measured)
     nu, judged = run_innovations(observer, y, batch.inputs, observer.own(batch.parameters), settle)
     episodes = [(nu[:n, i].copy(), judged[:n, i].copy()) for i, n in enumerate(batch.lengths)]

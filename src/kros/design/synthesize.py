@@ -49,7 +49,10 @@ class DeploymentSettings:
     diverged: float = 300.0  # percent of the largest value, of the largest error where measurements are lost
 
 
-@dataclass(frozen=True, eq=False, repr=False)
+DEPLOYMENT = DeploymentSettings()
+
+
+@dataclass(frozen=True, eq=False)
 class Designs:
     """All observers of a population."""
 
@@ -63,9 +66,6 @@ class Designs:
         """What the metrics say of every observer, designed or not."""
         failed = {name: {"status": "failed", "reason": reason} for name, reason in self.failed.items()}
         return {name: failed.get(name) or dict(self.designs[name].facts) for name in self.order}
-
-    def __repr__(self) -> str:
-        return f"<Designs: {', '.join(self.designs)}; deployed is {self.deployed}>"
 
 
 def synthesize(
@@ -253,14 +253,14 @@ def certified(
     return final
 
 
-def choose_deployed(designs: Sequence[Design], rule: DeploymentSettings | None = None) -> str:
+def choose_deployed(designs: Sequence[Design]) -> str:
     """Return the most accurate observer with all certificates that tolerates dropouts."""
-    rule, errors = rule or DeploymentSettings(), {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
+    errors = {d.name: float(d.facts["hidden_error_percent"]) for d in designs}
     bounded = [d for d in designs if d.certificate and d.certificate.certified and np.isfinite(errors[d.name])]
     safe = [d for d in bounded if d.certified] or bounded
-    candidates = [d for d in safe if d.facts["loss_error_percent"] < rule.diverged] or safe
+    candidates = [d for d in safe if d.facts["loss_error_percent"] < DEPLOYMENT.diverged] or safe
     least = min((errors[d.name] for d in candidates), default=np.inf)
-    good = [d.name for d in candidates if errors[d.name] <= rule.as_good * least]
+    good = [d.name for d in candidates if errors[d.name] <= DEPLOYMENT.as_good * least]
     best = preferred(good or [d.name for d in designs])
     if best is None:
         raise SynthesisError("No observer could be designed; see the reasons above.")

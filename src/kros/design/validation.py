@@ -14,16 +14,15 @@ from ..data import EpisodeBatch
 from ..data.population import EpisodeKey, Population
 from ..data.prepare import scale_population
 from ..evaluate.errors import error_rms
+from ..evaluate.held_out import observers_run
 from ..evaluate.sensor import as_shown
 from ..identify import ModelSet
 from ..identify.identified import IdentifiedModels
 from ..observer import Observer, Seen
 from ..observer.sensor import Sensors, in_units
-from ..observer.simulate import run_observers
 
 Array = npt.NDArray[np.float64]
 T = TypeVar("T")
-SIDE_BY_SIDE = 20  # observers, which keeps a study of twelve units below 200 MB
 
 
 @dataclass(frozen=True)
@@ -36,6 +35,9 @@ class TrainingSettings:
     short: int = 2_000  # samples below which more episodes take part
 
 
+TRAINING = TrainingSettings()
+
+
 @dataclass(frozen=True, eq=False)
 class TrainingSet:
     """Training episodes of some units, as the sensor shows them, with each unit's lifting parameters."""
@@ -45,42 +47,28 @@ class TrainingSet:
     parameters: dict[str, dict[str, float]]
     seen: Seen | None = None  # sizes in all training episodes
     sensor: Sensors = field(default_factory=dict)
-    settings: TrainingSettings = field(default_factory=TrainingSettings)
 
     @classmethod
     def of(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
         """Take some of the first units, and of each some episodes from the first to the last."""
-        facts, settings = identified.facts, TrainingSettings()
-        units = [u for u in facts.pooled if u in models.unit_ids][: settings.units]
-        episodes = [facts.keys("train", u, facts.identify_on) for u in units]
-        recorded = bool(episodes and episodes[0])
-        length = len(identified.population.read(episodes[0][0])) if recorded else settings.short
-        count = settings.episodes * max(1, round(settings.short / length))
-        return cls._of(identified, models, units, [k for keys in episodes for k in spread(keys, count)], sensor)
+        whole, home = cls.whole(identified, models, sensor), identified.facts.identify_on
+        parameters = dict(list(whole.parameters.items())[: TRAINING.units])
+        episodes = [[k for k in whole.keys if (k.unit, k.condition) == (unit, home)] for unit in parameters]
+        count = TRAINING.episodes * max(1, round(TRAINING.short / len(whole.population.read(episodes[0][0]))))
+        keys = tuple(k for of_unit in episodes for k in spread(of_unit, count))
+        return replace(whole, keys=keys, parameters=parameters, population=whole.population.select(list(parameters)))
 
     @classmethod
     def whole(cls, identified: IdentifiedModels, models: ModelSet, sensor: Sensors | None = None) -> TrainingSet:
         """Take all training episodes of pooled units, one of every unit and condition before the second of any."""
         facts = identified.facts
-        units = [u for u in facts.pooled if u in models.unit_ids]
+        parameters = {u: identified.parameters[u] for u in facts.pooled if u in models.unit_ids}
         groups: dict[tuple[str, str], list[EpisodeKey]] = {}
-        for key in (key for unit in units for key in facts.keys("train", unit)):
+        for key in (key for unit in parameters for key in facts.keys("train", unit)):
             groups.setdefault((key.unit, key.condition), []).append(key)
-        keys = [k for turn in zip_longest(*groups.values()) for k in turn if k is not None]
-        return cls._of(identified, models, units, keys, sensor)
-
-    @classmethod
-    def _of(
-        cls,
-        identified: IdentifiedModels,
-        models: ModelSet,
-        units: Sequence[str],
-        keys: Sequence[EpisodeKey],
-        sensor: Sensors | None,
-    ) -> TrainingSet:
-        parameters = {u: identified.parameters[u] for u in units}
-        seen = seen_by(identified, models.measured)
-        return cls(identified.population.select(units), tuple(keys), parameters, seen, sensor or {})
+        keys = tuple(k for turn in zip_longest(*groups.values()) for k in turn if k is not None)
+        population, seen = identified.population.select(list(parameters)), seen_by(identified, models.measured)
+        return cls(population, keys, parameters, seen, sensor or {})
 
     def normalised(self, models: ModelSet) -> TrainingSet:
         """Return the same in channels divided by the ranges of models."""
@@ -94,13 +82,9 @@ class TrainingSet:
         firsts = {key.unit: key for key in reversed(self.keys)}
         return replace(self, keys=tuple(key for key in self.keys if firsts[key.unit] == key))
 
-    def read(self) -> EpisodeBatch:
-        """Read the episodes, cut short."""
-        return self._shown(self.keys, self.settings.samples)
-
-    def read_whole(self) -> EpisodeBatch:
-        """Read the episodes."""
-        return self._shown(self.keys)
+    def read(self, most: int | None = TRAINING.samples) -> EpisodeBatch:
+        """Read the episodes, cut short, or whole with None."""
+        return self._shown(self.keys, most)
 
     def read_one(self, key: EpisodeKey) -> EpisodeBatch:
         """Read an episode, whole, without the bias: its size is declared, and its sign cannot be learned."""
@@ -119,9 +103,8 @@ class TrainingSet:
 
 def percent_of(observers: Sequence[Observer], batch: EpisodeBatch) -> Array:
     """Return the errors of observers of one model of every recorded state, shape (observer, n), see `compare`."""
-    values, y = observers[0].own(batch.parameters), batch.measurements(observers[0].measured)
-    parts = (observers[start : start + SIDE_BY_SIDE] for start in range(0, len(observers), SIDE_BY_SIDE))
-    return np.concatenate([compare(run_observers(some, y, batch.inputs, values), batch) for some in parts])
+    run, y = observers_run(observers), batch.measurements(observers[0].measured)
+    return np.concatenate([compare(some, batch) for some in run(batch.keys, y, batch.inputs, batch.parameters)])
 
 
 def compare(estimates: Iterable[Array], batch: EpisodeBatch) -> Array:

@@ -1,4 +1,4 @@
-"""Evaluation: errors and spectra of estimates and free runs against recordings, also of disturbed ones.
+"""Evaluation: errors and spectra of estimates and free runs against recordings.
 
 Examples
 --------

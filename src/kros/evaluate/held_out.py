@@ -1,4 +1,4 @@
-"""Errors of observers, baselines and models on held-out episodes, disturbed or not, and trajectories for figures."""
+"""Errors of observers, baselines and models on held-out episodes, and trajectories for figures."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from ..identify import ModelSet, free_run
 from ..observer import Observer
 from ..observer.sensor import Sensors
 from ..observer.simulate import run_observers
-from .disturb import Disturbance, Run, disturbed_errors
 from .errors import ErrorSummary, summarise
 from .sensor import as_shown
 from .truth import TrueErrors, true_errors
 
 Array = npt.NDArray[np.float64]
+Run = Callable[[Sequence[EpisodeKey], Array, Array, Mapping[str, Array]], Iterable[Array]]
 SIDE_BY_SIDE = 32  # episodes
 _NUMBERS = 4_000_000  # of estimates that are in memory, 32 MB: memory of that size is used again
 
@@ -38,15 +38,10 @@ def observers_run(observers: Sequence[Observer]) -> Run:
 
 def alike(observers: Iterable[Observer], together: int = 8) -> list[list[Observer]]:
     """Return observers in groups that can run side by side: of one lifting, parameters, measured states and inputs."""
-    groups: list[tuple[Any, list[Observer]]] = []
-    for observer in observers:
-        model = observer.lifting, dict(observer.parameters), observer.measured, observer.inputs
-        group = next((g for of, g in groups if len(g) < together and of == model), None)
-        if group is None:
-            groups.append((model, [observer]))
-        else:
-            group.append(observer)
-    return [group for _, group in groups]
+    groups: dict[Any, list[Observer]] = {}
+    for o in observers:
+        groups.setdefault((o.lifting, tuple(o.parameters.items()), o.measured, o.inputs), []).append(o)
+    return [g[start : start + together] for g in groups.values() for start in range(0, len(g), together)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +53,6 @@ class Outcome:
     true: TrueErrors | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     estimated: tuple[int, ...] | None = None  # states; all by default
-    disturbed: Array | None = None
 
     @classmethod
     def joined(cls, parts: Sequence[Outcome], order: Sequence[int]) -> Outcome:
@@ -113,9 +107,9 @@ class HeldOut:
         places = [order.index(i) for i in self.shown]
         return [Outcome.joined(parts, places) for parts in zip(*blocks, strict=True)]
 
-    def read(self, keys: Sequence[EpisodeKey], truths: bool = False, samples: int | None = None) -> EpisodeBatch:
-        """Read episodes as the sensor shows them, each at most some samples long."""
-        batch = EpisodeBatch.read(self.population, keys, samples, self.parameters, truths)
+    def read(self, keys: Sequence[EpisodeKey], truths: bool = False) -> EpisodeBatch:
+        """Read episodes as the sensor shows them."""
+        batch = EpisodeBatch.read(self.population, keys, None, self.parameters, truths)
         batch = as_shown(batch, self.sensor, self.population.states)
         states = np.ascontiguousarray(batch.states.swapaxes(1, 2)).swapaxes(1, 2)  # in memory as estimates are
         return replace(batch, states=states)
@@ -177,23 +171,3 @@ def _true_entry(true: TrueErrors | None, episodes: Sequence[int], state: int) ->
         return {}
     at = true.states.index(state)
     return {f"true_{what}": float(v[episodes, at].mean()) for what, v in vars(true).items() if what != "states"}
-
-
-@dataclass(frozen=True, eq=False)
-class Trial:
-    """The first held-out episodes of a few units, on which measurements are disturbed."""
-
-    episodes: HeldOut
-    measured: tuple[int, ...]
-    disturbances: tuple[Disturbance, ...]
-    kind: str  # of the models whose observers run
-    samples: int = 3_000  # of an episode, at most
-
-    def errors(self, run: Run) -> list[Array]:
-        """Return the errors of estimators, each of shape (1 + disturbance, episode, n)."""
-        batch = self.episodes.read(self.episodes.keys, samples=self.samples)
-        return disturbed_errors(batch, self.measured, self.disturbances, run)
-
-    def of_observers(self, observers: Sequence[Observer]) -> list[Array]:
-        """Return the errors of observers that `alike` puts together."""
-        return self.errors(observers_run(observers))

@@ -15,6 +15,7 @@ from ..core.errors import DataError
 
 Array = npt.NDArray[np.float64]
 Row = Mapping[str, Any]
+_CELL = ("observer", "condition", "channel")
 
 
 def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tuple[Array, Array]:
@@ -55,18 +56,14 @@ def unit_interval(values: npt.ArrayLike, draws: int = 4000, seed: int = 0) -> tu
 
 def interval_rows(rows: Sequence[Row], role: str = "off_nominal") -> list[dict[str, Any]]:
     """Return the 95 % ``interval`` of the mean error over at least three units, by observer, condition and channel."""
-    errors: dict[tuple[str, str, str], dict[str, Any]] = {}
+    errors: dict[tuple[str, ...], dict[str, Any]] = {}
     for row in (row for row in rows if row["role"] == role):
-        cell = (row["observer"], row["condition"], row["channel"])
-        errors.setdefault(cell, {})[row["unit"]] = row["error_percent"]
-    alike: dict[tuple[str, ...], list[tuple[str, str, str]]] = {}
-    for cell, by_unit in errors.items():
-        if len(by_unit) > 2 and all(value is not None and np.isfinite(value) for value in by_unit.values()):
-            alike.setdefault(tuple(sorted(by_unit)), []).append(cell)
+        errors.setdefault(tuple(row[name] for name in _CELL), {})[row["unit"]] = row["error_percent"]
     intervals = []
-    for units, cells in alike.items():
-        ends = np.transpose(unit_interval([[float(errors[cell][unit]) for cell in cells] for unit in units]))
-        for cell, interval in zip(cells, ends.tolist(), strict=True):
-            place = dict(zip(("observer", "condition", "channel"), cell, strict=True))
-            intervals.append({**place, "role": role, "interval": interval})
+    for cell, by_unit in errors.items():
+        values = [by_unit[unit] for unit in sorted(by_unit)]
+        if len(values) > 2 and all(value is not None and np.isfinite(value) for value in values):
+            lower, upper = unit_interval(values)
+            interval = [float(lower), float(upper)]
+            intervals.append({**dict(zip(_CELL, cell, strict=True)), "role": role, "interval": interval})
     return intervals

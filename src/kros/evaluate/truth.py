@@ -47,29 +47,21 @@ def true_errors(
 
 def delay_samples(signals: Array, truths: Array, longest: int = 200) -> Array:
     """Return the delay of truths, at most `longest`, that fits signals best; a parabola refines the least cost."""
-    from scipy.fft import irfft, next_fast_len, rfft
+    from scipy.signal import fftconvolve
 
     n = len(signals)
     most = min(longest, n // 4)
-    found = np.full(signals.shape[1:], np.nan)
-    y, x = (np.moveaxis(a, 0, -1).reshape(-1, n) for a in (signals, truths))
-    usable = np.isfinite(y).all(axis=-1) & (np.ptp(x, axis=-1) > 0)
-    if most < 1 or not usable.any():
-        return found
-    y, x = (a[usable] - x[usable].mean(axis=-1, keepdims=True) for a in (y, x))
-    inside = y.copy()
-    inside[:, :most] = inside[:, n - most :] = 0.0
-    size = next_fast_len(n, real=True)
-    common = irfft(rfft(inside, size) * rfft(x, size).conj(), size)[:, np.arange(-most, most + 1)]
-    energy = np.cumsum(np.pad(x**2, ((0, 0), (1, 0))), axis=-1)
-    begin = most - np.arange(-most, most + 1)
-    cost = energy[:, begin + n - 2 * most] - energy[:, begin] - 2 * common
-    best = cost.argmin(axis=-1)
-    middle = np.clip(best, 1, 2 * most - 1)
-    left, least, right = (np.take_along_axis(cost, (middle + side)[:, None], axis=-1)[:, 0] for side in (-1, 0, 1))
-    bend = left - 2 * least + right
+    if most < 1:
+        return np.full(signals.shape[1:], np.nan)
     with np.errstate(divide="ignore", invalid="ignore"):
-        delay = np.where((best == middle) & (bend > 0), middle - most + 0.5 * (left - right) / bend, np.nan)
-    flat = found.reshape(-1)
-    flat[usable.reshape(-1)] = delay
-    return flat.reshape(found.shape)
+        y, x = (values - truths.mean(axis=0) for values in (signals[most : n - most], truths))
+        common = fftconvolve(x, y[::-1], mode="valid", axes=0)
+        energy = np.cumsum(np.concatenate([np.zeros((1, *x.shape[1:])), x**2]), axis=0)
+        cost = energy[n - 2 * most :] - energy[: 2 * most + 1] - 2 * common
+        best = cost.argmin(axis=0)
+        middle = np.clip(best, 1, 2 * most - 1)
+        left, least, right = (np.take_along_axis(cost, (middle + side)[None], axis=0)[0] for side in (-1, 0, 1))
+        bend = left - 2 * least + right
+        delay = most - middle - 0.5 * (left - right) / bend
+    known = np.isfinite(signals).all(axis=0) & (np.ptp(x, axis=0) > 0) & (best == middle) & (bend > 0)
+    return np.where(known, delay, np.nan)

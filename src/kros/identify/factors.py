@@ -28,10 +28,10 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, IdentificationError
 from ..core.linalg import qr_triangle
-from ..core.rounding import EPS, ROUNDING
+from ..core.rounding import ROUNDING
 from ..data.population import EpisodeKey, Population
 from ..lifting import Lifting
-from .edmd import KoopmanMatrices, edmd, relative_pivots
+from .edmd import KoopmanMatrices, edmd
 
 log = logging.getLogger(__name__)
 Array = npt.NDArray[np.float64]
@@ -190,16 +190,6 @@ def require_excitation(
                 f"Identifying {problem}, so the response to it is not in the recordings; {remedy}."
             )
         log.warning("%s; its column of B is that of an offset, shrunk by alpha = %g", problem, alpha)
-
-
-def require_independent(factor: Factor, names: Sequence[str], units: Sequence[str], where: str) -> None:
-    """Refuse lifted data in which one column follows from those before it."""
-    pivots = relative_pivots(factor.R[..., : len(names)])
-    for unit, column in np.argwhere(pivots < len(names) * EPS):
-        raise IdentificationError(
-            f"Identifying unit {units[unit]} ({where}): {names[column]!r} follows from the lifted states and inputs "
-            f"before it ({', '.join(names[:column])}) on its training episodes; remove it, excite it, or use alpha > 0."
-        )
 
 
 @dataclass(frozen=True, eq=False)

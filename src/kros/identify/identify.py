@@ -26,7 +26,7 @@ from ..data.survey import RecordingFacts, check_usable, survey
 from ..lifting import Lifting
 from .calibration import PhaseCalibration, calibrate
 from .edmd import AlphaSearch, edmd, smallest_stabilising_alpha
-from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation, require_independent
+from .factors import Factor, Ranges, combine, lifted_factor, reduce_episode, require_excitation
 from .identified import EpisodeFactors, IdentifiedModels
 from .model_set import ModelKind, ModelSet, kinds_for
 from .presets import lifting_settings, resolve_lifting, resolve_phase
@@ -198,8 +198,6 @@ class _Reduced:
         factors = [self.lifted(m.lifting) for m in sets]
         alpha = self._search(sets, factors, settings) if settings.alpha == "auto" else float(settings.alpha)
         require_excitation(self.factor, self.base.population.inputs, self.units, self.condition, alpha)
-        for m, factor in zip(sets, factors, strict=True) if alpha == 0 else ():
-            require_independent(factor, m.lifting.names + m.inputs, self.units, self.condition)
         sets = [replace(m, alpha=alpha, alpha_in_ranges=settings.alpha == "auto") for m in sets]
         models = [fitted(m, factor) for m, factor in zip(sets, factors, strict=True)]
         for m in models if self.feeds_synthesis else ():

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import ConfigError
 from ..core.frequency import log_grid
 from ..core.lti import StateSpace
@@ -140,7 +140,7 @@ class ModelSet:
         content |= self.lifting.extension()
         values = {name: v.tolist() for name, v in self.parameters.items()}
         content["parameters"] = {name: dict(zip(self.unit_ids, v, strict=True)) for name, v in values.items()}
-        save_artifact(folder, "model", content, {name: getattr(self, name) for name in _AXES})
+        save_artifact(folder, "model", content, {name: getattr(self, name) for name in _ARRAYS})
 
     @classmethod
     @loader
@@ -148,8 +148,6 @@ class ModelSet:
         """Read what `save` wrote."""
         content, arrays = load_artifact(folder, "model")
         units, lifting = tuple(content["unit_ids"]), Lifting.from_content(content)
-        m = len(content["inputs"]) + len(lifting.input_functions)
-        check_shapes(arrays, _AXES, {"u": len(units), "n": lifting.n_lifted, "m": m}, Path(folder))
         parameters = {k: np.array([v[u] for u in units], dtype=float) for k, v in content["parameters"].items()}
         given = {name: content[name] for name in _CONTENT} | arrays
         channels = tuple(Channel(c["name"], Role(c["role"]), c["unit"], c["measured"]) for c in content["channels"])
@@ -157,7 +155,7 @@ class ModelSet:
         return cls(lifting=lifting, parameters=parameters, **given)
 
 
-_AXES = {"A": "unn", "B": "unm", "output_scale": "n", "input_scale": "m"}
+_ARRAYS = ("A", "B", "output_scale", "input_scale")
 _CONTENT = [
     "name",
     "condition",

@@ -35,7 +35,7 @@ class LoadSettings:
     current: int | None = None  # state that carries the load, in the load's unit; None where none does
     level_s: float = 10.0  # s; time after which a constant load is forgotten
     corner_hz: float | None = None  # what is faster in the known load, such as vibrations of the gear, is no load
-    limit: float | None = None  # of the current; episodes that reach it are left out
+    limit: float = np.inf  # of the current; episodes that reach it are left out
     delays: int = 20  # of the estimator, in samples: few recordings have a known load
     start_trust: float = 1e-4  # of the estimator; the load of the first sample is in its tracking error
 
@@ -79,7 +79,7 @@ def load_observer(
 
 def _at_limit(batch: EpisodeBatch, settings: LoadSettings) -> npt.NDArray[np.bool_]:
     """Episodes in which the current reaches its limit, where the controller does not do what its errors say."""
-    if settings.limit is None or settings.current is None:
+    if settings.current is None:
         return np.zeros(len(batch.keys), bool)
     return np.abs(batch.states[..., settings.current]).max(axis=0) >= settings.limit
 

@@ -65,7 +65,7 @@ def legend(figure: Figure, axes: Axes, columns: int | None = None) -> None:
     """Write a legend across the top of the figure, from the labelled lines of one axes."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
-        columns = columns or (len(handles) if sum(map(len, labels)) < 90 else 2)
+        columns = columns or (len(handles) if sum(map(len, labels)) < 100 else 2)
         figure.set_figheight(figure.get_figheight() + DRAWING.legend_in * ceil(len(handles) / columns))
         figure.legend(handles, labels, loc="outside upper left", ncols=columns)
 
@@ -118,43 +118,38 @@ def name_units(drawn: Artist, units: Sequence[str]) -> None:
     drawn.set_gid("units-" + ",".join(quote(unit, safe="") for unit in units))
 
 
-def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)", most: int = 6) -> None:
-    """Make the horizontal axis logarithmic over the frequencies, with at most `most` numbers."""
+def frequency_axis(axes: Axes, freqs_hz: Array, label: str = "frequency (Hz)") -> None:
+    """Make the horizontal axis logarithmic over the frequencies, with few numbers."""
     positive = freqs_hz[freqs_hz > 0]
     axes.set_xscale("log")
     axes.set_xlim(float(positive[0]), float(positive[-1]))
-    _powers_of_ten(axes.xaxis, "{x:g}", most)
+    _powers_of_ten(axes.xaxis, "{x:g}")
     axes.set_xlabel(label)
 
 
-def logarithmic(axes: Axes, plain: bool = False) -> None:
-    """Make the vertical axis logarithmic, with few numbers, in plain figures or as powers of ten."""
+def logarithmic(axes: Axes) -> None:
+    """Make the vertical axis logarithmic, with few powers of ten."""
     axes.set_yscale("log")
     low, high = axes.get_ylim()
     axes.set_ylim(10.0 ** floor(log10(low)), 10.0 ** ceil(log10(high)))
-    _powers_of_ten(axes.yaxis, "{x:g}" if plain else lambda value, _: power_of_ten(value))
+    _powers_of_ten(axes.yaxis, lambda value, _: f"10{str(round(log10(value))).translate(RAISED)}")
 
 
-def power_of_ten(value: float) -> str:
-    """Return a power of ten as text, such as 10⁻³."""
-    return f"10{str(round(log10(value))).translate(RAISED)}"
-
-
-def _powers_of_ten(axis: Axis, formatter: Any, most: int = 6) -> None:
+def _powers_of_ten(axis: Axis, formatter: Any) -> None:
     """Number a logarithmic axis at powers of ten only, without mathematical text, which is slow to set."""
     from matplotlib.ticker import LogLocator, NullLocator
 
-    axis.set_major_locator(LogLocator(numticks=most))
+    axis.set_major_locator(LogLocator(numticks=4))
     axis.set_minor_locator(NullLocator())
     axis.set_major_formatter(formatter)
 
 
 def units_axis(axes: Axes, units: Sequence[str]) -> None:
     """Label the horizontal axis with units at 0, 1, 2, ...: their names as long as they fit, else their count."""
-    axes.set_xlim(-0.7, len(units) - 0.3)
+    axes.set_xlim(-0.5, len(units) - 0.5)
     axes.grid(visible=False, axis="x")
-    if len(units) <= 40:
-        axes.set_xticks(range(len(units)), units, rotation=90 if len(units) > 4 else 0, size="small")
+    if len(units) <= 60:
+        axes.set_xticks(range(len(units)), units, rotation="vertical" if len(units) > 4 else "horizontal", size="small")
         axes.set_xlabel("unit")
     else:
         axes.set_xlabel(f"{len(units)} units, in order")

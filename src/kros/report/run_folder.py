@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..core.artifacts import MANIFEST, load_artifact, read_arrays, read_json, recorded_files
-from ..data.population import OUTLIERS, Channel, EpisodeKey, Population, Role
+from ..data.population import OUTLIERS, Channel, EpisodeKey, Role
 from ..identify import ModelSet, PhaseCalibration
 from ..synthesis.result import Synthesis
 from ..uncertainty import OutlierModel, UncertainModel
@@ -82,25 +82,9 @@ class RunFolder:
         return [unit for unit, group in self.facts["groups"].items() if group == OUTLIERS]
 
     @cached_property
-    def population(self) -> Population:
-        """The recordings, where they still exist."""
-        from ..data.readers.parquet import read_parquet
-
-        folder = self.folder / self.facts["recordings"]
-        if not (folder / "population.json").exists():
-            raise NotShownError(f"the recordings are no longer in {folder}")
-        return read_parquet(folder)
-
-    @cached_property
     def channels(self) -> tuple[Channel, ...]:
         """Channels with their units of measure."""
-        return self._signals.channels
-
-    @cached_property
-    def _signals(self) -> ModelSet | Population:
-        """What knows channels and sampling period."""
-        identified = any(name.startswith("models/") for name in self.files)
-        return next(iter(self.models.values())) if identified else self.population
+        return next(iter(self.models.values())).channels
 
     @property
     def states(self) -> list[Channel]:
@@ -116,7 +100,7 @@ class RunFolder:
     @property
     def sample_period_s(self) -> float:
         """Sampling period, s."""
-        return self._signals.sample_period_s
+        return next(iter(self.models.values())).sample_period_s
 
     @cached_property
     def calibration(self) -> PhaseCalibration:
@@ -167,11 +151,6 @@ class RunFolder:
     def deployed(self) -> str | None:
         """Name of the deployed observer, where there is one."""
         return self._record("observers/observers.json").get("deployed")
-
-    @property
-    def disturbed(self) -> dict[str, Any]:
-        """Errors on disturbed measurements; empty where the study does not ask for them."""
-        return self._record("disturbed/disturbed.json")
 
     @cached_property
     def evaluation(self) -> dict[str, Any]:

@@ -29,10 +29,10 @@ class Drawing:
     decades: int = 5  # below half of the sampling frequency
     states: int = 4  # rows of one episode or plant
     units: int = 400  # rows of the table of units
+    label: int = 16  # characters of a name beside an axis
     zoom: int = 300  # samples at constant speed that are enlarged
     settled: float = 0.1  # share of an episode after which errors are drawn: at the start no observer knows the state
     diverged: float = 1e3  # ranges of the signal: a larger error is not drawn
-    diverged_percent: float = 400.0  # error on disturbed measurements that is not drawn
     segment: int = 1024  # samples of a spectrum
     concentrated: float = 0.8  # concentration below which the segments of a unit disagree on its phase
 
@@ -76,29 +76,29 @@ HUES = (Tone.BLUE, Tone.ORANGE, Tone.GREEN, Tone.PURPLE, Tone.GOLD, Tone.SKY, To
 _SETTINGS: dict[str, Any] = {
     "font.family": "DejaVu Sans",
     "font.size": 8.5,
-    "axes.titlesize": 8.5,
+    "axes.titlesize": "medium",
     "axes.titleweight": "bold",
     "axes.titlelocation": "left",
     "axes.titlecolor": Tone.INK.light,
-    "axes.labelsize": 8.5,
+    "axes.labelsize": "medium",
     "axes.labelcolor": Tone.INK.light,
     "axes.edgecolor": Tone.SOFT.light,
-    "axes.linewidth": 0.7,
+    "axes.linewidth": DRAWING.thin,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
     "axes.facecolor": "none",
     "grid.color": Tone.GRID.light,
-    "grid.linewidth": 0.6,
+    "grid.linewidth": DRAWING.thin,
     "text.color": Tone.INK.light,
     "xtick.color": Tone.SOFT.light,
     "ytick.color": Tone.SOFT.light,
     "xtick.labelcolor": Tone.INK.light,
     "ytick.labelcolor": Tone.INK.light,
-    "xtick.labelsize": 7.5,
-    "ytick.labelsize": 7.5,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
+    "xtick.labelsize": "small",
+    "ytick.labelsize": "small",
+    "xtick.major.width": DRAWING.thin,
+    "ytick.major.width": DRAWING.thin,
     "lines.linewidth": 1.2,
     "legend.frameon": False,
     "legend.fontsize": 8,

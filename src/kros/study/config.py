@@ -72,7 +72,7 @@ class SplitConfig(Settings):
 
 
 class EvaluateConfig(Settings):
-    """Evaluation on units that took no part, and on disturbed measurements."""
+    """Evaluation on units that took no part."""
 
     folds: int = Field(
         0, ge=0, description="folds of units left out in turn, the whole study being made on all others; 0 for none"
@@ -81,7 +81,6 @@ class EvaluateConfig(Settings):
         0, ge=0, description="units that take part in nothing; their errors bound those of the next unit"
     )
     confidence: float = Field(0.95, gt=0, lt=1, description="of that bound")
-    robustness: bool = Field(True, description="whether observers run on disturbed measurements of a few units")
 
     @field_validator("folds")
     @classmethod

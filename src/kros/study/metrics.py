@@ -8,9 +8,10 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from ..core.artifacts import load_artifact, plain, read_json
+from ..core.artifacts import load_artifact, plain
 from ..evaluate.intervals import interval_rows
 from ..observer import Observer
+from ..observer.sensor_gains import sensor_gains
 from ..synthesis.result import Synthesis
 from ..uncertainty import UncertainModel
 from .config import Stage
@@ -26,7 +27,9 @@ def collect_metrics(context: Context, until: Stage) -> dict[str, Any]:
     metrics: dict[str, Any] = {"schema": 1, "study": _study(context, done), "timing_s": _timing(context, done)}
     metrics["units"] = _units(context, done)
     for stage in done:
-        if stage in _OF_STAGES:
+        if stage is Stage.EVALUATE:
+            metrics |= _evaluation(context, metrics)
+        elif stage in _OF_STAGES:
             metrics |= _OF_STAGES[stage](context)
     clean: dict[str, Any] = plain(metrics)
     return clean
@@ -112,29 +115,18 @@ def _models(context: Context) -> dict[str, Any]:
 
 def _uncertainty(context: Context) -> dict[str, Any]:
     """Uncertain models by kind, and the scores of all units."""
-    store = context.store
-    names = [name for name in context.identified.kinds if store.holds("uncertainty", name)]
-    scored = store.holds("outliers", "scores.json")
-    return {
-        "uncertainty": {name: uncertainty_entry(store, name) for name in names},
-        "outliers": read_json(store.path("outliers", "scores.json"))["rows"] if scored else [],
-    }
+    uncertain = context.uncertain
+    entries = {name: _uncertain_model(context.store, name, one) for name, one in uncertain.sets.items()}
+    return {"uncertainty": entries, "outliers": uncertain.scores}
 
 
-def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
+def _uncertain_model(store: Store, name: str, model: UncertainModel) -> dict[str, Any]:
     """Return the metrics of one uncertain model, and the share of noise in it."""
-    model = UncertainModel.load(store.path("uncertainty", name))
-    entry: dict[str, Any] = {
-        "nominal": model.nominal_id,
-        "form": model.form,
-        "peak_db": model.peak_db,
-        "misfit_max": model.misfit_max,
-        "weight": {
-            "orders": [model.weight.left_orders, model.weight.right_orders],
-            "cover_max": model.cover_max,
-            "overbound_db_max": model.overbound_db_max,
-        },
-    }
+    weight = model.weight
+    entry: dict[str, Any] = {name: getattr(model, name) for name in ("form", "peak_db", "misfit_max")}
+    entry["nominal"] = model.nominal_id
+    entry["weight"] = {name: getattr(model, name) for name in ("cover_max", "overbound_db_max")}
+    entry["weight"]["orders"] = [weight.left_orders, weight.right_orders]
     if store.holds("uncertainty", name, "noise"):
         facts, _ = load_artifact(store.path("uncertainty", name, "noise"), "noise_share")
         entry["noise_share"] = {key: facts[key] for key in ("median", "at_peak", "peak_hz")}
@@ -143,51 +135,42 @@ def uncertainty_entry(store: Store, name: str) -> dict[str, Any]:
 
 def _observers(context: Context) -> dict[str, Any]:
     """Observers with what their synthesis and certificates state, and what the deployed one reads."""
-    entries: dict[str, Any] = {}
-    written = context.store.files()
-    for name, facts in context.observers_record["facts"].items():
-        entries[name] = dict(facts)
-        if f"synthesis/{name}/synthesis.json" in written:
-            synthesis = Synthesis.load(context.store.path("synthesis", name))
-            bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
-            names = ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)
-            entries[name] |= {key: getattr(synthesis, key) for key in names}
-    return {"observers": entries} | _deployment(context)
+    record = context.observers_record
+    entries = {name: dict(facts) for name, facts in record["facts"].items()}
+    for name in record["names"]:
+        synthesis = Synthesis.load(context.store.path("synthesis", name))
+        bounds = ("lower_bound", "gap_percent") if synthesis.worst_case_h2 is not None else ()
+        entries[name] |= {
+            key: getattr(synthesis, key) for key in ("status", "solve_s", "h2_norm", "hinf_norm", *bounds)
+        }
+    return {"observers": entries, "deployment": _deployment(context)}
 
 
 def _deployment(context: Context) -> dict[str, Any]:
-    """Return what the deployed observer reads, estimates and needs."""
-    if not context.store.holds("observers", "deployed.json"):
-        return {}
+    """Return what the deployed observer reads, estimates and needs of its sensors."""
     observer = Observer.load(context.store.path("observers", "deployed.json"))
-    measured, sizes = observer.outputs, observer.seen
-    largest = () if sizes is None else (*sizes.measured, *sizes.inputs)
-    content = {
+    measured, sizes = observer.outputs, observer.about["largest_in_training"]
+    return {
         "measured": measured,
         "inputs": list(observer.inputs),
         "estimates": list(observer.recorded),
-        "largest": dict(zip([*measured, *observer.inputs], largest, strict=False)),
+        "largest": {name: sizes[name] for name in (*measured, *observer.inputs)},
         "delay_samples": observer.runtime.delay,
         "parameters": {name: observer.parameters.get(name) for name in observer.lifting.parameters},
         "functions": list(observer.lifting.functions),
         "states": observer.lifting.n_states + observer.controller.n_states,
-        "sensor": observer.about.get("sensor", {}),
+        "sensor": observer.about["sensor"],
+        "sensor_gains": sensor_gains(observer, sizes),
     }
-    return {"deployment": content}
 
 
-def _evaluation(context: Context) -> dict[str, Any]:
-    """Errors on held-out episodes, disturbed or not, of the load, and of recorded states where truth is recorded."""
-    store, evaluated = context.store, context.evaluation
-    free = {name: {"freerun_error_percent": errors} for name, errors in evaluated["free_run"].items()}
-    entries: dict[str, Any] = {
-        "models": {name: entry | free[name] for name, entry in _models(context)["models"].items()},
-        "observers": _observers(context)["observers"] | evaluated["baselines"],
-        "evaluation": evaluated["rows"],
-        "intervals": interval_rows(evaluated["rows"]),
-    }
-    if store.holds("disturbed", "disturbed.json"):
-        entries["robustness"] = load_artifact(store.path("disturbed"), "disturbed")[0]["robustness"]
+def _evaluation(context: Context, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Errors on held-out episodes, of the load, and of recorded states where truth is recorded."""
+    evaluated = context.evaluation
+    for name, errors in evaluated["free_run"].items():
+        metrics["models"][name]["freerun_error_percent"] = errors
+    metrics["observers"] |= evaluated["baselines"]
+    entries = {"evaluation": evaluated["rows"], "intervals": interval_rows(evaluated["rows"])}
     return entries | load_metrics(context) | ({"recorded": evaluated["recorded"]} if "recorded" in evaluated else {})
 
 
@@ -196,6 +179,5 @@ _OF_STAGES = {
     Stage.IDENTIFY: _models,
     Stage.QUANTIFY: _uncertainty,
     Stage.SYNTHESIZE: _observers,
-    Stage.EVALUATE: _evaluation,
     Stage.LEFT_OUT: left_out.results,
 }

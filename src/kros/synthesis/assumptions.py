@@ -67,16 +67,11 @@ def h2_violations(plant: GeneralizedPlant, proper: bool = True) -> dict[tuple[st
     return failed
 
 
-def require_plant(plant: object, method: str) -> None:
-    """Raise a `DimensionError` when it is no generalized plant."""
+def require(plant: Any, method: str, proper: bool = True) -> None:
+    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
     if not isinstance(plant, GeneralizedPlant):
         needed = "a GeneralizedPlant (A, B1, B2, C1, C2, D11, D12, D21, D22, dt)"
         raise DimensionError(f"{method} needs {needed}, found {type(plant).__name__}; build one first.")
-
-
-def require(plant: GeneralizedPlant, method: str, proper: bool = True) -> None:
-    """Raise a `SynthesisError` that names every violated assumption, a `DimensionError` for what is no plant."""
-    require_plant(plant, method)
     failed = [f"{label} ({value}): {fix}" for (label, fix), value in h2_violations(plant, proper).items()]
     if failed:
         raise SynthesisError(f"{method} needs a regular generalized plant; violated: {'; '.join(failed)}.")

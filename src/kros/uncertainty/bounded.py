@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from ..core.errors import ConfigError
 from ..core.frequency import check_grid, log_grid
-from ..core.lti import StateSpace
 from ..core.small_matrices import sigma_max
 from .forms import Form, check_responses, misfit
-from .inputs import Options, check_candidate, read_systems
+from .inputs import Options, read_systems
 from .model import ResponseUncertainty, UncertainModel, scale_system
 from .nominal import NominalChoice, choose_nominal
 from .settings import SET
@@ -26,7 +25,6 @@ from .weights.fit import Residuals, fit_weight
 
 Array = npt.NDArray[Any]
 
-POOLED = "pooled"  # name of a nominal that is no unit
 _LOG = logging.getLogger(__name__)
 
 
@@ -38,43 +36,41 @@ def bound_systems(models: Any, form: Form, freqs_hz: npt.ArrayLike | None, optio
     grid = log_grid(system.dt, longest_s=getattr(models, "longest_s", None)) if freqs_hz is None else freqs_hz
     freqs = check_grid(grid, system.dt)
     choices = _choices(units.frequency_response(freqs))
-    if isinstance(options.nominal, StateSpace):
-        check_candidate(options.nominal, system)
-        index, chosen = -1, options.nominal
-    else:
-        index = options.row(ids, choices[form].index)
-        chosen = system[index]
-    base = scale_system(chosen, *scales)
+    index = options.row(ids, choices[form].index)
     residuals = Residuals(
-        form, base.frequency_response, lambda f, rows: units[rows].frequency_response(f), len(ids), (base, units)
+        form,
+        units[index].frequency_response,
+        lambda f, rows: units[rows].frequency_response(f),
+        len(ids),
+        (units[index], units),
     )
     fields = _bound(residuals, freqs, (system.dt, options.max_order, options.tolerance_db), ids, index, choices)
-    return UncertainModel(nominal_system=chosen, output_scale=scales[0], input_scale=scales[1], **fields)
+    return UncertainModel(nominal_system=system[index], output_scale=scales[0], input_scale=scales[1], **fields)
 
 
 def bound_responses(
     responses: Array, form: Form, freqs_hz: npt.ArrayLike | None, options: Options
 ) -> ResponseUncertainty:
     """Return the set of frequency responses, shape (unit, frequency, p, m)."""
-    dt, nominal, ids = options.sample_period_s, options.nominal, options.ids(len(responses))
+    dt, ids = options.sample_period_s, options.ids(len(responses))
     if freqs_hz is None or dt is None:
         raise ConfigError("Quantify: responses need their frequencies, freqs_hz in Hz, and sample_period_s in seconds.")
     freqs = check_grid(freqs_hz, float(dt))
     G = check_responses(responses, ids, freqs)
     scales = options.scales(G.shape[2:])
-    given = nominal is not None and not isinstance(nominal, str) and np.ndim(nominal) > 0
     units = G / scales[0][:, None] * scales[1]
     choices = _choices(units)
-    index = -1 if given else options.row(ids, choices[form].index)
-    chosen = check_responses([nominal, *G], ("the nominal", *ids), freqs)[0] if given else G[index]
-    base = (chosen / scales[0][:, None] * scales[1])[None]
+    index = options.row(ids, choices[form].index)
     residuals = Residuals(
-        form, lambda f: _between(freqs, base, f)[0], lambda f, rows: _between(freqs, units[rows], f), len(ids)
+        form,
+        lambda f: _between(freqs, units[[index]], f)[0],
+        lambda f, rows: _between(freqs, units[rows], f),
+        len(ids),
     )
     fields = _bound(residuals, freqs, (float(dt), options.max_order, options.tolerance_db), ids, index, choices)
     fields |= {"output_scale": scales[0], "input_scale": scales[1], "sample_period_s": float(dt)}
     certificate = _certificate(freqs, fields["bounds"][form])
-    return ResponseUncertainty(nominal_response=chosen, certificate=certificate, **fields)
+    return ResponseUncertainty(nominal_response=G[index], certificate=certificate, **fields)
 
 
 def _choices(responses: Array) -> dict[Form, NominalChoice]:
@@ -113,12 +109,19 @@ def _bound(
 ) -> dict[str, Any]:
     """Return the set around the nominal `index`, with the remainder where the form leaves one."""
     weight, cover = fit_weight(residuals, freqs, *target)
-    G, form, name = residuals.nominal(freqs), residuals.form, ids[index] if index >= 0 else POOLED
+    G, form = residuals.nominal(freqs), residuals.form
     ratios, largest = zip(*((misfit(form, G, Gp), sigma_max(E)) for Gp, E in residuals.pieces(freqs)), strict=True)
     ratio, bound = np.concatenate(ratios), np.concatenate(largest).max(axis=0)
-    fields = {"form": form, "unit_ids": ids, "nominal": index, "nominal_id": name, "freqs_hz": freqs, "misfit": ratio}
+    fields = {
+        "form": form,
+        "unit_ids": ids,
+        "nominal": index,
+        "nominal_id": ids[index],
+        "freqs_hz": freqs,
+        "misfit": ratio,
+    }
     fields["bounds"] = {f: choice.bound for f, choice in choices.items()} | {form: bound}
-    fields["nominals"] = {f: ids[choice.index] for f, choice in choices.items()} | {form: name}
+    fields["nominals"] = {f: ids[choice.index] for f, choice in choices.items()} | {form: ids[index]}
     remainder = fit_weight(replace(residuals, remainder=True), freqs, *target)[0] if _leaves_out(form, ratio) else None
     return fields | {"cover": cover, "weight": weight, "remainder": remainder}
 

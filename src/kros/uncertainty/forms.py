@@ -21,7 +21,7 @@ Plants here are already in scaled coordinates. Nothing in this module chooses, f
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ..core.errors import DataError, DimensionError
 from ..core.settings import member
-from ..core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max
+from ..core.small_matrices import sigma_max
 from .settings import SET
 
 Array = npt.NDArray[Any]
@@ -57,6 +57,9 @@ class Form(str, Enum):
     def inverse(self) -> bool:
         """Whether the perturbed plant is rebuilt by an inverse."""
         return self in (Form.INVERSE_ADDITIVE, Form.INVERSE_INPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
+
+
+OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
 
 def as_form(form: Form | str) -> Form:
@@ -91,20 +94,24 @@ def residual(form: Form | str, nominal: npt.ArrayLike, perturbed: npt.ArrayLike,
     """
     form = as_form(form)
     G, Gp = _plants(nominal, perturbed)
+    if not paper or form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
+        return residual_of(form, G, Gp, np.linalg.pinv)
+    inverse, other = (np.linalg.pinv(Gp), G) if form.inverse else (np.linalg.pinv(G), Gp)
+    product = other @ inverse if form in OUTPUT_SIDE else inverse @ other
+    one = np.eye(product.shape[-1])
+    return one - product if form.inverse else product - one
+
+
+def residual_of(form: Form, G: Any, Gp: Any, pinv: Callable[[Any], Any]) -> Any:
+    """Return the residual of arrays, or of other plants with sums, products and a pseudo-inverse."""
+    difference = Gp - G
     if form is Form.ADDITIVE:
-        return Gp - G
-    first, second = entries_first(G), entries_first(Gp)
-    inverse, difference = pseudo_inverse_first(Gp if form.inverse else G), second - first
-    if form is Form.INVERSE_ADDITIVE:
-        return entries_last(multiply(multiply(inverse, difference), pseudo_inverse_first(G)))
-    left = form in (Form.INPUT_MULTIPLICATIVE, Form.INVERSE_INPUT_MULTIPLICATIVE)
-    whole = first if form.inverse else second
-    other = whole if paper else difference
-    product = multiply(inverse, other) if left else multiply(other, inverse)
-    if paper:
-        one = np.eye(len(product)).reshape(product.shape[:2] + (1,) * (product.ndim - 2))
-        product = one - product if form.inverse else product - one
-    return entries_last(product)
+        return difference
+    inverse = pinv(Gp if form.inverse else G)
+    if form in OUTPUT_SIDE:
+        return difference @ inverse
+    product = inverse @ difference
+    return product @ pinv(G) if form is Form.INVERSE_ADDITIVE else product
 
 
 def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array:
@@ -120,15 +127,23 @@ def rebuild(form: Form | str, nominal: npt.ArrayLike, E: npt.ArrayLike) -> Array
     ([[0.25]], [[2.5]])
     """
     form, G, E = as_form(form), np.asarray(nominal), np.asarray(E)
+    if not form.inverse:
+        return G + change_of(form, G, E)
+    loop = loop_of(form, G, E)
+    inverse = _inverse(np.eye(loop.shape[-1]) - loop)
+    return inverse @ G if form in OUTPUT_SIDE else G @ inverse
+
+
+def change_of(form: Form, G: Any, E: Any) -> Any:
+    """Return what a form without an inverse adds to the nominal plant."""
     if form is Form.ADDITIVE:
-        return G + E
-    if form is Form.INPUT_MULTIPLICATIVE:
-        return G + G @ E
-    if form is Form.OUTPUT_MULTIPLICATIVE:
-        return G + E @ G
-    product = E @ G if form is Form.INVERSE_ADDITIVE else E
-    inverse = _inverse(np.eye(product.shape[-1]) - product)
-    return inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse
+        return E
+    return E @ G if form in OUTPUT_SIDE else G @ E
+
+
+def loop_of(form: Form, G: Any, E: Any) -> Any:
+    """Return L of an inverse form, whose inverse is that of ``1 - L``."""
+    return E @ G if form is Form.INVERSE_ADDITIVE else E
 
 
 def misfit(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLike) -> Array:
@@ -166,8 +181,8 @@ def completion(form: Form | str, nominal: npt.ArrayLike, responses: npt.ArrayLik
     E = residual(form, G, Gp)
     regular = np.ones(E.shape[:-2], bool)
     if form.inverse:
-        product = E @ G if form is Form.INVERSE_ADDITIVE else E
-        regular = np.linalg.cond(np.eye(product.shape[-1]) - product) <= SET.condition
+        loop = loop_of(form, G, E)
+        regular = np.linalg.cond(np.eye(loop.shape[-1]) - loop) <= SET.condition
         E = np.where(regular[..., None, None], E, 0.0)
     return E, Gp - rebuild(form, G, E), regular
 

@@ -1,4 +1,4 @@
-"""What a quantification is given: models, responses, a nominal and scales, read and checked."""
+"""What a quantification takes: models, responses and scales, read and checked."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pydantic import Field
 
 from ..core.errors import ConfigError, DataError, DimensionError
 from ..core.lti import StateSpace
+from ..core.rounding import ITERATED
 from ..core.settings import Settings
 from .forms import check_responses
 
@@ -23,7 +24,7 @@ class Options(Settings):
     unit_ids: tuple[str, ...] | None = None
     output_scale: Any = None
     input_scale: Any = None
-    nominal: Any = None
+    nominal: str | int | None = None
     max_order: int = Field(4, ge=0)
     tolerance_db: float = Field(1.0, ge=0)
     sample_period_s: float | None = None
@@ -45,13 +46,13 @@ class Options(Settings):
 
     def row(self, ids: tuple[str, ...], best: int) -> int:
         """Return the row of the nominal among the units: by name or row, otherwise the best."""
+        if isinstance(self.nominal, str) and self.nominal in ids:
+            return ids.index(self.nominal)
         index = best if self.nominal is None else self.nominal
-        if isinstance(index, str) and index in ids:
-            return ids.index(index)
-        if not isinstance(index, (int, np.integer)) or not 0 <= index < len(ids):
-            known = f"give one of the units {', '.join(ids[:10])}, a system, or a row below {len(ids)}"
+        if isinstance(index, str) or not 0 <= index < len(ids):
+            known = f"give one of the units {', '.join(ids[:10])}, or a row below {len(ids)}"
             raise ConfigError(f"Quantify: nominal {index!r} is out of range; {known}.")
-        return int(index)
+        return index
 
 
 def read_systems(models: Any, options: Options) -> tuple[StateSpace, Options]:
@@ -105,15 +106,6 @@ def check_scale(side: str, values: npt.ArrayLike | None, size: int) -> Array:
     return scale
 
 
-def check_candidate(candidate: StateSpace, system: StateSpace) -> None:
-    """Raise an error when a nominal that is no unit is not one stable system like the units."""
-    kinds = [(s.n_outputs, s.n_inputs, s.dt) for s in (candidate, system)]
-    if candidate.batch_shape or kinds[0] != kinds[1]:
-        problem = f"Quantify: the nominal should be one system with (outputs, inputs, sampling period) {kinds[1]}"
-        raise DimensionError(f"{problem}, found {kinds[0]} in a batch of {candidate.batch_shape}.")
-    require_stable(candidate[None], ("the nominal",))
-
-
 def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
     """Raise a `DataError` that names the first model of a batch that is not finite or not stable."""
     for k, name in enumerate(names):
@@ -126,18 +118,13 @@ def require_stable(system: StateSpace, names: tuple[str, ...]) -> None:
 
 def read_response_data(data: Sequence[Any], options: dict[str, Any]) -> tuple[Array, Array]:
     """Return responses (frequency, p, m) and their frequencies, Hz, of objects with `frdata, omega, dt`."""
-    first, nominal = data[0], options.get("nominal")
-    named = {f"response {k}": one for k, one in enumerate(data)}
-    named |= {"the nominal": nominal} if hasattr(nominal, "frdata") else {}
-    for name, other in named.items():
-        if other.omega.shape != first.omega.shape or not np.allclose(other.omega, first.omega, rtol=1e-9, atol=0):
-            problem = f"{name} has other frequencies than the first response"
-            raise DimensionError(f"Quantify: {problem}; interpolate to one grid.")
-        if other.dt != first.dt:
-            raise DimensionError(f"Quantify: {name} has dt = {other.dt}, the first response {first.dt}.")
+    first = data[0]
+    for k, other in enumerate(data):
+        same = other.omega.shape == first.omega.shape and np.allclose(other.omega, first.omega, rtol=ITERATED, atol=0)
+        if not same or other.dt != first.dt:
+            problem = f"response {k} has other frequencies or another dt ({other.dt}) than the first one ({first.dt})"
+            raise DimensionError(f"Quantify: {problem}; bring all to one grid.")
     if first.dt and first.dt is not True:
         options["sample_period_s"] = float(first.dt)
-    responses = [np.moveaxis(np.asarray(one.frdata), -1, 0) for one in named.values()]
-    if len(responses) > len(data):
-        options["nominal"] = responses.pop()
+    responses = [np.moveaxis(np.asarray(one.frdata), -1, 0) for one in data]
     return check_responses(responses), np.asarray(first.omega, float) / (2 * np.pi)

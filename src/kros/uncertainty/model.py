@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.lti import StateSpace
 from .forms import Form
 from .weights.cover import Cover, Weight
@@ -30,7 +30,7 @@ class Uncertainty:
 
     form: Form
     unit_ids: tuple[str, ...]  # units that the weights cover
-    nominal: int  # row of the nominal unit; -1 when the nominal is none of the units (for example a pooled one)
+    nominal: int  # row of the nominal unit
     nominal_id: str
     freqs_hz: Array  # (frequency,), Hz
     output_scale: Array  # (p,)
@@ -157,8 +157,6 @@ class UncertainModel(Uncertainty):
     def load(cls, folder: Path) -> UncertainModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "uncertain_model")
-        axes = {"freqs_hz": "f", "nominal_C": "pN", "nominal_D": "pm", "output_scale": "p", "input_scale": "m"}
-        check_shapes(arrays, axes, {}, Path(folder))
         dt, nominals = content["sample_period_s"], {Form(name): unit for name, unit in content["nominals"].items()}
 
         def system(name: str) -> StateSpace:

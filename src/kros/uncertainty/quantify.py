@@ -30,6 +30,7 @@ from .nominal import choose_nominal
 from .outliers.model import OutlierModel
 from .outliers.population import score_population
 from .settings import QuantifySettings
+from .unit_residuals import UnitResiduals, unit_residuals
 
 Array = npt.NDArray[Any]
 
@@ -121,9 +122,9 @@ def quantify(
     **options
         Of models of `kros.identify`: those of `QuantifySettings`. Of all others: ``unit_ids`` (names),
         ``output_scale`` and ``input_scale`` (ranges; residuals and weights are in these units), ``nominal`` (a unit by
-        row or name, or a model that is none; by default the unit with the lowest peak), ``max_order`` (of an entry),
-        ``tolerance_db`` (overbound at which a lower order is good enough), ``sample_period_s`` (s, of responses
-        that have none: of measured ones at most half the inverse of the highest frequency).
+        row or name; by default the unit with the lowest peak), ``max_order`` (of an entry), ``tolerance_db`` (overbound
+        at which a lower order is good enough), ``sample_period_s`` (s, of responses that have none: of measured ones at
+        most half the inverse of the highest frequency).
 
     Returns
     -------
@@ -201,3 +202,11 @@ def worst_off_nominal(models: ModelSet, uncertain: UncertainModel) -> str:
     peaks = sigma_max(residual(uncertain.form, responses[uncertain.nominal], responses)).max(axis=-1)
     peaks[uncertain.nominal] = -np.inf
     return uncertain.unit_ids[int(np.argmax(peaks))]
+
+
+def residuals_beside_weights(models: ModelSet, uncertain: UncertainModel, points: int = 240) -> UnitResiduals:
+    """Return the residuals of all covered units beside the weights, at about so many frequencies."""
+    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // points)]
+    nominal = uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)
+    units = dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True))
+    return unit_residuals(uncertain.form, nominal, units, uncertain.weight, freqs, models.sample_period_s)

@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from ..core.rounding import ITERATED, ROUNDING
 from ..core.settings import Settings
 
 FORMS = Literal[
@@ -53,7 +54,7 @@ class FitRule:
     pull: float = 1e-3  # towards the start, nepers: small, and it makes optima unique
     peak_price: float = 0.05  # of the peak of square weights, which decides among equal covers
     rounds: int = 5  # fits, each with the frequencies and units missed by the one before
-    deficit: float = 1.02  # ratio up to which a weight is lifted; beyond it is fitted again
+    deficit: float = 1.02  # ratio beyond which a weight is fitted again, before it is lifted
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class MagnitudeRule:
     highest: float = 10.0  # tau of the highest knot: 80 % of Nyquist
     rounds: int = 6  # of programs: frequencies at which n or d vanish between points join them
     edge: float = 1e-4  # share to which n and d may fall between the ends of the grid and DC or Nyquist
-    settled: float = 1 - 1e-8  # ratio of steps of Dinkelbach's iteration that ends it
+    settled: float = 1 - ITERATED  # ratio of steps of Dinkelbach's iteration that ends it
     damping: float = 3e-3  # least, of a pair of zeros or poles
     widest: float = 40.0  # y of a pair: two real ones 17 decades apart
     digits: int = 30  # of the arithmetic of roots, which spread over twice as many decades as frequencies
@@ -84,7 +85,7 @@ class ProofRule:
     decades: int = 4  # of tau beyond the grid that are checked
     a_decade: int = 15  # points in each
     worst: int = 20  # frequencies that join a fit in a round
-    rounding: float = 1e-9  # of ratios, by which weights are larger, and of frequencies that are one
+    rounding: float = ITERATED  # of ratios, by which weights are larger, and of frequencies that are one
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,9 @@ class OutlierRule:
     nominals: int = 64  # at most, from which distances are measured
     smoothing: float = 1 / 3  # decades of the moving average
     balancings: int = 50  # of Sinkhorn's scaling
-    smallest: float = 1e-12  # typical size of an entry, relative to its row and column; of equal responses' difference
+    smallest: float = (
+        ROUNDING  # typical size of an entry, relative to its row and column; of equal responses' difference
+    )
     least: float = 1e-10  # distance of responses that are the same, relative to the typical one
     at_once: int = 4_000_000  # complex numbers of residuals in memory
     fewest: int = 8  # units: with fewer the verdict stays open; of studies of five a third of good units were beyond
@@ -111,8 +114,8 @@ class OutlierRule:
 class SetRule:
     """From systems or responses to a set: what a form leaves over, and what is shown."""
 
-    condition: float = 1e12  # beyond it an inverse form does not rebuild a plant
-    exact: float = 1e-9  # relative misfit that is rounding
+    condition: float = 1 / ROUNDING  # beyond it an inverse form does not rebuild a plant
+    exact: float = ITERATED  # relative misfit that is rounding
     warned: float = 0.01  # misfit from which on another form is worth a thought
     resolved: float = 10 ** (3 / 20)  # fall of a bound beside a peak beyond which frequencies do not resolve it
     entry_order: int = 3  # of fits to single entries, which are shown and decide nothing

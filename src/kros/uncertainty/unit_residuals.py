@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ..core.artifacts import load_artifact, loader, save_artifact
 from ..core.errors import DimensionError
 from ..core.lti import StateSpace, block_diagonal, gain
 from ..core.small_matrices import sigma_max
@@ -64,8 +64,6 @@ class UnitResiduals:
     def load(cls, folder: Path) -> UnitResiduals:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "unit_residuals")
-        axes = dict(zip(_ARRAYS, ("f", "ufpm", "uf", "fpm", "fpm", "pm"), strict=True))
-        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {name: tuple(content[name]) for name in ("unit_ids", "outside")} | {"form": Form(content["form"])}
         return cls(**facts | {"entry_excess": float("nan") if facts["entry_excess"] is None else facts["entry_excess"]})

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import numpy as np
 
-from ...identify.model_set import kind_of
 from ...observer import EstimatorSettings, Recordings, Seen, identify_estimator
 from ...observer.sensor import Sensor
 from ...synthesis import Status, Synthesis
@@ -21,12 +19,8 @@ class Estimator(Method):
     """Regression on filtered measurements and inputs; it is trained with the declared sensors."""
 
     name: ClassVar[str] = "estimator"
+    fits_recordings: ClassVar[bool] = True
     settings: EstimatorSettings = field(default_factory=EstimatorSettings)
-
-    def refusal(self, kind: str, kinds: Collection[str]) -> str:
-        """Refuse to fit the same recordings twice, for refined models and for those of EDMD."""
-        again = not kind_of(kind).refined and kind.removesuffix("_edmd") in kinds
-        return "it is fitted to recordings, not to models, and is designed for refined models" if again else ""
 
     def design(self, task: DesignTask) -> Design:
         """Identify the estimator."""

@@ -1,21 +1,20 @@
 """Constant gains: the model alone, the Kalman filter that does best on training episodes, and the residual-shaped one.
 
-The residual-shaped observer may run rows fitted to single steps, where these promise smaller errors.
+The residual-shaped observer runs rows fitted to single steps where these promise smaller errors, the Kalman filter all.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import gain
 from ...observer.baselines.kalman import kalman_candidates
-from ...observer.residual.models import Refitted, ResidualModel, refitted_models, residual_models
-from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance
+from ...observer.residual.models import ResidualModel, one_step_rows, residual_models, with_rows
+from ...observer.residual.one_step import mean_error_dynamics, mean_slopes, one_step_covariance, one_step_residual
 from ...synthesis import Synthesis
 from ...synthesis.residual_shaped.residual_h2 import ResidualProblem, residual_h2
 from ..task import Design, DesignTask, Method
@@ -35,38 +34,32 @@ class OpenLoop(Method):
 
 @dataclass(frozen=True)
 class KalmanTuned(Method):
-    """Kalman gains for process noise like the one-step residuals, of the size that does best on training episodes."""
+    """The Kalman filter of a model fitted to single steps, whose process noise does best in training."""
 
     name: ClassVar[str] = "kalman_tuned"
+    fits_recordings: ClassVar[bool] = True
 
     def design(self, task: DesignTask) -> Design:
-        """Return the candidate of least error of the hidden states; the model alone where none is better."""
-        tried = [(0.0, task.open_loop(), None), *candidates(task)]
-        observers = [task.observer(gains, *((model.A, model.B) if model else ())) for _, gains, model in tried]
-        errors = hidden_mean(percent_of(observers, task.training.read()), task.models.measured)
+        """Return the candidate of least error of the hidden states; process noise is like the one-step residuals."""
+        models, batch, n = task.models, task.training.read(), task.models.lifting.n_states
+        lifting, nominal, recorded = models.lifting, models.index(task.unit), (batch.states, batch.inputs)
+        A, B = with_rows(models.A[nominal], models.B[nominal], *one_step_rows(lifting, batch))
+        residual = one_step_residual(lifting, A, B, *recorded, batch.parameters)
+        covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
+        dynamics = mean_error_dynamics(A, mean_slopes(lifting, *recorded, batch.parameters))
+        noise, C = np.diag(task.noise**2), task.selector[:, :n]
+        candidates = kalman_candidates(dynamics, C, covariance, noise, models.sample_period_s)
+        tried = [(level, _padded(gains, lifting.n_lifted)) for level, gains in candidates]
+        observers = [task.observer(gains, A, B) for _, gains in tried]
+        errors = hidden_mean(percent_of(observers, batch), models.measured) if tried else np.array([np.inf])
         first = int(np.argmin(errors))
         if not np.isfinite(errors[first]):
-            diverges = "every candidate diverges on the training episodes, and so does the model alone"
-            raise SynthesisError(f"Kalman filter: {diverges}; look at the models first.")
-        level, gains, model = tried[first]
-        facts: dict[str, Any] = {"process_noise_level": level, "correction_off": first == 0}
-        facts["rows_fitted_to_single_steps"] = [task.models.lifting.states[i] for i in (model.rows if model else ())]
-        if np.isfinite(errors[0]):
-            facts["training_error_to_open_loop"] = float(errors[first] / errors[0])
+            raise SynthesisError(
+                "Kalman filter: every candidate diverges on the training episodes; look at the models."
+            )
+        level, gains = tried[first]
+        facts = {"process_noise_level": level, "rows_fitted_to_single_steps": list(lifting.states)}
         return Design(task.name, observers[first], gains, facts)
-
-
-def candidates(task: DesignTask) -> Iterator[tuple[float, Synthesis, Refitted | None]]:
-    """Yield sizes of process noise, gains and, where it is not the nominal one, the model with new rows."""
-    models, batch, n = task.models, task.training.read(), task.models.lifting.n_states
-    lifting, R, nominal = models.lifting, np.diag(task.noise**2), models.index(task.unit)
-    refitted, residual = refitted_models(lifting, models.A[nominal], models.B[nominal], models.measured, batch)
-    covariance = one_step_covariance(residual, batch.lengths - 1 - lifting.history)
-    slopes = mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
-    for model in refitted:
-        dynamics, shape = mean_error_dynamics(model.A, slopes), covariance[np.ix_(model.columns, model.columns)]
-        for level, gains in kalman_candidates(dynamics, task.selector[:, :n], shape, R, models.sample_period_s):
-            yield level, _padded(gains, lifting.n_lifted), model if model.rows else None
 
 
 def _padded(synthesis: Synthesis, n_lifted: int) -> Synthesis:

@@ -99,7 +99,7 @@ class WorstCaseH2(Method):
 
     name: ClassVar[str] = "worst_case_h2"
     assumes_disturbances: ClassVar[bool] = True
-    corners: tuple[float | None, ...] = (None, 3e-5, 1e-3, 3e-2)  # see `Disturbances`
+    corners: tuple[float | None, ...] = (None, 3e-5, 1e-3)  # see `Disturbances`
     noises: tuple[tuple[float, float], ...] = ((0.0, 0.0), (1e-2, 0.0), (0.0, 1e-1), (0.0, 1.0))
     tolerance_db: float = 3.0  # of the shaping filters
     orders: tuple[int, ...] = (1, 2)  # of the shaping filters; disturbances are compared with the first one

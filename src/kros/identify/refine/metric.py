@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...core.linalg import adjoint
-from ...core.small_matrices import entries_first, entries_last, multiply, pseudo_inverse_first, sigma_max_first
+from ...core.small_matrices import entries_first, multiply, sigma_max_first
 from .minimax import smallest_largest
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +56,7 @@ class ResponsePrior:
         Phi = np.linalg.inv(shifted - W[:, None, :, :n])
         G = Phi @ W[:, None, :, n:]
         G0 = np.linalg.solve(shifted - self.A, self.B + 0j * z[:, None, None])
-        left = entries_last(pseudo_inverse_first(G))
+        left = np.linalg.pinv(G)
         E = left @ (G - G0)
         Z = np.concatenate([G, np.broadcast_to(np.eye(m), (*G.shape[:2], m, m))], axis=-2)
         return np.asarray(E), np.asarray(left @ Phi), np.asarray(self.T.T @ Z @ (np.eye(m) - E))
@@ -86,7 +86,7 @@ def peak_residual(A: Array, B: Array, points: int = 200) -> float:
         return float("nan")
     z = unit_circle(points)
     G = np.linalg.solve(z[:, None, None] * np.eye(A.shape[-1]) - A[:, None], B[:, None] + 0j)
-    inverse, G, every = pseudo_inverse_first(G), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
+    inverse, G, every = entries_first(np.linalg.pinv(G)), entries_first(G), np.arange(points)  # (m, n, unit, frequency)
 
     def bound_of(row: int) -> tuple[Complex, Complex]:
         sizes = sigma_max_first(multiply(inverse, G[:, :, row, None] - G))

@@ -67,8 +67,6 @@ def refine_population(
     ------
     IdentificationError
         When no stable model is found, free runs diverge or leave their bound; names the unit where there is one.
-    DimensionError
-        When keys, parameters and factors do not fit together.
 
     Examples
     --------
@@ -87,7 +85,6 @@ def refine_population(
     marks = np.ones(len(keys), dtype=bool) if pooled is None else np.asarray(pooled, dtype=bool)
     values = {name: np.asarray(parameters[name], dtype=float) for name in lifting.parameters if name in parameters}
     data = TrainingData(population, keys, lifting, values, factor, marks)
-    data.require_factors()
     ranges = Ranges.of(factor, lifting.n_lifted, marks)
     return ranges.restore(_refine(data.divided_by(ranges), options or RefineOptions()))
 

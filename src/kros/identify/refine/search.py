@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import ConfigError
 from ...core.rounding import EPS, TINY
 
 Array = npt.NDArray[np.float64]
@@ -110,11 +109,6 @@ def _step(matrix: Array, mu: Array) -> Array:
 class RefineOptions:
     """Settings of `refine_population`: errors of channels divided by their ranges, horizons in samples.
 
-    Raises
-    ------
-    ConfigError
-        When a setting is out of its range.
-
     Examples
     --------
     >>> from kros.identify.refine import RefineOptions
@@ -154,20 +148,3 @@ class RefineOptions:
     search: GaussNewton = field(default_factory=GaussNewton)  # at each horizon
     final_iterations: int = 75  # of the units at the strength chosen, at most
     path_iterations: int = 8  # at each strength before one is chosen; each starts where the stronger prior ended
-
-    def __post_init__(self) -> None:
-        """Refuse what is out of its range."""
-        usable = {
-            "horizons": min(self.horizons, default=0) >= 1 and tuple(sorted(self.horizons)) == self.horizons,
-            "segments": self.segments >= 1,
-            "pooled_segments": self.pooled_segments >= 1,
-            "balance": 0 <= self.balance <= 1,
-            "strengths": min(self.strengths, default=0.0) > 0,
-            "margin": 0 <= self.margin < 1,
-            "bound": self.bound >= 1,
-            "search": min(self.search.iterations, self.path_iterations) >= 1,
-        }
-        for name, fine in usable.items():
-            if not fine:
-                problem = f"{name} = {getattr(self, name)} is out of its range"
-                raise ConfigError(f"Refinement: {problem}; see RefineOptions for what it may be.")

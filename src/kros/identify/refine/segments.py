@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, DimensionError
+from ...core.errors import DataError
 from ...data.population import EpisodeKey, Population
 from ...data.prepare import scale_population
 from ...lifting import Lifting
@@ -44,18 +44,6 @@ class TrainingData:
             lifting=self.lifting.in_sizes(sizes),
             factor=ranges.factor(self.factor),
         )
-
-    def require_factors(self) -> None:
-        """Refuse factors, parameters and marks that are not those of the units."""
-        m, units = len(self.population.inputs) + len(self.lifting.input_functions), (len(self.keys),)
-        shape = (*units, *[2 * self.lifting.n_lifted + m] * 2)
-        wrong = [name for name in self.lifting.parameters if np.shape(self.parameters.get(name, 0.0)) != units]
-        if self.factor.R.shape != shape or wrong or self.pooled.shape != units or not self.pooled.any():
-            raise DimensionError(
-                f"Refinement: needs factors of shape {shape}, found {self.factor.R.shape}, one value of parameters a "
-                f"unit (wrong: {wrong}) and a pooled unit, found {int(self.pooled.sum())} of {self.pooled.size}; pass "
-                "factors from episode_factors."
-            )
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,7 @@ from ..certificate.error import ReliftScales
 from ..certificate.signals import SignalBound
 from ..data import ObserverData
 from ..sensor import delay_of
+from ..sensor_gains import noise_response
 from .channels import CONSTANT, without_limits
 from .regression import Readout
 
@@ -37,15 +38,6 @@ ASSUMPTIONS = (
     "every measurement arrives",
     "noise is small enough for lifted functions not to change",
 )
-
-
-def noise_response(observer: ObserverData) -> StateSpace:
-    """Return the system from the noise of measurements, (q), to the error of the recorded states, (n)."""
-    assert observer.bank is not None
-    n = len(observer.recorded)
-    z, at = slice(n, n + observer.bank.filters), list(observer.measured)
-    A = observer.A
-    return StateSpace(A[z, z], A[z, :][:, at], A[:n, z], A[:n, at], observer.sample_period_s)
 
 
 def linear_estimate(

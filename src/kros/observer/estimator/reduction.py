@@ -68,7 +68,7 @@ def reduced(readout: Readout, order: int | None = None) -> Filters:
     D = weights * size @ B
     used = np.isfinite(errors) & (errors > 0)
     errors[list(design.channels.measured)] *= design.settings.measured_loss
-    root = gramian_root(A.T, (C[used] / errors[used, None]).T, 1.0).T
+    root = gramian_root(A.T, (C[used] / errors[used, None]).T).T
     _, values, U = np.linalg.svd(root, full_matrices=False)
     kept = values > EPS * values[0]
     L, inverse = values[kept, None] * U[kept], U[kept].T / values[kept]

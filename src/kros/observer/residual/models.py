@@ -66,32 +66,12 @@ def one_step_rows(lifting: Lifting, batch: EpisodeBatch) -> tuple[Array, Array]:
     return W[:, : lifting.n_lifted], W[:, lifting.n_lifted :]
 
 
-@dataclass(frozen=True, eq=False)
-class Refitted:
-    """A model of which some rows were fitted to single steps."""
-
-    rows: tuple[int, ...]
-    A: Array  # (n_lifted, n_lifted)
-    B: Array  # (n_lifted, m)
-    columns: tuple[int, ...]
-
-
-def refitted_models(
-    lifting: Lifting, A: Array, B: Array, measured: Sequence[int], batch: EpisodeBatch
-) -> tuple[list[Refitted], Array]:
-    """Return the model as identified and with choices of rows fitted to single steps."""
-    n = lifting.n_states
-    hidden = [i for i in range(n) if i not in measured] or list(range(n))
-    fitted, x, u, values = one_step_rows(lifting, batch), batch.states, batch.inputs, batch.parameters
-    both = [(A, B), (np.vstack([fitted[0], A[n:]]), np.vstack([fitted[1], B[n:]]))]
-    residual = np.concatenate([one_step_residual(lifting, *model, x, u, values) for model in both], axis=-1)
-    models = []
-    for rows in _choices(tuple(measured), hidden):
-        own = [M.copy() for M in both[0]]
-        for matrix, other in zip(own, both[1], strict=True):
-            matrix[list(rows)] = other[list(rows)]
-        models.append(Refitted(rows, own[0], own[1], tuple(i + n * (i in rows) for i in range(n))))
-    return models, residual
+def with_rows(A: Array, B: Array, A_s: Array, B_s: Array, rows: Sequence[int] | None = None) -> tuple[Array, Array]:
+    """Return a model with some of its first rows, all by default, taken from another one."""
+    rows = list(range(len(A_s)) if rows is None else rows)
+    A, B = A.copy(), B.copy()
+    A[rows], B[rows] = A_s[rows], B_s[rows]
+    return A, B
 
 
 def residual_models(
@@ -104,18 +84,19 @@ def residual_models(
     scale: Array,
 ) -> list[ResidualModel]:
     """Return models with rows of both kinds, the one that promises the smallest hidden errors first."""
-    n = lifting.n_states
+    n, x, u, values = lifting.n_states, batch.states, batch.inputs, batch.parameters
     hidden = [i for i in range(n) if i not in measured] or list(range(n))
-    refitted, residual = refitted_models(lifting, A, B, measured, batch)
-    spectra = residual_spectra(residual, batch.lengths - 1 - lifting.history, batch.units)
-    models, slopes = [], mean_slopes(lifting, batch.states, batch.inputs, batch.parameters)
-    for model in refitted:
-        dynamics = mean_error_dynamics(model.A, slopes)
-        chosen = spectra[..., model.columns, :][..., model.columns]
+    fitted = one_step_rows(lifting, batch)
+    both = [one_step_residual(lifting, *model, x, u, values) for model in ((A, B), with_rows(A, B, *fitted))]
+    spectra = residual_spectra(np.concatenate(both, axis=-1), batch.lengths - 1 - lifting.history, batch.units)
+    models, slopes = [], mean_slopes(lifting, x, u, values)
+    for rows in _choices(tuple(measured), hidden):
+        model, columns = with_rows(A, B, *fitted, rows), [i + n * (i in rows) for i in range(n)]
+        dynamics, chosen = mean_error_dynamics(model[0], slopes), spectra[..., columns, :][..., columns]
         promised = promised_errors(
             ResidualProblem(dynamics, np.eye(n)[list(measured)], chosen, noise, scale, batch.sample_period_s)
         )
-        models.append(ResidualModel(model.rows, model.A, model.B, dynamics, chosen, promised))
+        models.append(ResidualModel(rows, *model, dynamics, chosen, promised))
     return sorted(models, key=lambda m: float(np.sum(np.log(np.maximum(m.promised[hidden], TINY)))))
 
 

@@ -42,8 +42,7 @@ FIGURES: dict[str, Row] = {
     "observers_in_time": Row("Estimates", "episodes:estimates", _SMALL),
     "observers_in_time_paper": Row("The paper's estimates", "episodes:estimates", _SMALL, {"paper": True}),
     "loaded_paper": Row("Errors in another condition", "episodes:other_condition", _SMALL),
-    "load_torque": Row("Load torque", "disturbed:load_torque", "The nearer to the declared load, the better."),
-    "robustness": Row("Disturbed measurements", "disturbed:robustness", "A line rises where the observer fails."),
+    "load_torque": Row("Load torque", "load:load_torque", "The nearer to the declared load, the better."),
     "outlier_scores": Row("Outlier scores", "outliers:scores", "The higher a unit, the more it differs."),
     "outlier_residuals": Row("Highest score", "uncertainty:outlier_residuals", "It differs where red leaves black."),
 }

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ...identify import ModelSet
-from ...uncertainty import Form, UncertainModel
-from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
+from ...uncertainty import Form
+from ...uncertainty.unit_residuals import UnitResiduals
 from ..canvas import Array, Axes, Figure, decibel, frequency_axis, grid, label_below, legend, lines_of_units, note
 from ..names import model_label, shorten, words
 from ..theme import DRAWING, Tone
@@ -25,19 +25,8 @@ def entry_names(form: Form, models: ModelSet) -> Names:
 
 def short(name: str) -> str:
     """Return a signal's name for a title; of a formula the outer function."""
-    text = name if len(name) <= 16 or "(" not in name else f"{name.partition('(')[0]}(…)"
-    return shorten(words(text), 18)
-
-
-def beside(model: UncertainModel, models: ModelSet) -> UnitResiduals:
-    """Return the residuals of all units relative to the weights of an uncertain model."""
-    freqs = model.freqs_hz[:: max(1, len(model.freqs_hz) // DRAWING.points)]
-    scale = model.input_scale / model.output_scale[:, None]
-    responses = models.systems(model.unit_ids).frequency_response(freqs) * scale
-    nominal_response = model.scaled_nominal().frequency_response(freqs)
-    units = dict(zip(model.unit_ids, responses, strict=True))
-    nominal = model.nominal_id, nominal_response
-    return unit_residuals(model.form, nominal, units, model.weight, freqs, model.sample_period_s)
+    text = name if len(name) <= DRAWING.label or "(" not in name else f"{name.partition('(')[0]}(…)"
+    return shorten(words(text), DRAWING.label)
 
 
 def differing(residuals: UnitResiduals) -> list[int]:
@@ -82,7 +71,7 @@ def _draw_block(block: Any, residuals: UnitResiduals, names: Names, label: str, 
             )
             panel.plot(freqs, fitted[:, i, j], color=Tone.INK.light, label="fitted weight")
             _mark_unit(panel, residuals, levels[..., i, j], alarm)
-            frequency_axis(panel, freqs, "", 4)
+            frequency_axis(panel, freqs, "")
             order = f"order {residuals.entry_orders[i, j]}"
             note(panel, order, (0, 0), (3, 3), size="small", color=Tone.SOFT.light)
         row[0].set_ylabel(f"to\n{short(names[0][i])}\n(dB)")

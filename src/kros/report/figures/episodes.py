@@ -36,7 +36,7 @@ from ..names import (
 from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 
-TRUTH = Look(Tone.INK.light, weight=2.2, opacity=0.38)
+TRUTH = Look(Tone.INK.light, weight=2, opacity=DRAWING.shade)
 _PAPER = "The paper's observers: mixed H2-H∞ synthesis on models of EDMD. "
 
 
@@ -159,7 +159,7 @@ def _draw_state(signals: Signals, row: Sequence[Axes], block: Block, i: int, win
             draw_lines(row[2], time_s[start:], {label: (error[start:], look)})
             freqs, density = error_spectrum(error, signals.sample_period_s)
             row[3].plot(freqs[1:], density[1:], look.style, color=look.colour)
-            frequency_axis(row[3], freqs, "", 4)
+            frequency_axis(row[3], freqs, "")
     logarithmic(row[3])
     row[3].set_ylabel(f"{squared(signals.channels[i].unit)}/Hz", size="small")
     if signals.band_hz is not None:
@@ -184,7 +184,8 @@ def label_rows(axes: Iterable[Axes], channels: Sequence[Channel]) -> None:
     """Label the vertical axes with channel and unit of measure."""
     for row, channel in zip(axes, channels, strict=True):
         row.locator_params(axis="y", nbins=4)
-        lines = [shorten(line, 14) for line in textwrap.wrap(words(channel.name), 14, break_long_words=False)[:2]]
+        wrapped = textwrap.wrap(words(channel.name), DRAWING.label, break_long_words=False)
+        lines = [shorten(line, DRAWING.label) for line in wrapped[:2]]
         unit = readable_unit(channel.unit)
         row.set_ylabel("\n".join([*lines, *([f"({unit})"] if unit else [])]))
 
@@ -203,14 +204,11 @@ def references(channels: Sequence[Channel]) -> dict[str, int]:
 
 
 def steady_window(signals: Signals, shown: Shown) -> slice:
-    """Return a window in the longest stretch of the highest steady reference, else in the middle of the episode."""
+    """Return a window that begins where the reference is fastest, in the middle of the episode where there is none."""
     columns, samples = references(signals.channels), len(shown.time_s)
     size = max(min(signals.window, samples), 2)
-    speed = shown.inputs[:, columns["velocity"]] if "velocity" in columns else np.zeros(samples)
-    start, stop = max(steady_stretches(speed), key=lambda r: r[1] - r[0], default=(0, 0))
-    middle = (start + stop) // 2 if stop - start > size // 2 else samples // 2
-    first = min(max(middle - size // 2, 0), samples - size)
-    return slice(first, first + size)
+    first = np.abs(shown.inputs[:, columns["velocity"]]).argmax() if "velocity" in columns else (samples - size) // 2
+    return slice(min(int(first), samples - size), min(int(first), samples - size) + size)
 
 
 def steady_stretches(speed: Array) -> list[tuple[int, int]]:

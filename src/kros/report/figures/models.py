@@ -7,9 +7,10 @@ import numpy as np
 from ...identify import ModelSet
 from ...identify.identified import IdentifiedModels
 from ..canvas import Figure, decibel, frequency_axis, grid, legend, lines_of_units
-from ..names import best_models, is_koopman, model_label, model_look, shorten, words
+from ..names import best_models, is_koopman, model_label, model_look, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, Tone
+from .entries import short
 
 
 def bode(run: RunFolder) -> tuple[Figure, str]:
@@ -39,10 +40,9 @@ def bode_figure(models: ModelSet, nominal: str | None = None) -> Figure:
             if nominal in models.unit_ids:
                 line = lines[models.index(nominal)]
                 panel.plot(freqs, line, color=Tone.INK.light, label=f"nominal, unit {nominal}")
-            frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "", 4)
-            panel.locator_params(axis="y", nbins=5)
-        name = words(models.lifting.names[i])
-        row[0].set_ylabel(name if len(name) <= 14 else f"{shorten(name.partition('(')[0], 11)}(…)")
+            frequency_axis(panel, freqs, "frequency (Hz)" if i == rows - 1 else "")
+            panel.locator_params(axis="y", nbins=4)
+        row[0].set_ylabel(short(models.lifting.names[i]))
     for j, panel in enumerate(axes[0]):
         panel.set_title(f"{words(models.inputs[j // 2])}:\n{'phase (°)' if j % 2 else 'magnitude (dB)'}")
     legend(figure, axes[0, 0])

@@ -45,12 +45,11 @@ def _panel(axes: Axes, model: OutlierModel, units: list[str]) -> None:
         shift = score.score_db - score.excess_db  # relative to the threshold, as the score itself
         ends = [score.lowest_db + shift, score.highest_db + shift]
         axes.plot([place, place], ends, color=tone.light, lw=DRAWING.broad, alpha=DRAWING.shade, solid_capstyle="butt")
-        (point,) = axes.plot(place, score.score_db, "o", ms=6 if score.outlier else 4, color=tone.light)
+        (point,) = axes.plot(place, score.score_db, "o", ms=8 if score.outlier else 4, color=tone.light)
         name_units(point, [score.unit])
         if score.outlier or score is highest:
-            note(axes, score.unit, (place, score.score_db), (7, 4), xycoords="data", va="bottom", color=tone.light)
+            note(axes, score.unit, (place, score.score_db), (8, 0), xycoords="data", va="center", color=tone.light)
     if np.isfinite(model.threshold_db):
         axes.axhline(model.threshold_db, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
         text = f"threshold, {number(model.threshold_db)} dB"
         note(axes, text, (1, model.threshold_db), (-2, 3), xycoords=("axes fraction", "data"), ha="right")
-    axes.margins(y=0.15)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...core.errors import ConfigError
-from ...data.population import OUTLIERS, EpisodeKey, Population, Role
+from ...data.population import Population, Role
 from ...data.recording import some
 from ...evaluate.errors import error_spectrum
 from ...identify import PhaseCalibration
@@ -15,30 +15,18 @@ from ..run_folder import NotShownError, RunFolder, Shown
 from ..theme import DRAWING, Tone
 from .episodes import draw_lines, hide_times, label_rows, references, steady_stretches
 
-_RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.55)
+_RECORDED, _REFERENCE = Look(Tone.INK.light), Look(Tone.GOLD.light, weight=3, opacity=0.5)
 
 
 def recorded_episodes(run: RunFolder) -> list[Shown]:
     """Return one held-out episode of one unit in every condition, the condition of the models first."""
-    try:
-        unit = run.shown[0].key.unit
-        episodes = [s for s in run.shown if s.key.unit == unit]
-    except NotShownError:
-        groups = run.facts["groups"]
-        unit = next((u for u, group in groups.items() if group != OUTLIERS), next(iter(groups)))
-        keys = [EpisodeKey(*row) for row in reversed(run.facts["test"])]
-        episodes = [_read(run, key) for key in {k.condition: k for k in keys if k.unit == unit}.values()]
+    episodes = [s for s in run.shown if s.key.unit == run.shown[0].key.unit]
     return sorted(episodes, key=lambda s: s.key.condition != run.identify_on)
-
-
-def _read(run: RunFolder, key: EpisodeKey) -> Shown:
-    states, inputs = run.population.read_parts(key)
-    return Shown(key, np.arange(len(states)) * run.sample_period_s, states, inputs, {}, {})
 
 
 def signals(run: RunFolder) -> tuple[Figure, str]:
     """Draw one episode in at most two conditions, side by side, with references."""
-    shown, channels, targets = recorded_episodes(run)[:2], run.states[:5], references(run.channels)
+    shown, channels, targets = recorded_episodes(run)[:2], run.states[: DRAWING.states], references(run.channels)
     figure, axes = grid(len(channels), len(shown), sharey="row", sharex="col")
     for column, episode in zip(axes.T, shown, strict=True):
         for i, channel in enumerate(channels):
@@ -81,11 +69,12 @@ def tracking_spectrum(run: RunFolder) -> tuple[Figure, str]:
         panel.plot(freqs[1:], density[1:], color=tone.light, label=episode_title(shown.key))
     logarithmic(panel)
     top = 0.5 / run.sample_period_s
-    for multiple in range(1, min(6, int(top / frequency)) + 1):
+    count = min(8, int(top / frequency))
+    for multiple in range(1, count + 1):
         place = multiple * frequency
         panel.axvline(place, color=Tone.SOFT.light, lw=DRAWING.thin, ls=":", zorder=1)
         note(panel, f"{place:.0f} Hz", (place, 1), (3, -2), xycoords=("data", "axes fraction"), va="top")
-    panel.set_xlim(0, min(top, 6.6 * frequency))
+    panel.set_xlim(0, min(top, (count + 0.5) * frequency))
     panel.set_xlabel("frequency (Hz)")
     unit = next(c.unit for c in run.channels if c.name == spec.measured)
     panel.set_ylabel(f"{spec.measured} error,\nPSD ({squared(unit)}/Hz)")
@@ -102,7 +91,7 @@ def _tracking(run: RunFolder, shown: Shown) -> tuple[Array, Array, float]:
     settle = round(spec.settle * len(reference))
     stretches = [slice(a + settle, b) for a, b in steady_stretches(reference)]
     segment = min(DRAWING.segment, max((s.stop - s.start for s in stretches), default=0))
-    if segment < 64:
+    if segment < 100:
         raise NotShownError(f"{shown.key} has no stretch of constant speed that is long enough")
     used = [s for s in stretches if s.stop - s.start >= segment]
     spectra = [error_spectrum((reference - measured)[s], run.sample_period_s, segment) for s in used]
@@ -133,14 +122,12 @@ def phase_figure(calibration: PhaseCalibration, set_aside: list[str] | None = No
     )
     places, inside = np.arange(len(units)), np.array([u not in (set_aside or []) for u in units])
     for (column, label), panel in zip(columns, axes[0], strict=True):
-        for chosen, look in ((inside, {"ms": 4, "mec": "none"}), (~inside, {"ms": 5, "mfc": "none", "mew": 1.2})):
-            (drawn,) = panel.plot(places[chosen], column[chosen], "o", color=Tone.BLUE.light, **look)
+        for chosen, look in ((inside, {}), (~inside, {"mfc": "none"})):
+            (drawn,) = panel.plot(places[chosen], column[chosen], "o", ms=4, color=Tone.BLUE.light, **look)
             name_units(drawn, [u for u, mark in zip(units, chosen, strict=True) if mark])
         panel.set_title(label)
         units_axis(panel, units)
-    axes[0, 0].set_ylim(-12, 372)
-    axes[0, 0].set_yticks([0, 90, 180, 270, 360])
+    axes[0, 0].set_yticks([0, 180, 360])
     axes[0, 1].axhline(np.degrees(calibration.lag_rad), color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
     axes[0, 2].axhline(DRAWING.concentrated, color=Tone.SOFT.light, lw=DRAWING.thin, ls="--")
-    axes[0, 2].set_ylim(min(0.7, columns[2][0].min() - 0.02), 1.03)
     return figure

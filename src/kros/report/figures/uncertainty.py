@@ -9,7 +9,7 @@ import numpy as np
 from ...core.errors import ConfigError
 from ...identify import ModelSet
 from ...uncertainty import Form, UncertainModel, residual, sigma_max
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals
 from ...uncertainty.weights.cover import Cover
 from ..canvas import (
@@ -28,7 +28,7 @@ from ..canvas import (
 from ..names import best_models, model_label, number, words
 from ..run_folder import RunFolder
 from ..theme import DRAWING, HUES, Tone
-from .entries import beside, differing, entries_figure, entry_names
+from .entries import differing, entries_figure, entry_names
 
 FORM_TONES = {
     Form.ADDITIVE: Tone.INK,
@@ -139,10 +139,10 @@ def _side(axes: Axes, freqs_hz: Array, magnitudes: Array, cover: Array, names: S
     labels = names if len(names) == len(columns) else [str(i + 1) for i in columns]
     for i, tone in zip(columns, HUES, strict=False):
         line_over_shade(axes, freqs_hz, magnitudes[:, i], cover[:, i], tone.light)
-        note(axes, words(labels[i]), (0, 1), (5, -9 * i - 1), va="top", color=tone.light)
-    frequency_axis(axes, freqs_hz, "", 4)
+        note(axes, words(labels[i]), (0, 1), (4, -10 * i - 1), va="top", color=tone.light)
+    frequency_axis(axes, freqs_hz, "")
     low, high = (-20.0, 10.0) if np.allclose(magnitudes, 1.0) else axes.get_ylim()
-    axes.set_ylim(low, high + 0.2 * (high - low) * len(columns))
+    axes.set_ylim(low, high + (high - low) * len(columns) / 4)
 
 
 def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
@@ -155,7 +155,7 @@ def ratio_panel(axes: Axes, residuals: UnitResiduals) -> None:
     axes.plot(freqs, levels[first], color=Tone.INK.light)
     note(axes, f"unit {names[first]}", (1, 0), (-3, 3), ha="right", color=Tone.INK.light)
     axes.axhline(0, color=Tone.ALARM.light, lw=DRAWING.thin, ls="--")
-    frequency_axis(axes, freqs, "", 4)
+    frequency_axis(axes, freqs, "")
 
 
 def weights_entrywise(run: RunFolder) -> tuple[Figure, str]:
@@ -187,4 +187,4 @@ def sets_figure(models: UncertainModels, kind: str | None = None) -> Figure:
     if name not in models.sets:
         raise ConfigError(f"Plot of uncertain models: no set of kind {name!r}; choose one of {', '.join(models.sets)}.")
     model, identified = models.sets[name], models.models.models(name)
-    return weights_figure({name: (model, identified, beside(model, identified))})
+    return weights_figure({name: (model, identified, residuals_beside_weights(identified, model))})

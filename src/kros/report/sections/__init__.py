@@ -9,12 +9,12 @@ from ..facts import Facts
 from .certificates import certificates
 from .deployment import deployment
 from .errors import errors, left_out, other_conditions
-from .evidence import calibration, models, recordings, robustness, run, spread, uncertainty
+from .evidence import calibration, models, recordings, run, spread, uncertainty
 from .units import units
 
 Maker = Callable[[Facts], Section | None]
 FIRST: tuple[Maker, ...] = (deployment, errors, units)
 EVIDENCE: tuple[Maker, ...] = (
     *(recordings, calibration, models, spread, uncertainty),
-    *(certificates, robustness, left_out, other_conditions, run),
+    *(certificates, left_out, other_conditions, run),
 )

@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ...evaluate.disturb import Kind
-from ..content import Section
-from ..disturbances import doublings
+from ..content import Column, Section, Table, build
 from ..facts import Facts
 from ..names import axis_label, joined, number, observer_about, words
 from .evidence import limit_text
 
-_NEEDS = {
-    Kind.NOISE: "noise of {} % of the largest value",
-    Kind.QUANTISATION: "a resolution of {} %",
-    Kind.BIAS: "a bias of {} %",
-    Kind.DELAY: "an undeclared delay of {} samples",
-    Kind.DROPPED: "{} % of the samples lost",
+_ERRORS = {
+    "noise": "white noise, standard deviation",
+    "bias": "constant offset",
+    "bounded": "any error of at most this size, such as rounding",
 }
+_GAINS = (
+    "The table is computed from gains of the observer's linear part: the H2 norm for white noise, the gain at zero "
+    "frequency for an offset, the sum of the absolute impulse response for bounded errors. They add to what the "
+    "recordings already contain."
+)
 
 
 def deployment(facts: Facts) -> Section | None:
@@ -34,7 +35,19 @@ def deployment(facts: Facts) -> Section | None:
         ("Next unit", _next_unit(facts.get("next_unit"))),
         ("Monitor", _monitor(facts.entry.get("monitor"))),
     ]
-    return Section("deployment", "Deployment", card=[(term, texts) for term, texts in card if texts])
+    table = _needed(facts, facts.get("deployment", {}))
+    texts = [_GAINS] if table is not None else []
+    return Section("deployment", "Deployment", texts, [(term, of) for term, of in card if of], [table])
+
+
+def _needed(facts: Facts, entry: Mapping[str, Any]) -> Table | None:
+    """Return the errors of measurements that cost one percent in each estimate; None where no gain is known."""
+    rows = [(c, kind, of) for c, kinds in entry.get("sensor_gains", {}).items() for kind, of in kinds.items()]
+    columns = [Column("error", [f"{axis_label(c, facts.unit(c))}: {_ERRORS[kind]}" for c, kind, _ in rows])]
+    for state in (s for s in entry.get("estimates", ()) if s not in entry["measured"]):
+        sizes = [entry["largest"][c] / (100 * of[state]) if of[state] else None for c, _, of in rows]
+        columns.append(Column(words(state), sizes))
+    return build("Error of a measurement that costs 1 % of the largest value of an estimate", columns)
 
 
 def _interface(facts: Facts, entry: Mapping[str, Any]) -> list[tuple[str, Sequence[str]]]:
@@ -69,13 +82,9 @@ def _parameters(parameters: Mapping[str, float | None], calibrated: bool) -> lis
 
 
 def _sensor(facts: Facts, sensor: Mapping[str, Mapping[str, float]]) -> list[str]:
-    """Say what the observer assumes of its sensors, and with which disturbances its error doubles."""
+    """Say what the observer assumes of its sensors."""
     assumed = {n: ", ".join(f"{words(k)} {number(v)}" for k, v in entry.items() if v) for n, entry in sensor.items()}
-    texts = [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
-    tried = doublings(facts).get(facts.deployed, {})
-    reached = {kind: value for kind, value in tried.items() if kind in _NEEDS and ">" not in value}
-    parts = [_NEEDS[kind].format(value).replace("of < ", "below ") for kind, value in reached.items()]
-    return [*texts, f"The error doubles with {joined(parts).replace(' and ', ' or ')}."] if parts else texts
+    return [f"Assumed for {axis_label(name, facts.unit(name))}: {text}." for name, text in assumed.items() if text]
 
 
 def _next_unit(entry: Mapping[str, Any] | None) -> list[str]:

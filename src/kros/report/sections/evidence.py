@@ -1,4 +1,4 @@
-"""Where the numbers come from: recordings, models, spread of the units, weights, disturbances, the run."""
+"""Where the numbers come from: recordings, models, spread of the units, weights, the run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ from typing import Any
 
 from ...core.linalg import radius_text
 from ...data.recording import some
-from ...evaluate.disturb import Kind
 from ..content import Column, Section, build
-from ..disturbances import AXES, doublings
 from ..facts import Facts
-from ..names import in_condition, minus, model_label, number, observer_label, split_observer, words
+from ..names import in_condition, minus, model_label, number, words
 
 _PACKAGES = ("kros", "numpy", "scipy", "matplotlib")
 
@@ -136,23 +134,6 @@ def uncertainty(facts: Facts) -> Section | None:
         Column("approximation error", [entry["misfit_max"] for entry in entries.values()]),
     ]
     return Section("uncertainty", "Uncertainty weights", [text], tables=[build("Weights", columns)], figure="weights")
-
-
-def robustness(facts: Facts) -> Section | None:
-    """Return where errors double on disturbed measurements; None where the study did not try."""
-    severities = doublings(facts)
-    if not severities:
-        return None
-    text = (
-        "The measurements of held-out episodes are disturbed in one way at a time, and the observers are not informed. "
-        "The table shows where the error doubles, as the geometric mean over the hidden channels."
-    )
-    names = [n for n in severities if split_observer(n)[0] in (facts.model, "")] or list(severities)
-    kinds = [kind for kind in Kind if any(kind in severity for severity in severities.values())]
-    columns = [Column("observer", [observer_label(n) for n in names])]
-    columns += [Column(AXES[kind].title, [severities[n].get(kind, "") for n in names]) for kind in kinds]
-    table = build("Severity that doubles the error; < and >: outside of what was tried", columns, facts.label)
-    return Section("robustness", "Disturbed measurements", [text], tables=[table], figure="robustness")
 
 
 def run(facts: Facts) -> Section:

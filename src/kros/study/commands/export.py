@@ -22,7 +22,7 @@ from ...observer.units import recorded_factors
 from ..config import Stage, StudyConfig
 from ..engine.store import Store, open_finished
 from ..stages.learning import open_source
-from ..stages.load import TrialSettings
+from ..stages.load import TRIAL, angle_load
 from .field import load_calibration
 
 LARGEST = 20_000  # samples of the recording that generated code is compared on
@@ -63,9 +63,8 @@ def export_run(
             chosen = replace(chosen, about={key: about[key] for key in ("units_of_measure", "columns") if key in about})
         if fmi is not None:
             return export_fmu(chosen, out, fmi, name, precision, track), ""
-        settings, facts = TrialSettings(), RecordingFacts.load(store.path("population"))
-        level = settings.level(chosen.sample_period_s, facts.limits)
-        load = LoadOutput(level, current=settings.current) if observer in loads else None
+        level = angle_load(RecordingFacts.load(store.path("population")).limits, chosen.sample_period_s)
+        load = LoadOutput(level, current=TRIAL.current) if observer in loads else None
         folder = export_c(chosen, out, name, precision, track, load)
         write_json(folder / "study.json", config.dump())
         return folder, "" if track else exactness(folder, chosen, config, store)

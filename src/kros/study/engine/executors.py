@@ -57,7 +57,7 @@ class Lines(Progress):
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)
-_BATCHES, _LARGEST = 1024, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
+_BATCHES, _LARGEST = 1000, 1000  # of a map, and tasks in one of them: the scheduler spends a millisecond on a batch
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "ARROW_NUM_THREADS")
 _ALONE = Lock()
 _LOST = "the connection was lost; start scheduler and workers again: the same command goes on where this one ended."
@@ -157,7 +157,7 @@ def open_dask(address: str) -> Iterator[DaskExecutor]:
         messages.setLevel(level)
 
 
-_CHUNKS = 128  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
+_CHUNKS = 100  # of a map of many tasks, which are small: handing each out costs the parent a tenth of the work
 
 
 @dataclass(frozen=True)

@@ -17,14 +17,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.errors import DataError, KrosError
+from ...core.errors import KrosError
 from ...identify import Factor, ModelSet
-from ...identify.bootstrap import ModelSamples, bootstrap_edmd, episode_weights
+from ...identify.bootstrap import bootstrap_edmd, episode_weights
 from ...identify.factors import Ranges, lifted_factor
 from ...uncertainty import Form, UncertainModel, residual
 from ...uncertainty.noise import NoiseShare, noise_share
 from ...uncertainty.nominal import choose_nominal
-from ...uncertainty.quantify import UncertainModels
+from ...uncertainty.quantify import UncertainModels, residuals_beside_weights
 from ...uncertainty.unit_residuals import UnitResiduals, unit_residuals
 from ...uncertainty.weights.cover import optimal_cover
 from ..engine.context import Context
@@ -39,6 +39,7 @@ class DiagnosticSettings:
     noise_points: int = 80  # frequencies at which variation and noise are compared
     points: int = 240  # frequencies of residuals
     units: int = 60  # at most, whose models are resampled
+    draws: int = 60  # of the episodes of a unit
 
 
 DEFAULT = DiagnosticSettings()
@@ -50,12 +51,8 @@ def diagnose(context: Context, uncertain: UncertainModels) -> None:
     """Compute and save all of it; what cannot be computed is logged with its reason, and absent."""
     folder, models, sets = context.store.draft("uncertainty"), uncertain.models, uncertain.sets
     pair = models.kinds[: len(models.edmd_kinds)]  # that figures compare
-    tasks: list[Task] = [
-        (folder / kind / "noise", task)
-        for kind in models.edmd_kinds
-        if kind in sets and (task := _noise(context, kind, sets[kind])) is not None
-    ]
-    tasks += [(folder / k / "units", partial(beside_weights, models.models(k), sets[k])) for k in pair]
+    tasks: list[Task] = [(folder / k / "noise", _noise(context, k, sets[k])) for k in models.edmd_kinds if k in sets]
+    tasks += [(folder / k / "units", partial(residuals_beside_weights, models.models(k), sets[k])) for k in pair]
     tasks += _others(context, uncertain.scores)
     work = [partial(_attempt, place.parent.name, task) for place, task in tasks]
     for (place, _), result in zip(tasks, context.work.run("quantify (diagnose)", work), strict=True):
@@ -67,40 +64,45 @@ def _attempt(name: str, task: Callable[[], Result]) -> Result | None:
     try:
         return task()
     except KrosError as error:
-        log.warning("%s: not in the report: %s", name, error)
+        log.info("%s: not in the report: %s", name, error)
         return None
 
 
-def _noise(context: Context, name: str, uncertain: UncertainModel) -> Callable[[], NoiseShare] | None:
+def _noise(context: Context, kind: str, uncertain: UncertainModel) -> Callable[[], NoiseShare]:
     """Return work that compares variation and noise over some units, the nominal one among them."""
-    units, models = uncertain.unit_ids, context.identified.models(name)
+    units, models = uncertain.unit_ids, context.identified.models(kind)
     some = np.linspace(0, len(units) - 1, min(DEFAULT.units, len(units))).round().astype(int)
     chosen = [units[k] for k in np.union1d(some, [uncertain.nominal])]
-    try:
-        samples = resampling(context, name, chosen)
-    except KrosError as error:  # single episodes
-        log.info("%s: variation and noise are not separated: %s", name, error)
-        return None
-    return partial(_compared, samples, models, uncertain.form, chosen.index(uncertain.nominal_id))
+    recorded = context.identified.factors[context.facts.identify_on]
+    places = [recorded.rows_of(unit) for unit in chosen]
+    used = np.arange(max(map(len, places))) < np.array([[len(rows)] for rows in places])
+    rows = np.zeros(used.shape, dtype=int)
+    rows[used] = np.concatenate(places)
+
+    def by_unit(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        values = values[rows]
+        values[~used] = 0
+        return values
+
+    factor = Factor(*(by_unit(getattr(recorded.factor, key)) for key in ("R", "peak", "n_samples")))
+    lifted = context.identified.models(context.identified.edmd_kinds[0])
+    parameters = {key: values[[lifted.index(u) for u in chosen]][:, None] for key, values in lifted.parameters.items()}
+    factor = lifted_factor(factor, context.lifting, parameters, models.lifting)
+    return partial(_compared, factor, used.sum(axis=1).tolist(), models, chosen, uncertain.form, uncertain.nominal_id)
 
 
-def _compared(samples: Callable[[], ModelSamples], models: ModelSet, form: Form, nominal: int) -> NoiseShare:
+def _compared(
+    factor: Factor, counts: list[int], models: ModelSet, units: list[str], form: Form, nominal: str
+) -> NoiseShare:
+    """Compare the variation of units with that of models of drawn episodes, in the recordings' units."""
+    assert models.alpha is not None
+    ones = Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
+    ranges, weights = models.ranges if models.alpha_in_ranges else ones, episode_weights(counts, DEFAULT.draws, 0)
+    samples = bootstrap_edmd(ranges.triangles(factor.R), models.lifting.n_lifted, models.alpha, weights, units)
+    samples = replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))
     scale = models.output_scale[:, None] / models.input_scale
     freqs, dt = models.frequencies(DEFAULT.noise_points), models.sample_period_s
-    return noise_share(samples(), scale, freqs, dt, form, nominal)
-
-
-def beside_weights(models: ModelSet, uncertain: UncertainModel) -> UnitResiduals:
-    """Return the residuals of all covered units beside the weights of a study."""
-    freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // DEFAULT.points)]
-    return unit_residuals(
-        uncertain.form,
-        (uncertain.nominal_id, uncertain.scaled_nominal().frequency_response(freqs)),
-        dict(zip(uncertain.unit_ids, models.scaled_responses(freqs, list(uncertain.unit_ids)), strict=True)),
-        uncertain.weight,
-        freqs,
-        models.sample_period_s,
-    )
+    return noise_share(samples, scale, freqs, dt, form, units.index(nominal))
 
 
 def _others(context: Context, rows: Sequence[Mapping[str, Any]]) -> list[Task]:
@@ -131,45 +133,3 @@ def against_others(models: ModelSet, others: list[str], outside: list[str], nomi
     cover = optimal_cover(residual(form, responses[row], responses[: len(others)]))
     units = dict(zip(everyone, responses, strict=True))
     return unit_residuals(form, (nominal, responses[row]), units, cover, freqs, models.sample_period_s, outside)
-
-
-def resampling(context: Context, name: str, units: list[str], draws: int = 60) -> Callable[[], ModelSamples]:
-    """Return work that computes EDMD models of resampled training episodes in the condition that feeds synthesis."""
-    models = context.identified.models(name)
-    return partial(_edmd_samples, models, *episode_factor(context, models, units), units, draws)
-
-
-def _edmd_samples(models: ModelSet, factor: Factor, counts: list[int], units: list[str], draws: int) -> ModelSamples:
-    """Return EDMD models of drawn episodes, in the recordings' units."""
-    assert models.alpha is not None
-    ones = Ranges(np.ones_like(models.output_scale), np.ones_like(models.input_scale))
-    ranges = models.ranges if models.alpha_in_ranges else ones
-    triangles, weights = ranges.triangles(factor.R), episode_weights(counts, draws, 0)
-    return _restored(bootstrap_edmd(triangles, models.lifting.n_lifted, models.alpha, weights, units), ranges)
-
-
-def episode_factor(context: Context, models: ModelSet, units: list[str]) -> tuple[Factor, list[int]]:
-    """Return the stored factors of ``[Psi | Theta_plus]``, (unit, episode), and the number of episodes by unit."""
-    recorded = context.identified.factors[context.facts.identify_on]
-    places = [recorded.rows_of(unit) for unit in units]
-    counts = [len(rows) for rows in places]
-    if min(counts) < 2:
-        unit = units[int(np.argmin(counts))]
-        raise DataError(f"Resampling: unit {unit} has {min(counts)} training episodes; at least two are needed.")
-    R, peak, n_samples = (_by_unit(getattr(recorded.factor, key), places) for key in ("R", "peak", "n_samples"))
-    lifted = context.identified.models(context.identified.edmd_kinds[0])
-    parameters = {key: values[[lifted.index(u) for u in units]][:, None] for key, values in lifted.parameters.items()}
-    return lifted_factor(Factor(R, peak, n_samples), context.lifting, parameters, models.lifting), counts
-
-
-def _by_unit(values: npt.NDArray[Any], places: list[list[int]]) -> npt.NDArray[Any]:
-    """Return rows of episodes as (unit, episode, ...), zero where a unit has fewer episodes."""
-    padded = np.zeros((len(places), max(map(len, places)), *values.shape[1:]), dtype=values.dtype)
-    for row, rows in enumerate(places):
-        padded[row, : len(rows)] = values[rows]
-    return padded
-
-
-def _restored(samples: ModelSamples, ranges: Ranges) -> ModelSamples:
-    """Return samples in the recordings' units, of channels divided by their ranges."""
-    return replace(samples, estimate=ranges.restore(samples.estimate), samples=ranges.restore(samples.samples))

@@ -16,10 +16,8 @@ from ...core.errors import KrosError
 from ...data.population import EpisodeKey
 from ...design.baselines import Baseline, make_difference, make_extended, make_learned, make_mean_profile
 from ...design.synthesize import measurement_noise
-from ...design.task import split_name
 from ...design.validation import TrainingSet
-from ...evaluate.disturb import Kind, disturbed_rows, standard_disturbances
-from ...evaluate.held_out import HeldOut, Outcome, Trial, alike
+from ...evaluate.held_out import HeldOut, Outcome, alike
 from ...identify.presets import gearbox_band_hz
 from ...observer import Observer
 from ...observer.sensor import sides
@@ -43,9 +41,9 @@ def run(context: Context) -> None:
     at_home = replace(
         episodes, keys=tuple(keys[i] for i in home), shown=tuple(home.index(i) for i in episodes.shown if i in home)
     )
-    observers, trial = load_observers(context), make_trial(context, episodes, roles)
+    observers = load_observers(context)
     kinds = {name: context.identified.models(name) for name in context.identified.kinds}
-    work = estimation(context, episodes, trial)
+    work = estimation(context, episodes)
     work |= {(f"free run/{name}",): partial(at_home.models, one) for name, one in kinds.items()}
     results = outcomes(context, work)
     free_runs: dict[str, Outcome] = {name: results.pop(f"free run/{name}") for name in kinds}  # type: ignore[misc]
@@ -55,68 +53,26 @@ def run(context: Context) -> None:
         "rows": [row for item in estimates.items() for row in episodes.rows(*item, roles, band)],
         "free_run": {name: free_run_percent(o, at_home, facts.pooled) for name, o in free_runs.items()},
         "band_hz": band,
-        "roles": roles,
         "shown": [[k.unit, k.condition, k.episode] for k in (keys[i] for i in episodes.shown)],
         "baselines": {name: facts_of(name, outcome) for name, outcome in results.items() if name not in observers},
         **episodes.recorded_rows(roles),
     }
-    content |= {"observers": list(estimates), "models": list(kinds), "states": population.states}
     arrays = _arrays(episodes, estimates, free_runs)
     save_artifact(context.store.draft("evaluation"), "evaluation", content, arrays)
-    if trial is not None:
-        disturbed = {name: outcome for name, outcome in estimates.items() if outcome.disturbed is not None}
-        run_disturbed(context, trial, observers, disturbed)
     run_load(context, observers)
 
 
-def make_trial(context: Context, episodes: HeldOut, roles: Mapping[str, str], few: int = 3) -> Trial | None:
-    """Return what runs on disturbed measurements of a few units; None where the study asks for nothing of it."""
-    firsts = {k.unit: k for k in reversed(episodes.keys) if k.condition == context.facts.identify_on}
-    chosen = sorted((k for u, k in firsts.items() if roles[u] != "outlier"), key=episodes.keys.index)
-    chosen = sorted(chosen, key=lambda k: roles[k.unit] != "nominal")[:few]
-    if not context.config.evaluate.robustness or not chosen:
-        return None
-    phases = any(episodes.parameters.values())
-    disturbances = tuple(standard_disturbances([k for k in Kind if phases or k is not Kind.PHASE]))
-    kind, measured = split_name(str(context.observers_record["deployed"]))[0], context.identified.models().measured
-    return Trial(replace(episodes, keys=tuple(chosen), shown=()), measured, disturbances, kind)
-
-
-def run_disturbed(
-    context: Context, trial: Trial, observers: Mapping[str, Observer], baselines: Mapping[str, Outcome]
-) -> None:
-    """Run the observers of a trial on disturbed measurements, and save their errors with those of baselines."""
-    groups = alike(observer for name, observer in observers.items() if split_name(name)[0] == trial.kind)
-    results = context.work.run("disturb", [partial(trial.of_observers, group) for group in groups])
-    by_name = {o.name: e for group, es in zip(groups, results, strict=True) for o, e in zip(group, es, strict=True)}
-    named = {name: by_name[observer.name] for name, observer in observers.items() if observer.name in by_name}
-    errors: dict[str, Any] = named | {name: outcome.disturbed for name, outcome in baselines.items()}
-    channels, home, rows = dict(enumerate(context.population.states)), context.facts.identify_on, []
-    for name, error in errors.items():
-        estimated = baselines[name].estimated if name in baselines else None
-        some = channels if estimated is None else {i: channels[i] for i in estimated}
-        of = {"observer": name, "condition": home}
-        rows += [of | row for row in disturbed_rows(error, trial.disturbances, some)]
-    units, seconds = [k.unit for k in trial.episodes.keys], trial.samples * context.population.sample_period_s
-    content = {"units": units, "seconds": seconds, "robustness": rows}
-    save_artifact(context.store.draft("disturbed"), "disturbed", content)
-
-
-def estimation(context: Context, episodes: HeldOut, trial: Trial | None = None) -> Pieces:
+def estimation(context: Context, episodes: HeldOut) -> Pieces:
     """Return the work of running all observers of a study, and the baselines that are made here, on some episodes."""
-    states = context.population.states
-    limits = sides(context.facts.limits, states)
-    makers = baseline_makers(context, episodes)
-    work: Pieces = {(name,): partial(of_baseline, episodes, make, limits, trial) for name, make in makers.items()}
+    limits, makers = sides(context.facts.limits, context.population.states), baseline_makers(context, episodes)
+    work: Pieces = {(name,): partial(of_baseline, episodes, make, limits) for name, make in makers.items()}
     for group in alike(load_observers(context).values()):
         work[tuple(observer.name for observer in group)] = partial(episodes.observers, group)
     return work
 
 
-def of_baseline(
-    episodes: HeldOut, make: Callable[[], Baseline], limits: tuple[Array, Array], trial: Trial | None
-) -> Outcome | str:
-    """Make a baseline and run it, on disturbed episodes too; return the reason where it cannot be made."""
+def of_baseline(episodes: HeldOut, make: Callable[[], Baseline], limits: tuple[Array, Array]) -> Outcome | str:
+    """Make a baseline and run it; return the reason where it cannot be made."""
     try:
         baseline = replace(make(), limits=limits)
     except KrosError as error:
@@ -126,8 +82,7 @@ def of_baseline(
         return [baseline.estimate(keys, y, u, values)[None]]
 
     (outcome,) = episodes.estimates(run, baseline.measured)
-    disturbed = None if trial is None else trial.errors(run)[0]
-    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated, disturbed=disturbed)
+    return replace(outcome, facts=baseline.facts, estimated=baseline.estimated)
 
 
 def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
@@ -135,7 +90,7 @@ def outcomes(context: Context, work: Pieces) -> dict[str, Outcome | str]:
     by_name: dict[str, Outcome | str] = {}
     for names, result in zip(work, context.work.run("evaluate", work.values()), strict=True):
         by_name |= dict(zip(names, result if isinstance(result, list) else [result], strict=True))
-    return {name: by_name[name] for name in dict.fromkeys((*load_observers(context), *by_name))}
+    return {name: by_name[name] for name in dict.fromkeys((*context.observers_record["names"], *by_name))}
 
 
 def baseline_makers(context: Context, episodes: HeldOut) -> dict[str, Callable[[], Baseline]]:

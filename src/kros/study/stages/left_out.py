@@ -149,13 +149,10 @@ def next_unit(context: Context) -> dict[str, Any]:
     rows, failed = reserve_rows(context, deployed)
     known = [r for r in evaluated if r["observer"] == deployed and r["unit"] in facts.pooled]
     hidden = [c for c in population.states if c not in population.measured] or list(population.states)
-    bounds = {}
-    for condition in population.conditions:
-        reserved, pooled = ([r for r in part if r["condition"] == condition] for part in (rows, known))
-        bounds[condition] = bounds_of(reserved, pooled, hidden, config.confidence)
+    reserved, pooled = ([r for r in part if r["condition"] == facts.identify_on] for part in (rows, known))
     content = {"reserve": len(facts.reserve), "units": facts.reserve, "confidence": config.confidence}
-    content |= {"observer": deployed, "jointly": True, "condition": facts.identify_on, **bounds.pop(facts.identify_on)}
-    return content | {"others": bounds, "rows": rows, "failed": failed}
+    content |= {"observer": deployed, "condition": facts.identify_on, "rows": rows, "failed": failed}
+    return content | bounds_of(reserved, pooled, hidden, config.confidence)
 
 
 def reserve_rows(context: Context, deployed: str) -> tuple[Rows, dict[str, str]]:
@@ -187,19 +184,19 @@ def bounds_of(rows: Rows, known: Rows, channels: Sequence[str], confidence: floa
     places = [(c, m) for c in channels for m in _MEASURES]
     scale = {(c, m): np.mean([r[m] for r in known if r["channel"] == c] or [np.nan]) for c, m in places}
     usable = [place for place, size in scale.items() if np.isfinite(size) and size > 0]
-    units, needed = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence)
+    units, needed, bounds = list(dict.fromkeys(r["unit"] for r in rows)), fewest_units(confidence), None
     if not usable:
-        return {"bounds": None, "reason": "the observer has no finite error on the units that it was made from"}
-    if len(units) < needed:
+        reason = "the observer has no finite error on the units that it was made from"
+    elif len(units) < needed:
         reason = f"{len(units)} units in reserve, and a confidence of {confidence:g} needs {needed}"
-        return {"bounds": None, "reason": reason}
-    errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
-    of_units = [[errors[u, c, m] for c, m in usable] for u in units]
-    bound = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
-    if bound is None or not np.isfinite(bound).all():
+    else:
+        errors = {(r["unit"], r["channel"], m): float(r[m]) for r in rows for m in _MEASURES}
+        of_units = [[errors[u, c, m] for c, m in usable] for u in units]
+        bounds = next_unit_bound(of_units, [float(scale[p]) for p in usable], confidence)
         reason = "the observer diverges on too many of the units in reserve, or they cannot be calibrated"
+    if bounds is None or not np.isfinite(bounds).all():
         return {"bounds": None, "reason": reason}
-    values = dict(zip(usable, bound.tolist(), strict=True))
+    values = dict(zip(usable, bounds.tolist(), strict=True))
     return {"bounds": {c: {m: values.get((c, m)) for m in _MEASURES} for c in channels}, "reason": None}
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -41,22 +41,14 @@ class TrialSettings:
     condition: str = "load"  # in which it is mounted
     angle: str = "position"  # state that is the angle
     current: str = "current"  # state that is the current
-    level_s: float = 10.0  # time constant of the leak against drift of the load's level
     corner_hz: float = 20.0  # of the known load: what is faster, as vibrations of the gear, does not count
     judged_hz: float = 5.0  # up to which errors of the load count
     settle_s: float = 2.0  # of an episode, which is not judged
     known: int = 2  # units on which the load is known, where the study names none
     unaware: str = "worst_case_h2"  # method whose observers estimate a load from the recorded current
 
-    def level(self, sample_period_s: float, limits: Mapping[str, FoundLimit]) -> AngleLoad:
-        """Return what fills in the level of a load; the current's limit is that of the recordings."""
-        return AngleLoad(self.level_s, sample_period_s, limit=self.limit(limits) or np.inf)
 
-    def limit(self, limits: Mapping[str, FoundLimit]) -> float | None:
-        """Return the largest current, where recordings reach a limit."""
-        reached = limits.get(self.current)
-        ends = [abs(end) for end in (reached.lower, reached.upper) if end is not None] if reached else []
-        return max(ends, default=None)
+TRIAL = TrialSettings()
 
 
 def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
@@ -65,7 +57,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
         return
     trial = LoadTrial.of(context)
     makers = {f"{kind}/{LOAD}": partial(_with_load, context, trial, kind, lifting) for kind, lifting in trial.liftings}
-    names = [f"{kind}/{trial.settings.unaware}" for kind, _ in trial.liftings]
+    names = [f"{kind}/{TRIAL.unaware}" for kind, _ in trial.liftings]
     makers |= {f"{n}/current": partial(_from_current, trial, observers[n]) for n in names if n in observers}
     curves: dict[str, Array] = {}
     facts: dict[str, dict[str, Any]] = {}
@@ -79,7 +71,7 @@ def run_load(context: Context, observers: Mapping[str, Observer]) -> None:
     shown = int(np.flatnonzero(trial.loaded)[0])
     key, arrays = trial.test.keys[shown], {"truth": trial.truth[1]} | {f"estimate/{n}": v for n, v in curves.items()}
     content = {"known": trial.known, "rows": [trial.row(*item) for item in curves.items()], "observers": facts}
-    content |= {"corner_hz": trial.settings.judged_hz, "settle_s": trial.settings.settle_s, "estimates": list(curves)}
+    content |= {"corner_hz": TRIAL.judged_hz, "settle_s": TRIAL.settle_s, "estimates": list(curves)}
     content["shown"] = [key.unit, key.condition, key.episode]
     single = {name: values[:, shown].astype(np.float32) for name, values in arrays.items()}
     save_artifact(context.store.draft(LOAD), LOAD, content, single)
@@ -95,18 +87,25 @@ def load_metrics(context: Context) -> dict[str, Any]:
 
 def _with_load(context: Context, trial: LoadTrial, kind: str, lifting: Lifting) -> tuple[Array, dict[str, Any]]:
     """Return the load of an observer that has it as a state, with its level, and facts; save the observer."""
-    settings, (angle, current) = trial.settings, trial.places
-    read = LoadSettings(current, settings.level_s, settings.corner_hz, settings.limit(trial.limits))
-    inputs, known = context.population.inputs, trial.truth[0]
-    observer, left_out = load_observer(f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, known, read)
+    (angle, current), test, inputs = trial.places, trial.test, context.population.inputs
+    leveled = angle_load(context.facts.limits, trial.dt)
+    read = LoadSettings(current, leveled.level_s, TRIAL.corner_hz, leveled.limit)
+    observer, left_out = load_observer(
+        f"{kind}/{LOAD}", lifting, trial.measured, inputs, trial.train, trial.truth[0], read
+    )
     observer = replace(observer, seen=seen_by(context.identified, observer.measured))
     observer.save(context.store.draft(LOAD, f"{kind}.json"))
-    y = np.asarray(trial.test.states[..., list(trial.measured)])
-    estimate = run_observer(observer, y, trial.test.inputs, observer.own(trial.test.parameters))
-    leveled = settings.level(trial.dt, trial.limits)
+    estimate = run_observer(observer, test.measurements(trial.measured), test.inputs, observer.own(test.parameters))
     seen = estimate[..., observer.lifting.states.index("load")]
-    load = leveled.run(seen, estimate[..., current], trial.test.states[..., angle]).load
+    load = leveled.run(seen, estimate[..., current], test.states[..., angle]).load
     return load, {"order": observer.internal, "episodes_left_out": len(left_out)}
+
+
+def angle_load(limits: Mapping[str, FoundLimit], dt: float) -> AngleLoad:
+    """Return what fills in the level of a load; the current's limit is that of the recordings."""
+    reached = limits.get(TRIAL.current)
+    ends = [abs(end) for end in (reached.lower, reached.upper) if end is not None] if reached else []
+    return AngleLoad(LoadSettings.level_s, dt, limit=max(ends, default=np.inf))
 
 
 def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str, Any]]:
@@ -116,7 +115,7 @@ def _from_current(trial: LoadTrial, observer: Observer) -> tuple[Array, dict[str
         y = as_arriving(batch, observer.sensor, trial.states).measurements(observer.measured)
         estimate = run_observer(observer, y, batch.inputs, observer.own(batch.parameters))
         errors.append(batch.states[..., current] - estimate[..., current])
-    loaded = [i for i, k in enumerate(trial.train.keys) if k.condition == trial.settings.condition]
+    loaded = [i for i, k in enumerate(trial.train.keys) if k.condition == TRIAL.condition]
     scale = TorqueScale.calibrated(errors[0][:, loaded], trial.truth[0][:, loaded], trial.dt)
     return scale.load(errors[1]), {}
 
@@ -132,55 +131,53 @@ class LoadTrial:
     test: EpisodeBatch
     truth: tuple[Array, Array]  # of both, in units of current
     dt: float
-    limits: Mapping[str, FoundLimit]
     liftings: list[tuple[str, Lifting]]
-    settings: TrialSettings = field(default_factory=TrialSettings)
 
     @classmethod
     def of(cls, context: Context) -> LoadTrial:
         """Read the recordings; refuse a study without a known load, or without other units to judge on."""
-        facts, settings, population = context.facts, TrialSettings(), context.population
-        if missing := [name for name in (settings.angle, settings.current) if name not in population.states]:
+        facts, population = context.facts, context.population
+        if missing := [name for name in (TRIAL.angle, TRIAL.current) if name not in population.states]:
             states = ", ".join(population.states)
             raise ConfigError(f"Load: there is no state {missing[0]!r} in {states}; give the channel this name.")
         units = context.identified.parameters
         usable = [u for u in facts.pooled if u in units]
-        known, others = _known(context, settings, usable)
-        free, loaded = facts.identify_on, settings.condition
+        known, others = _known(context, usable)
+        free, loaded = facts.identify_on, TRIAL.condition
         places = {free: usable, loaded: [*known, *(usable if free == loaded else ())]}
         train = [k for k in facts.train if k.unit in places.get(k.condition, ())]
         test = [k for k in facts.test if k.unit in others and k.condition in (free, loaded)]
         batches = (EpisodeBatch.read(population, keys, parameters=units) for keys in (train, test))
         first, second = (batch.head(int(batch.lengths.min())) for batch in batches)
-        truth = _truth(context, settings, first), _truth(context, settings, second)
+        truth = _truth(context, first), _truth(context, second)
         linear = [("linear", Lifting(population.states))]
         liftings = [("koopman", context.lifting), *linear] if context.lifting.functions else linear
         measured, dt = context.identified.models(context.identified.kinds[0]).measured, population.sample_period_s
-        return cls(known, population.states, measured, first, second, truth, dt, facts.limits, liftings)
+        return cls(known, population.states, measured, first, second, truth, dt, liftings)
 
     @property
     def places(self) -> tuple[int, int]:
         """Places of angle and current among the states."""
-        return self.states.index(self.settings.angle), self.states.index(self.settings.current)
+        return self.states.index(TRIAL.angle), self.states.index(TRIAL.current)
 
     @property
     def loaded(self) -> npt.NDArray[np.bool_]:
         """Which test episodes have the load."""
-        return np.array([k.condition == self.settings.condition for k in self.test.keys])
+        return np.array([k.condition == TRIAL.condition for k in self.test.keys])
 
     def row(self, name: str, estimate: Array) -> dict[str, Any]:
         """Return errors of an estimate for the metrics."""
-        settings, skip = self.settings, round(self.settings.settle_s / self.dt)
-        accuracy = load_accuracy(estimate, self.truth[1], self.dt, settings.judged_hz, skip)
+        skip = round(TRIAL.settle_s / self.dt)
+        accuracy = load_accuracy(estimate, self.truth[1], self.dt, TRIAL.judged_hz, skip)
         row = {"observer": name} | {name: getattr(accuracy, name) for name in ("load_rms", "floor_rms", "error_rms")}
         return row | {"error_percent": accuracy.percent, "error_to_floor": accuracy.ratio}
 
 
-def _known(context: Context, settings: TrialSettings, usable: list[str]) -> tuple[list[str], list[str]]:
+def _known(context: Context, usable: list[str]) -> tuple[list[str], list[str]]:
     """Return the units on which the load is known, and the others."""
-    facts, condition = context.facts, settings.condition
+    facts, condition = context.facts, TRIAL.condition
     loaded = [u for u in usable if facts.keys("train", u, condition)]
-    known = list(context.config.load.units) or loaded[: settings.known]
+    known = list(context.config.load.units) or loaded[: TRIAL.known]
     others = [u for u in usable if u not in known]
     if not set(known) <= set(usable) or not known or not any(facts.keys("test", u, condition) for u in others):
         raise ConfigError(
@@ -190,10 +187,11 @@ def _known(context: Context, settings: TrialSettings, usable: list[str]) -> tupl
     return known, others
 
 
-def _truth(context: Context, settings: TrialSettings, batch: EpisodeBatch) -> Array:
+def _truth(context: Context, batch: EpisodeBatch) -> Array:
     """Return the load that is declared, on episodes in its condition."""
     config, population = context.config.load, context.population
-    position = batch.states[..., population.states.index(settings.angle)]
-    sizes = float(config.moment or 0.0), config.inertia
-    torque = known_load(position, population.sample_period_s, *sizes, corner_hz=settings.corner_hz)
-    return np.where([k.condition == settings.condition for k in batch.keys], torque, 0.0)
+    position = batch.states[..., population.states.index(TRIAL.angle)]
+    torque = known_load(
+        position, population.sample_period_s, float(config.moment or 0.0), config.inertia, TRIAL.corner_hz
+    )
+    return np.where([k.condition == TRIAL.condition for k in batch.keys], torque, 0.0)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from pathlib import Path
 
-from ...core.artifacts import digest_of
 from ...core.work import Progress
 from ..config import Stage
 from ..engine.context import Context
@@ -30,18 +28,8 @@ def render_run(folder: Path, workers: int = 1) -> Path:
     """Write the report of a finished run again; `workers` processes draw its figures."""
     from ...report.html import render
 
-    began = time.perf_counter()
-    with (
-        open_finished(folder, *_SHOWN, alone=True) as (_, store),
-        store.drafting() as draft,
-        open_executor(workers) as executor,
-    ):
-        render(store.folder, store.metrics(), executor.map, draft.draft(REPORT))
-        record = store.record(Stage.REPORT)
-        digest = digest_of(REPORT, [artefact.digest for artefact in store.manifest.values()])
-        digest, seconds = (record.digest, record.seconds) if record else (digest, time.perf_counter() - began)
-        draft.commit(Stage.REPORT, digest, seconds)
-        return store.path(REPORT)
+    with open_finished(folder, *_SHOWN, alone=True) as (_, store), open_executor(workers) as executor:
+        return render(store.folder, store.metrics(), executor.map)
 
 
 def write_figures(folder: Path, out: Path, progress: Progress | None = None) -> list[str]:

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.rounding import ITERATED, ROUNDING, TINY
+from ...core.rounding import EPS, ITERATED, ROUNDING, TINY
 
 Array = npt.NDArray[Any]
 
@@ -136,7 +136,7 @@ def _follow(programme: _Programme, x: Array, rtol: float, stop_below: float = -n
             return Outcome(x, here, lower, Ending.INFEASIBLE if proven else Ending.SOLVED)
         step = _line_search(float(programme.c @ direction) / mu, eigenvalues)
         moved = step * np.abs(direction).max(initial=0.0)
-        if moved <= 1e-15 * max(np.abs(x).max(initial=0.0), TINY) and decrement > _CENTRED:
+        if moved <= 4 * EPS * max(np.abs(x).max(initial=0.0), TINY) and decrement > _CENTRED:
             break
         x = x + step * direction
         mu = mu * _SHRINK if decrement < _CENTRED else mu
@@ -192,7 +192,7 @@ class _Programme:
 def _solve(hessian: Array, gradient: Array) -> Array:
     """Newton direction in units in which the Hessian has a unit diagonal, with one step of refinement."""
     scale = 1 / np.sqrt(np.diag(hessian))
-    scaled = hessian * scale[:, None] * scale + 1e-14 * np.eye(len(hessian))
+    scaled = hessian * scale[:, None] * scale + 100 * EPS * np.eye(len(hessian))
     right = gradient * scale
     direction = np.linalg.solve(scaled, right)
     direction += np.linalg.solve(scaled, right - scaled @ direction)
@@ -200,17 +200,12 @@ def _solve(hessian: Array, gradient: Array) -> Array:
 
 
 def _line_search(slope: float, eigenvalues: Array) -> float:
-    """Minimise ``slope t - sum log(1 + t eigenvalue)`` over the step t by Newton's method."""
-    lowest = float(eigenvalues.min(initial=0.0))
-    limit = np.inf if lowest >= 0 else -1 / lowest
-    low, high, t = 0.0, limit, min(1.0, 0.9 * limit)
-    for _ in range(50):
-        ratio = eigenvalues / (1 + t * eigenvalues)
-        first, second = slope - ratio.sum(), ratio @ ratio
-        low, high = (low, t) if first > 0 else (t, high)
-        step = t - first / second
-        t_new = step if low < step < high else (low + min(high, 4 * low + 1)) / 2
-        if abs(t_new - t) <= 1e-3 * t_new:
-            return float(min(t_new, 0.99 * limit))
-        t = t_new
-    return float(low or t)
+    """Minimise ``slope t - sum log(1 + t eigenvalue)`` over the step t."""
+    from scipy.optimize import minimize_scalar
+
+    limit = 1 / max(-float(eigenvalues.min(initial=0.0)), 0.01)
+
+    def barrier(t: float) -> float:
+        return slope * t - float(np.log(np.maximum(1 + t * eigenvalues, TINY)).sum())
+
+    return float(minimize_scalar(barrier, bounds=(0.0, limit), method="bounded", options={"xatol": 1e-3}).x)

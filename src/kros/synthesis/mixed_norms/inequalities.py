@@ -11,7 +11,7 @@ and then the inequality between G~ and A~ is a small difference of large matrice
 the rows are combined accordingly (a congruence):
 
     H2:    [[-W-W', W, B~1], [., G~, 0], [., ., I]] > 0,   [[Z, C~1, D~11], [., G~, 0], [., ., I]] > 0,   min tr Z
-    Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., gamma^2 I]] > 0
+    Hinf:  [[-W-W', W, B~2, -C~2'], [., G~, 0, C~2'], [., ., I, D~22'], [., ., ., I]] > 0
 
 In balanced coordinates G~ has the diagonal (s, s); rows and columns are
 divided by its root.
@@ -36,7 +36,7 @@ import numpy.typing as npt
 from ...core.linalg import balancing
 from ...core.lti import StateSpace
 from ...core.norms import gramian, h2_norm
-from ...core.rounding import TINY
+from ...core.rounding import EPS, TINY
 from ..generalized_plant import GeneralizedPlant
 from ..riccati.h2 import h2
 from .barrier import Block
@@ -78,7 +78,7 @@ def balance(plant: GeneralizedPlant) -> Balanced:
     P = gramian(A, np.vstack([plant.B1 - L @ plant.D21, K.B @ plant.D21]), plant.dt)
     E, X = P[:n, :n], P[:n, :n] + P[:n, n:] + P[n:, :n] + P[n:, n:]
     X = X + _KNOWN**2 * np.diag(np.where(np.diag(X) > 0, 0.0, np.diag(X).max(initial=1.0)))
-    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > 1e-28 * np.diag(X), 0.0, np.diag(X)))
+    E = E + _KNOWN**2 * np.diag(np.where(np.diag(E) > EPS**2 * np.diag(X), 0.0, np.diag(X)))
     T, back, s = balancing(np.linalg.cholesky(X), np.linalg.inv(np.linalg.cholesky(E)).T)
     size = h2_norm(plant.channel(rows, slice(None)).close(K))
     scale = np.ones(plant.sizes[3])
@@ -91,10 +91,9 @@ def balance(plant: GeneralizedPlant) -> Balanced:
 
 @dataclass(frozen=True, eq=False)
 class MixedInequalities:
-    """The inequalities of one balanced plant (D22 = 0) at one level, for any solver."""
+    """The inequalities of one balanced plant (D22 = 0), for any solver."""
 
     balanced: Balanced
-    gamma: float  # Level of the H-infinity constraint
 
     @property
     def shapes(self) -> dict[str, tuple[int, int, bool]]:
@@ -175,7 +174,7 @@ class MixedInequalities:
                 blocks.append(_blocks([[-W - Wt, W, B], [Wt, G, zero], [Bt, zero.T, one]]))
                 blocks.append(_blocks([[v["Z"], C, D], [Ct, G, zero], [Dt, zero.T, one]]))
             else:
-                level = self.gamma**2 * np.eye(C.shape[-2])
+                level = np.eye(C.shape[-2])
                 blocks.append(
                     _blocks([[-W - Wt, W, B, -Ct], [Wt, G, zero, Ct], [Bt, zero.T, one, Dt], [-C, C, D, level]])
                 )

@@ -35,7 +35,7 @@ from ...core.rounding import AGREED
 from ...core.settings import member
 from ...uncertainty.forms import Form, as_form
 from ..assumptions import require_detectable
-from ..generalized_plant import GeneralizedPlant, split
+from ..generalized_plant import GeneralizedPlant
 from ..result import Injection
 from .interconnect import interconnect
 from .uncertainty_location import LOCATIONS, UncertaintyLocation
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from ...uncertainty.model import UncertainModel
 
 Array = npt.NDArray[Any]
-_WEIGHTS = ("W_L", "W_R", "W_u", "W_p", "remainder_left", "remainder_right")
+_WEIGHTS = ("W_L", "W_R", "W_u", "remainder_left", "remainder_right")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +74,10 @@ class ObserverProblem:
     input_scale: Array  # (m,), physical size of each input
     output_scale: Array  # (n,), physical size of each (lifted) state
     noise: Array  # (q,), standard deviation of the white measurement noise per sample, in the units of y
-    n_original: int | None = None  # the first states are the original ones, the rest have no weight; default all
+    n_original: int | None = (
+        None  # the first states are the original ones, whose errors over `output_scale` count; default all
+    )
     W_u: StateSpace | None = None  # (m, m), of the scaled inputs; default white inputs of unit variance
-    W_p: Array | StateSpace | None = None  # (p, n), on the error; default ``1 / output_scale`` on the original states
-    correction_penalty: float = 1e-3  # of the scaled correction, where the problem is singular without it
     remainder_left: StateSpace | None = None  # (n, n), left weight of the additive remainder on scaled states
     remainder_right: StateSpace | None = None  # (m, m), right weight of it on scaled inputs
     injection: Injection = Injection.STATE  # where the correction enters
@@ -102,10 +102,7 @@ class ObserverProblem:
         valid = level.shape == (n,) and bool(np.all(np.isfinite(level) & (level >= 0)))
         self._require(valid, f"process_noise should be {n} numbers of at least zero, found {level}")
         put("process_noise", level)
-        W_p = np.diag(1 / self.output_scale)[:kept] if self.W_p is None else self.W_p
-        put("W_p", gain(W_p, self.nominal.dt) if isinstance(W_p, np.ndarray | list) else W_p)
-        penalty, one = self.correction_penalty, (self.remainder_left is None) != (self.remainder_right is None)
-        self._require(penalty > 0, f"correction_penalty = {penalty} should be positive; 1e-3 is the default")
+        one = (self.remainder_left is None) != (self.remainder_right is None)
         self._require(self.injection is not Injection.NONE, "injection should be INPUT or STATE, found NONE")
         self._require(not one, "remainder_left and remainder_right come together, found only one of them")
         self._check_weights()
@@ -118,7 +115,7 @@ class ObserverProblem:
         """Refuse weights whose sizes or sampling periods do not fit; None is any size."""
         n, m, dt = self.nominal.n_states, self.nominal.n_inputs, self.nominal.dt
         rows, columns = self.location.sizes(n, m)
-        sizes = (rows, None), (None, columns), (m, m), (None, n), (n, None), (None, m)
+        sizes = (rows, None), (None, columns), (m, m), (n, None), (None, m)
         for name, (height, width) in zip(_WEIGHTS, sizes, strict=True):
             if getattr(self, name) is not None:
                 weight = StateSpace.of(getattr(self, name))
@@ -131,15 +128,7 @@ class ObserverProblem:
                 self._require(weight.dt == dt, f"{name} is sampled at {weight.dt} s, the nominal model at {dt} s")
 
     @classmethod
-    def from_uncertain(
-        cls,
-        models: ModelSet,
-        uncertain: UncertainModel,
-        noise: npt.ArrayLike,
-        *,
-        injection: Any = Injection.STATE,
-        correction_penalty: float = 1e-3,
-    ) -> ObserverProblem:
+    def from_uncertain(cls, models: ModelSet, uncertain: UncertainModel, noise: npt.ArrayLike) -> ObserverProblem:
         """Return the problem of the nominal unit and the set around it, remainder included.
 
         Parameters
@@ -149,8 +138,6 @@ class ObserverProblem:
         uncertain : UncertainModel
         noise : array_like, shape (q,)
             Standard deviation of every measurement's noise, in the units of `models`.
-        injection : Injection or its name
-        correction_penalty : float
 
         Raises
         ------
@@ -172,10 +159,8 @@ class ObserverProblem:
             output_scale=models.output_scale,
             noise=np.asarray(noise, dtype=float),
             n_original=models.lifting.n_states,
-            correction_penalty=correction_penalty,
             remainder_left=remainder.left if remainder is not None else None,
             remainder_right=remainder.right if remainder is not None else None,
-            injection=injection,
             form=uncertain.form,
         )
         freqs = uncertain.freqs_hz[:: max(1, len(uncertain.freqs_hz) // 8)]
@@ -196,17 +181,11 @@ class ObserverProblem:
         return self.W_u if self.W_u is not None else gain(np.eye(self.nominal.n_inputs), self.nominal.dt)
 
     @cached_property
-    def performance(self) -> StateSpace:
-        """W_p on scaled states."""
-        W_p, x = StateSpace.of(self.W_p), self.output_scale
-        return StateSpace(W_p.A, W_p.B * x, W_p.C, W_p.D * x, W_p.dt)
-
-    @cached_property
     def scaled(self) -> tuple[Array, Array, Array, Array]:
-        """A, B, C and the direct part of W_p in scaled coordinates; the measurement noise has unit covariance."""
+        """A, B, C and the selection W_p of the original states, scaled; the measurement noise has unit covariance."""
         x, u = self.output_scale, self.input_scale
         A, B = self.nominal.A * x / x[:, None], self.nominal.B * u / x[:, None]
-        return A, B, self.C * x / self.noise[:, None], self.performance.D
+        return A, B, self.C * x / self.noise[:, None], np.eye(len(A))[: self.n_original]
 
     @cached_property
     def scaled_model(self) -> StateSpace:
@@ -280,17 +259,13 @@ class ObserverProblem:
 
         W = (d, r, n, v), z = W_p e, y = C e + n; d acts at the input, r at the state, v is process noise.
         """
-        A, B, C, _ = self.scaled
-        n, m, q, eye = len(A), B.shape[1], len(C), np.eye
-        whole = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), self.nominal.dt)
-        w = {"d": m, "r": n, "n": q, "v": n}
-        error = {"error": eye(n), "r": eye(n)}
-        wires = {"error": {"d": B, "v": np.diag(self.scaled_process_noise), "u": -self.injection_matrix}, "W_p": error}
-        outputs = {"z": {"W_p": eye(self.performance.n_outputs)}, "y": {name: C for name in error} | {"n": eye(q)}}
-        system = interconnect(
-            {"error": whole, "W_p": self.performance}, wires, w | {"u": self.correction_size}, outputs
-        )
-        return split(system, sum(w.values()), self.performance.n_outputs)
+        A, B, C, W_p = self.scaled
+        n, m, q, J = len(A), B.shape[1], len(C), self.injection_matrix
+        B1 = np.hstack([B, np.zeros((n, n + q)), np.diag(self.scaled_process_noise)])
+        D11 = np.hstack([np.zeros((len(W_p), m)), W_p, np.zeros((len(W_p), q + n))])
+        D21 = np.hstack([np.zeros((q, m)), C, np.eye(q), np.zeros((q, n))])
+        D12, D22 = (np.zeros((rows, J.shape[1])) for rows in (len(W_p), q))
+        return GeneralizedPlant(A, B1, -J, W_p, C, D11, D12, D21, D22, self.nominal.dt)
 
     def error_system(self, controller: StateSpace) -> StateSpace:
         """Closed error system from (d, r, n, v), scaled, to W_p e, for a controller in physical units."""
@@ -307,21 +282,19 @@ class ObserverProblem:
         ``e = x - F [C x + n; x; s]``, ``x = G (s + d) + r + (zI - A)^-1 v``; F from measurements, states (for functions
         of what is measured) and inputs to all states, in physical units.
         """
-        A, B, C, _ = self.scaled
+        A, B, C, W_p = self.scaled
         n, m, q, eye, dt = len(A), B.shape[1], len(C), np.eye, self.nominal.dt
         sizes = np.diag([*self.noise, *self.output_scale, *self.input_scale])
         filters = gain(np.diag(1 / self.output_scale), dt) @ estimate @ gain(sizes, dt)
         truth = np.vstack([C, eye(n), np.zeros((m, n))])
         columns = {"n": eye(q + n + m, q), "s": eye(q + n + m)[:, q + n :]}
         plant = StateSpace(A, eye(n), eye(n), np.zeros((n, n)), dt)
-        blocks = {"plant": plant, "F": filters, "W_p": self.performance}
         wires = {
             "plant": {"d": B, "s": B, "v": np.diag(self.scaled_process_noise)},
             "F": {"plant": truth, "r": truth} | columns,
-            "W_p": {"plant": eye(n), "r": eye(n), "F": -eye(n)},
         }
-        inputs = {"d": m, "r": n, "n": q, "v": n, "s": m}
-        return interconnect(blocks, wires, inputs, {"z": {"W_p": eye(self.performance.n_outputs)}})
+        inputs, outputs = {"d": m, "r": n, "n": q, "v": n, "s": m}, {"z": {"plant": W_p, "r": W_p, "F": -W_p}}
+        return interconnect({"plant": plant, "F": filters}, wires, inputs, outputs)
 
     @property
     def _scales(self) -> tuple[Array, Array]:

@@ -185,8 +185,8 @@ class _Scaled:
         if not shaping.n_states or (tolerance_percent <= 0 and most >= shaping.n_states):
             return K
         best, loop = self.deviations(shaping, K), self.loop(shaping, K)
-        seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T, self.dt)[-shaping.n_states :]
-        left, right, values = balancing(gramian_root(shaping.A, shaping.B, self.dt), seen, ROUNDING)
+        seen = gramian_root(loop.A.T, (loop.C / best[:, None]).T)[-shaping.n_states :]
+        left, right, values = balancing(gramian_root(shaping.A, shaping.B), seen, ROUNDING)
         allowed = (1 + tolerance_percent / 100) * best[self.hidden]
 
         def of_order(k: int) -> StateSpace:

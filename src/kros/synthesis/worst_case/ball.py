@@ -17,12 +17,8 @@ Giving them multipliers g_i, l_j >= 0 with ``g_i + l_j >= d_ij`` and completing 
 *Any* feasible multipliers give a valid bound; coordinate descent makes it good. For ``a = 0`` it is ``sum s_i^2 q_i^2``
 (von Neumann's trace inequality, `spread`), for scalars ``(|a| + s q)^2``: both exact.
 
-*Lower bound.* The worst case is at least any average over the set. Theta uniform on the matrices (b, a) with
-orthonormal columns or rows has mean zero and ``E[Theta Q Q^H Theta^H] = I ||Q||_F^2 / max(a, b)`` (`Ball.average`). If
-N and M are diagonal, the set of ``X M`` does not change under ``X -> V X V^H`` with V a diagonal matrix of signs, and
-without a loop not under ``X -> V X``. Averaging over V removes the off-diagonal entries of ``X M M^H X^H``, so in both
-cases *the diagonal of the spectrum of any element* gives a lower bound as well. Elsewhere the largest diagonal spectrum
-below the average's is used.
+*Average.* Theta uniform on the matrices (b, a) with orthonormal columns or rows has mean zero and ``E[Theta Q Q^H
+Theta^H] = I ||Q||_F^2 / max(a, b)`` (`Ball.average`).
 
 Symbols
 -------
@@ -74,10 +70,6 @@ class Ball:
         energy = np.sum(np.abs(self.right) ** 2, axis=(-2, -1)) / max(self.right.shape[-2], self.left.shape[-1])
         return self.center @ adjoint(self.center) + energy[..., None, None] * (self.left @ adjoint(self.left))
 
-    def spectrum(self, theta: Array) -> Array:
-        """Diagonal of the spectrum of the element of a contraction (f, b, a), shape (f, b)."""
-        return np.sum(np.abs(self.center + self.left @ theta @ self.right) ** 2, axis=-1)
-
     def worst(self, T: Array, certain: Array | float = 0.0, iterations: int = 15) -> Array:
         """Contraction of an element that is (locally) worst for ``certain + T X M``, shape (f, b, a)."""
         P, Qh = T @ self.left, adjoint(self.right)
@@ -117,14 +109,6 @@ def _with_gains(U: Array, gains: Array) -> Array:
     """Return ``U diag(gains, 1, ...) U^H``."""
     gains = np.concatenate([gains, np.ones((*gains.shape[:-1], U.shape[-1] - gains.shape[-1]))], axis=-1)
     return (U * gains[..., None, :]) @ adjoint(U)
-
-
-def below(spectrum: Array) -> Array:
-    """Return a diagonal spectrum below a full one, proportional to its diagonal: shape (f, b) for (f, b, b)."""
-    power = np.real(np.einsum("fii->fi", spectrum))
-    root = np.sqrt(np.maximum(power, TINY))
-    least = np.linalg.eigvalsh(spectrum / (root[:, :, None] * root[:, None, :]))[:, 0]
-    return power * np.clip(least, 0.0, 1.0)[:, None]
 
 
 def polar(matrix: Array) -> Array:

@@ -32,6 +32,8 @@ from .ball import spread, uncertain_ball
 Array = npt.NDArray[Any]
 Density = Callable[[ObserverProblem, StateSpace, Array], Array]
 
+_ACCURACY = 1e-5  # of the quadrature, relative; a hundred times as much for what is attained
+
 
 def density(problem: ObserverProblem, errors: StateSpace, freqs_hz: Array) -> Array:
     """Certified worst-case power density of ``W_p e``, shape (f,), for the error system from (d, r, n, v[, s])."""
@@ -67,24 +69,22 @@ def _responses(
     return response, T, certain, np.sum(np.abs(response[..., white:direct]) ** 2, axis=(-2, -1))
 
 
-def certify(problem: ObserverProblem, controller: StateSpace, rtol: float = 1e-5) -> tuple[float, float]:
+def certify(problem: ObserverProblem, controller: StateSpace) -> tuple[float, float]:
     """Return the certified worst-case H2 norm of ``W_p e`` and the quadrature error that it includes."""
-    return certify_errors(problem, problem.error_system(controller), rtol=rtol)
+    return certify_errors(problem, problem.error_system(controller))
 
 
-def certify_errors(
-    problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-5
-) -> tuple[float, float]:
+def certify_errors(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0) -> tuple[float, float]:
     """Return what `certify` returns, for the error system from (d, r, n, v[, s]) and the mean of ``W_p e``."""
-    squared, error = _mean_square(problem, errors, density, rtol)
+    squared, error = _mean_square(problem, errors, density, _ACCURACY)
     squared += float(np.sum(np.square(mean)))
     upper = float(np.sqrt(squared + error))
     return upper, upper - float(np.sqrt(squared))
 
 
-def attained(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0, rtol: float = 1e-3) -> float:
+def attained(problem: ObserverProblem, errors: StateSpace, mean: Array | float = 0.0) -> float:
     """Return a lower bound of this very observer's worst case: what a perturbation attains at every frequency."""
-    squared, error = _mean_square(problem, errors, attained_density, rtol)
+    squared, error = _mean_square(problem, errors, attained_density, 100 * _ACCURACY)
     return float(np.sqrt(max(squared - error, 0.0) + np.sum(np.square(mean))))
 
 
@@ -98,9 +98,9 @@ def _mean_square(problem: ObserverProblem, errors: StateSpace, of: Density, rtol
     return circle_mean(lambda theta: of(problem, errors, theta / rate), _log_poles(problem, errors), rtol)
 
 
-def certified(problem: ObserverProblem, controller: StateSpace, method: str, rtol: float = 1e-5) -> Synthesis:
+def certified(problem: ObserverProblem, controller: StateSpace, method: str) -> Synthesis:
     """Return a controller in physical units with its certificate; ``h2_norm`` is that of the noise alone."""
-    value, error = certify(problem, controller, rtol)
+    value, error = certify(problem, controller)
     loop, white = problem.error_system(controller), problem.nominal.n_inputs + problem.nominal.n_states
     return Synthesis(
         method=method,
@@ -129,7 +129,7 @@ _ALL = np.concatenate([_NODES, _ROUGH_NODES])
 
 
 def circle_mean(
-    density: Callable[[Array], Array], centers: Array, rtol: float = 1e-6, max_panels: int = 4000
+    density: Callable[[Array], Array], centers: Array, rtol: float, max_panels: int = 4000
 ) -> tuple[float, float]:
     """Return mean and error over the circle of an even density of angles (k,); `centers` are log poles."""
     edges = _edges(centers)

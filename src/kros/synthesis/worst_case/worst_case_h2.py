@@ -1,11 +1,10 @@
 r"""Worst-case H2 observers: filtering of a shaped disturbance, by one Riccati equation.
 
 K is outside the loop of the uncertainty, so the worst case over the set is a disturbance spectrum, and the best K for a
-given spectrum is a Kalman predictor (state injection) or an H2 controller (input injection). The observer is designed
-for the average spectrum of the set and certified on the set itself; where it guarantees less than no correction,
-nothing is corrected.
+given spectrum is a Kalman predictor, which corrects the state. The observer is designed for the average spectrum of the
+set and certified on the set itself; where it guarantees less than no correction, nothing is corrected.
 
-*State injection.* With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
+With ``d = C_d x_d + D_d nu``, ``x_d+ = A_d x_d + B_d nu`` the shaped input disturbance, and ``r``
 the shaped disturbance of the state, the error is ``e = xi + r``, ``xi+ = A xi + B d - y^c``, ``y = C e + n``. The
 correction has full authority over the state, so the optimum keeps the predicted error at zero:
 
@@ -13,14 +12,9 @@ correction has full authority over the state, so the optimum keeps the predicted
     x_d^+ = A_d x_d^ + L_d y,    x_r^+ = A_r x_r^ + L_r y
 
 with ``L`` the gain of the steady-state predictor of ``(xi, x_d, x_r)``. The order of K is that of the shaping filters
-only. A performance weight with states of its own makes past errors matter, which a predictor cannot mend: then, as for
-input injection, the H2 controller of the whole plant is taken.
+only.
 
-*Lower bound.* The same model, driven by filters that lie below the spectrum of the average over the set, or of its
-worst element, at all frequencies
-(`everywhere`), gives an error that no observer beats: state injection contains input injection (``K_state = B
-K_input``), and an observer's ``W_p x_hat`` is one of the causal estimates of ``W_p x`` over which a predictor is the
-best. It is the optimum of a Riccati equation.
+The lower bound is in `members`.
 """
 
 from __future__ import annotations
@@ -28,41 +22,43 @@ from __future__ import annotations
 import time
 from dataclasses import replace
 from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from ...core.errors import SynthesisError
 from ...core.lti import StateSpace, gain
-from ...core.rounding import ROUNDING
+from ...uncertainty.weights.magnitude import fit_magnitude
 from ..problem.observer_problem import ObserverProblem
-from ..problem.plants import penalise, shaped_plant
+from ..problem.plants import shaped_plant
 from ..result import Injection, Status, Synthesis, enclosed
-from ..riccati.h2 import h2
-from ..riccati.kalman import predictor, predictor_bound
+from ..riccati.kalman import predictor
 from .certificate import certified
-from .disturbance import Channels, Fit, Shaping, design_grid, symmetric
-from .everywhere import Everywhere
-
-_BOUND_ORDERS = (1, 2)  # of filters in lower bounds: W_L is behind them as it is, and what is left is smooth
+from .disturbance import Fit, average_disturbance
+from .members import lower_bound
 
 
 def worst_case_h2(
-    problem: ObserverProblem, *, max_order: int = 4, tolerance_db: float = 1.0, fit: Any = None, bounded: bool = True
+    problem: ObserverProblem,
+    *,
+    max_order: int = 4,
+    tolerance_db: float = 1.0,
+    fit: Fit = fit_magnitude,
+    bounded: bool = True,
 ) -> Synthesis:
     """Return an observer filter with a certified H2 norm for every member of the uncertain set.
 
     Parameters
     ----------
     problem : ObserverProblem
+        Its correction enters at the state, whatever its `injection`.
     max_order : int
         Highest order of each shaping filter; the smallest within `tolerance_db` is taken.
     tolerance_db : float, dB
         Accuracy of the shaping filters. It costs optimality, never validity: the certificate uses the set itself.
-    fit : callable, optional
+    fit : callable
         ``fit(freqs_hz, magnitude, dt, max_order=, tolerance_db=)`` with a result whose ``.system`` is a filter;
-        default `kros.uncertainty.fit_magnitude`.
+        by default `kros.uncertainty.fit_magnitude`.
     bounded : bool
         False: only the design, neither certified nor bounded from below, for those who design many and compare them on
         recordings.
@@ -89,24 +85,18 @@ def worst_case_h2(
     >>> observer.lower_bound <= observer.worst_case_h2, observer.gap_percent < 5
     (True, True)
     """
+    problem = replace(problem, injection=Injection.STATE)
     problem.require_sound()
-    if fit is None:
-        from ...uncertainty.weights.magnitude import fit_magnitude
-
-        fit = fit_magnitude
-    channels = Channels(problem, design_grid(problem))
-    order = {"max_order": max_order, "tolerance_db": tolerance_db}
-    shaping = channels.shaping(channels.average(), partial(fit, **order), "above")
+    shaped = average_disturbance(problem, partial(fit, max_order=max_order, tolerance_db=tolerance_db))
     start = time.perf_counter()
-    controller = design(problem, shaping)
+    controller = design(problem, *shaped)
     elapsed = time.perf_counter() - start
     if not bounded:
         return _design_alone(problem, controller)
     nothing = gain(np.zeros((problem.correction_size, len(problem.C))), problem.nominal.dt)
     candidates = [certified(problem, K, "worst_case_h2") for K in (nothing, controller)]
     best = min(candidates, key=lambda candidate: candidate.worst_case_h2 or 0.0)
-    bounds = lower_bounds(channels, best.controller, fit, max_order)
-    lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, max(bounds, default=None))
+    lower, gap, notes = enclosed(best.worst_case_h2 or 0.0, lower_bound(problem))
     note = "The spectral radius is that of the nominal loop and says nothing about robustness, worst_case_h2 does."
     return replace(best, lower_bound=lower, gap_percent=gap, solve_s=elapsed, notes=(note, *notes))
 
@@ -121,12 +111,9 @@ def _design_alone(problem: ObserverProblem, controller: StateSpace) -> Synthesis
     return Synthesis("worst_case_h2", controller, Status.INACCURATE, **facts, notes=notes)
 
 
-def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
-    """Return the filter that is H2-optimal for the shaped disturbances, in physical units."""
-    d, r = shaping.at_input_and_state(problem)
+def design(problem: ObserverProblem, d: StateSpace, r: StateSpace) -> StateSpace:
+    """Return the filter that is H2-optimal for shaped disturbances of input and state, in physical units."""
     plant = shaped_plant(problem, d, r)
-    if problem.injection is Injection.INPUT or problem.performance.n_states:
-        return problem.to_physical(h2(penalise(plant, problem.correction_penalty)).controller)
     A, B, _, _ = problem.scaled
     n, kd, kr = len(A), d.n_states, r.n_states
     noises = plant.B1 @ plant.B1.T, plant.D21 @ plant.D21.T, plant.B1 @ plant.D21.T
@@ -135,19 +122,3 @@ def design(problem: ObserverProblem, shaping: Shaping) -> StateSpace:
     dynamics = np.block([[d.A, np.zeros((kd, kr))], [np.zeros((kr, kd)), r.A]])
     output = np.hstack([B @ d.C, r.C @ r.A - A @ r.C])
     return problem.to_physical(StateSpace(dynamics, np.vstack([L_d, L_r]), output, L_xi + r.C @ L_r, d.dt))
-
-
-def lower_bounds(channels: Channels, controller: StateSpace, fit: Fit, max_order: int) -> list[float]:
-    """Norms that no observer beats: of the average over the set, and of its worst element for one observer."""
-    apart = Channels(channels.problem, channels.freqs_hz, apart=True)
-    proofs, even = Everywhere(apart), symmetric(channels.problem)
-    spectra = [apart.average(correlated=not even), *([apart.worst(controller)] if even else [])]
-    orders, bounds = sorted({min(order, max_order) for order in _BOUND_ORDERS}), []
-    for order, spectrum in product(orders, spectra):
-        shaping = proofs.lowered(
-            apart.shaping(spectrum, partial(fit, max_order=order, tolerance_db=0.0), "below"), spectrum
-        )
-        plant = shaped_plant(channels.problem, *shaping.at_input_and_state(channels.problem))
-        squared = predictor_bound(plant.A, plant.B1, plant.C2, plant.D21, plant.C1)
-        bounds.append(float(np.sqrt(squared + np.sum(plant.D11**2) * (1 - ROUNDING))))
-    return [bound for bound in bounds if bound > 0]

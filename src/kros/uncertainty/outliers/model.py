@@ -29,10 +29,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...core.artifacts import check_shapes, load_artifact, loader, save_artifact
+from ...core.artifacts import load_artifact, loader, save_artifact
 from ...core.errors import ConfigError, DataError
 from ..forms import Form, as_form, check_responses
-from ..inputs import check_scale
 from ..settings import OUTLIER
 from .distances import Distances, balance, distances, scaled_levels
 from .score import Comparison, OutlierScore, Status
@@ -155,8 +154,6 @@ class OutlierModel:
     def load(cls, folder: Path) -> OutlierModel:
         """Read what `save` wrote."""
         content, arrays = load_artifact(Path(folder), "outlier_model")
-        axes = {"freqs_hz": "f", "responses": "ufpm", "output_scale": "p", "input_scale": "m"}
-        check_shapes(arrays, axes, {"u": len(content["unit_ids"])}, Path(folder))
         threshold = float("inf") if content["threshold_db"] is None else content["threshold_db"]
         facts = {name: content[name] for name in _FACTS} | {name: arrays[name] for name in _ARRAYS}
         facts |= {"form": Form(content["form"]), "unit_ids": tuple(content["unit_ids"]), "threshold_db": threshold}
@@ -169,8 +166,6 @@ def score_outliers(
     form: Form | str = Form.ADDITIVE,
     *,
     unit_ids: tuple[str, ...] | None = None,
-    output_scale: npt.ArrayLike | None = None,
-    input_scale: npt.ArrayLike | None = None,
     false_alarm_rate: float = 0.01,
 ) -> OutlierModel:
     """Score every unit of a population against the others.
@@ -178,14 +173,12 @@ def score_outliers(
     Parameters
     ----------
     responses : array_like, shape (unit, frequency, p, m), complex
-        In physical units, of all units; nothing but the responses is looked at.
+        In any units of measure, which do not matter: outputs and inputs are scaled such that the responses' typical
+        entries are equal. Nothing but the responses is looked at.
     freqs_hz : array_like, shape (frequency,), Hz
         Increasing, above zero.
     form : Form or str
     unit_ids : tuple of str, optional
-    output_scale, input_scale : array_like, optional
-        Ranges; without both, those at which the responses' typical entries are equal, so that units of measure never
-        matter.
     false_alarm_rate : float
         Nominal rate per unit of the tail model.
 
@@ -220,8 +213,6 @@ def score_outliers(
     rows = scored_rows(len(freqs))
     freqs, G = freqs[rows], G[:, rows]
     scales = balance(G)
-    if output_scale is not None or input_scale is not None:
-        scales = check_scale("output", output_scale, G.shape[2]), check_scale("input", input_scale, G.shape[3])
     G = G / scales[0][:, None] * scales[1]
     found = distances(form, G, freqs)
     parts = separate(found.levels, rate)

@@ -67,8 +67,6 @@ def score_condition(
         freqs,
         settings.outlier_form,
         unit_ids=tuple(ids[k] for k in well),
-        output_scale=models.output_scale,
-        input_scale=models.input_scale,
         false_alarm_rate=settings.false_alarm_rate,
     )
     known = {score.unit: score for score in outliers.scores}

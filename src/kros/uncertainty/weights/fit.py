@@ -44,9 +44,6 @@ def fit_weight(
             break
         weight = fit.again(missed)
         proof, ratio = fit.proven(weight)
-    if proof.bound > FIT.deficit:
-        weight = weight.scaled(proof.bound)
-        proof, ratio = fit.proven(weight)
     cover = fit.optimal.at(np.searchsorted(fit.freqs_hz, freqs_hz))
     return _lifted(weight, proof, float(ratio.max())).measured(freqs_hz, cover), cover
 
@@ -114,8 +111,7 @@ class _Fit:
             return self.residuals.ratio(weight.magnitudes(freqs_hz), freqs_hz)
 
         known, realised = ratio(self.checked_hz), self.residuals.realised
-        sound = 0 < known.max() <= FIT.deficit  # otherwise it is fitted again
-        pencils = realised.ratios(weight.left, weight.right) if realised and sound else []
+        pencils = realised.ratios(weight.left, weight.right) if realised and known.max() > 0 else []
         return certify(ratio, self.checked_hz, known, pencils, weight.left.dt), known.max(axis=0)
 
     def _weight(self) -> Weight:

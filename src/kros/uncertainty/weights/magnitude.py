@@ -244,7 +244,7 @@ class _Grid:
             return None
         norm = np.concatenate([np.zeros(size), d.mean(axis=0), [0.0]]) * unit
         cost, zero = np.eye(2 * size + 1)[-1], np.zeros(len(table))
-        exact = {"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10}
+        exact = dict.fromkeys(("primal_feasibility_tolerance", "dual_feasibility_tolerance"), 1e-10)
         solved = linprog(cost, table, zero, norm[None], [1.0], (None, None), "highs-ds", options=exact)
         return (solved.x[:size] * unit[:size], solved.x[size:-1] * unit[size:-1]) if solved.status == 0 else None
 

@@ -31,14 +31,13 @@ import numpy.typing as npt
 from ...core.frequency import nyquist_hz
 from ...core.lti import StateSpace
 from ...core.norms import to_continuous
-from ..forms import Form
+from ..forms import OUTPUT_SIDE, Form, change_of, loop_of, residual_of
 from ..settings import PROOF
 
 Array = npt.NDArray[Any]
 Ratio = Callable[[Array], Array]
 
 _LOG = logging.getLogger(__name__)
-_OUTPUT_SIDE = (Form.OUTPUT_MULTIPLICATIVE, Form.INVERSE_OUTPUT_MULTIPLICATIVE)
 
 
 class Method(str, Enum):
@@ -58,8 +57,8 @@ class Certificate:
 
     @property
     def bound(self) -> float:
-        """What no ratio exceeds, by level sets; the largest one that was evaluated, on a grid."""
-        return self.peak * (1 + PROOF.margin) if self.method is Method.LEVEL_SETS else self.peak
+        """What no ratio exceeds, by level sets; on a grid the same above the largest one that was evaluated."""
+        return self.peak * (1 + PROOF.margin)
 
 
 def certify(ratio: Ratio, freqs_hz: Array, known: Array, pencils: list[Descriptor], dt: float) -> Certificate:
@@ -228,7 +227,8 @@ class ResidualSystems:
         G = Descriptor.of(self.nominal)
         for k in range(self.units.batch_shape[0]):
             Gp = Descriptor.of(self.units[k])
-            yield _remainder(self.form, G, Gp) if self.remainder else _residual(self.form, G, Gp)
+            E = residual_of(self.form, G, Gp, Descriptor.pseudo_inverse)
+            yield _remainder(self.form, G, Gp, E) if self.remainder else E
 
     def ratios(self, left: StateSpace, right: StateSpace) -> list[Descriptor]:
         """Return `W_L^-1 E_k W_R^-1` for every unit; none where pencils are large or nothing is left out."""
@@ -256,28 +256,16 @@ def leaves_nothing(form: Form, n_outputs: int, n_inputs: int) -> bool:
     """Tell whether a form rebuilds every regular unit of a shape exactly."""
     if form in (Form.ADDITIVE, Form.INVERSE_ADDITIVE):
         return form is Form.ADDITIVE or n_outputs == n_inputs
-    return n_outputs >= n_inputs if form in _OUTPUT_SIDE else n_outputs <= n_inputs
+    return n_outputs >= n_inputs if form in OUTPUT_SIDE else n_outputs <= n_inputs
 
 
-def _residual(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
-    """Return the residual of a form, as in `forms.residual`."""
-    difference = Gp - G
-    if form is Form.ADDITIVE:
-        return difference
-    inverse = (Gp if form.inverse else G).pseudo_inverse()
-    if form in _OUTPUT_SIDE:
-        return difference @ inverse
-    return inverse @ difference @ G.pseudo_inverse() if form is Form.INVERSE_ADDITIVE else inverse @ difference
-
-
-def _remainder(form: Form, G: Descriptor, Gp: Descriptor) -> Descriptor:
+def _remainder(form: Form, G: Descriptor, Gp: Descriptor, E: Descriptor) -> Descriptor:
     """Return the remainder of a form: the unit minus what `forms.rebuild` makes of the residual."""
-    E = _residual(form, G, Gp)
     if not form.inverse:
-        return (Gp - G) - (E @ G if form in _OUTPUT_SIDE else G @ E)
-    loop = E @ G if form is Form.INVERSE_ADDITIVE else E
+        return (Gp - G) - change_of(form, G, E)
+    loop = loop_of(form, G, E)
     inverse = (Descriptor.identity(len(loop.D)) - loop).inverse()
-    return Gp - (inverse @ G if form is Form.INVERSE_OUTPUT_MULTIPLICATIVE else G @ inverse)
+    return Gp - (inverse @ G if form in OUTPUT_SIDE else G @ inverse)
 
 
 def invert(system: StateSpace) -> StateSpace:

@@ -243,7 +243,10 @@ class Fold:
                     ..., : batch.states.shape[-1]
                 ],
             )
-        yield LEARNED, learned.run(batch, batch.parameters)
+        yield (
+            LEARNED,
+            learned.estimate(batch.keys, batch.measurements(learned.measured), batch.inputs, batch.parameters),
+        )
 
     def rows(self, designs: Designs, batch: EpisodeBatch, learned: Any, **case: Any) -> list[dict[str, Any]]:
         """Return errors in percent of the largest value of a unit in a condition, mean over its test episodes."""

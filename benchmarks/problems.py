@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
+from kros import from_arrays
 from kros.core import StateSpace, gain
 from kros.core.frequency import log_grid
 from kros.data import EpisodeKey, Population, Unit
@@ -36,24 +37,13 @@ def recording(n_samples: int, seed: int = 0) -> tuple[Array, Array]:
     return rng.normal(size=(n_samples, 3)).cumsum(axis=0) * 1e-2, rng.normal(size=(n_samples, 2))
 
 
-@dataclass(frozen=True, eq=False)
-class Repeated:
-    """A few simulated episodes over and over, under many names."""
-
-    episodes: tuple[Array, ...]
-
-    def __call__(self, key: EpisodeKey) -> Array:
-        return self.episodes[int(key.episode) % len(self.episodes)]
-
-
 def raw_drives(n_episodes: int, seconds: float = 19.0) -> Population:
     """Return one simulated drive as recorded."""
     raw = HarmonicDrivePopulation(n_units=1, n_episodes=2, seconds=seconds, conditions=("noload",)).simulate().raw
-    keys = tuple(EpisodeKey("000000", "noload", str(e)) for e in range(n_episodes))
+    two = [raw.read(key) for key in raw.episodes]
+    data = {EpisodeKey("000000", "noload", str(e)): two[e % 2] for e in range(n_episodes)}
     units = (Unit("000000", "population"),)
-    return Population(
-        raw.channels, raw.sample_period_s, units, keys, Repeated(tuple(map(raw.read, raw.episodes))), raw.metadata
-    )
+    return from_arrays(data, raw.channels, raw.sample_period_s, units=units, metadata=raw.metadata)
 
 
 def lags(n_units: int, seed: int = 0) -> StateSpace:

@@ -82,7 +82,10 @@ def errors(
     rows = []
     for batch in (EpisodeBatch.read(population, [key]) for key in test):
         y, truth = batch.measurements(measured), batch.states[:, 0][:, hidden]
-        runs = [run_observer(observer, y, batch.inputs)[:, 0][:, hidden], ridge.run(batch, {})[:, 0][:, hidden]]
+        runs = [
+            run_observer(observer, y, batch.inputs)[:, 0][:, hidden],
+            ridge.estimate(batch.keys, y, batch.inputs, {})[:, 0][:, hidden],
+        ]
         X = features(y[:, 0], batch.inputs[:, 0], recordings.length)
         runs += [np.column_stack([model.predict(X) for model in models]) for models in regressors]
         squares = np.array([(run - truth) ** 2 for run in runs])

@@ -32,6 +32,7 @@ import numpy as np
 import numpy.typing as npt
 
 from kros.data import Channel, EpisodeKey, Population, Role, Unit, write_parquet
+from kros.data.prepare import assemble
 from kros.plants.batch import SimulatedEpisodes
 from kros.plants.harmonic_drive.reference import episode_reference
 
@@ -243,9 +244,8 @@ def simulate(
     signals[2] += CURRENT_NOISE * rng.standard_normal(signals[2].shape)
     parts = {key: (signals[:3, i], targets[:, i, REST_SAMPLES:], signals[3:, i]) for i, key in enumerate(keys)}
     metadata = {"plant": "compliant-drive", "gear_ratio": GEAR_RATIO}
-    population = Population(
-        CHANNELS, PERIOD_S, tuple(Unit(u) for u in units), tuple(keys), SimulatedEpisodes(parts), metadata, TRUTHS
-    )
+    columns = (*CHANNELS, *TRUTHS)
+    population = assemble(SimulatedEpisodes(parts), columns, [Unit(u) for u in units], PERIOD_S, metadata)
     return population, {
         "limit": limit,
         "units": {u: {n: float(v[i]) for n, v in parameters.items()} for i, u in enumerate(units)},

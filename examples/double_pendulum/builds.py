@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import kros
-from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.data import Channel, EpisodeKey, Population, Role
 from kros.identify import KoopmanMatrices, combine, edmd, episode_factors, free_run, smallest_stabilising_alpha
 from kros.identify.refine import RefineOptions, refine_population
 from kros.lifting import Lifting
@@ -54,16 +54,17 @@ def read(folder: Path, spikes: bool) -> Recordings:
 
 
 def training(recordings: Recordings, design: tuple[str, ...]) -> Population:
-    """Return the training episodes of a design, cut to pieces of about half a second."""
+    """Return the training episodes of a design, cut to pieces of about half a second in which all states move."""
     pieces = {}
     for build in design:
         for name, values in recordings[build].items():
             if name not in HELD_OUT[build]:
-                for i, piece in enumerate(np.array_split(values, len(values) // PIECE)):
+                split = np.array_split(values, len(values) // PIECE)
+                for i, piece in enumerate(piece for piece in split if np.ptp(piece[:, : len(STATES)], axis=0).all()):
                     pieces[EpisodeKey(build, "default", f"{name}-{i:02d}")] = piece
     channels = [Channel(name, Role.STATE, measured=True) for name in STATES]
     channels += [Channel(name, Role.INPUT) for name in ("command1", "command2")]
-    return Population(tuple(channels), PERIOD_S, tuple(Unit(b) for b in design), tuple(pieces), pieces.__getitem__)
+    return kros.from_arrays(pieces, channels, PERIOD_S)
 
 
 def fit(population: Population) -> dict[str, KoopmanMatrices]:

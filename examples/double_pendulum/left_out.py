@@ -116,7 +116,9 @@ def judged(recordings: Population, held: Sequence[str], folder: Path) -> dict[st
             run = run_observer(observer, batch.states[..., list(observer.measured)], batch.inputs)
             add(name, run, own, facts["relift_certified"], facts.get("worst_case_h2") is not None)
         for name, make in baselines(training, folder).items():
-            add(name, make().run(batch, {}), None, None, None)
+            baseline = make()
+            y = batch.measurements(baseline.measured)
+            add(name, baseline.estimate(batch.keys, y, batch.inputs, {}), None, None, None)
     return table
 
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from kros import from_arrays
 from kros.core import IdentificationError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.data import Channel, EpisodeKey, Role, Unit
 from kros.identify import Factor, KoopmanMatrices, combine, free_run
 from kros.identify.factors import lifted_factor, reduce_episode
 from kros.identify.refine import RefineOptions, refine_population
@@ -44,7 +45,7 @@ def simulated(lifting: Lifting, n_units: int, noise: float, seed: int, spread: f
             )
     channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
     units = tuple(Unit(f"u{row}") for row in range(n_units))
-    population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
+    population = from_arrays(data, channels, 0.01)
     keys = {unit.id: population.keys(unit.id) for unit in units}
     parameters = {"phase": phase} if lifting.parameters else {}
     reduced = [

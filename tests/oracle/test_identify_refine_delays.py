@@ -6,7 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros import from_arrays
+from kros.data import Channel, EpisodeKey, Role, Unit
 from kros.identify import Factor, KoopmanMatrices, combine, free_run
 from kros.identify.factors import lifted_factor, reduce_episode
 from kros.identify.refine import RefineOptions, refine_population
@@ -86,7 +87,7 @@ def machines(n_units: int, noise: float, seed: int, spread: float = 0.02) -> tup
             )
     channels = (Channel("x", Role.STATE), Channel("v", Role.STATE), Channel("u", Role.INPUT))
     units = tuple(Unit(f"u{row}") for row in range(n_units))
-    population = Population(channels, 0.01, units, tuple(data), data.__getitem__)
+    population = from_arrays(data, channels, 0.01)
     keys = {unit.id: population.keys(unit.id) for unit in units}
     reduced = [
         combine(Factor.stack([reduce_episode(data[k][:, :2], data[k][:, 2:], BILINEAR) for k in ks]))

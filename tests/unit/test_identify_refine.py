@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kros import from_arrays
 from kros.core import DataError
-from kros.data import Channel, EpisodeKey, Population, Role, Unit
+from kros.data import Channel, EpisodeKey, Population, Role
 from kros.identify.refine import GaussNewton
 from kros.identify.refine.segments import Segments, held_segments, read_segments
 
@@ -17,10 +18,7 @@ def population(lengths: list[int]) -> tuple[Population, dict]:
         EpisodeKey("u", "default", str(e)): (1000.0 * e + np.arange(n))[:, None] * [1.0, -1.0]
         for e, n in enumerate(lengths)
     }
-    made = Population(
-        (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0, (Unit("u"),), tuple(data), data.__getitem__
-    )
-    return made, {"u": tuple(data)}
+    return from_arrays(data, (Channel("x", Role.STATE), Channel("u", Role.INPUT)), 1.0), {"u": tuple(data)}
 
 
 def test_segments_hold_the_last_episode_at_the_end() -> None:

@@ -65,19 +65,15 @@ class Steps:
         following = np.concatenate([theta, self.x_c, inputs, y], axis=-1) @ self._map.T
         if self.gaps is not None:
             self.gaps.follow(self.x, following[:, :n], missing)
-        on = self._guarded(following, moving)[:, None]
+        within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
+        going = ~self.waiting if moving is None else moving & ~self.waiting
+        self.waiting |= going & ~within  # a step that would leave the bounds is not taken
+        on = (going & within)[:, None]
         np.copyto(self.x, following[:, :n], where=on)
         np.copyto(self.x_c, following[:, n:], where=on)
         if delays:
             np.copyto(self.past, self.lifting.window.advance(window, u), where=on)
             self.fresh &= ~on[:, 0]
-
-    def _guarded(self, following: Array, moving: Flags | None) -> Flags:
-        """Return which machines take the step, shape (batch,): none that wait, and none that would leave the bounds."""
-        within = ((following >= self._low) & (following <= self._high)).all(axis=-1)
-        going = ~self.waiting if moving is None else moving & ~self.waiting
-        self.waiting |= going & ~within
-        return going & within
 
 
 def forward(

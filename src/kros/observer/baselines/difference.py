@@ -41,8 +41,8 @@ class FilteredDifference:
         """Return the same with the scales that fit recordings best, so that units of measure do not matter."""
         y, inside = batch.measurements(measured, arrived=False), np.arange(len(batch.states))[:, None] < batch.lengths
         rates, states = replace(self, scales=()).run(y, y[..., :0])[inside], batch.states[inside]
-        products = [(rates[:, i] @ rates[:, i], rates[:, i] @ states[:, i]) for _, i in self.pairs]
-        return replace(self, scales=tuple(float(along / power) if power else 1.0 for power, along in products))
+        power, along = (rates**2).sum(axis=0), (rates * states).sum(axis=0)
+        return replace(self, scales=tuple(float(along[i] / power[i]) if power[i] else 1.0 for _, i in self.pairs))
 
 
 def followed(batch: EpisodeBatch, measured: Sequence[int], explained: float = 0.5) -> tuple[tuple[int, int], ...]:

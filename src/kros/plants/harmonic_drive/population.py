@@ -119,10 +119,11 @@ class HarmonicDrivePopulation(BatchSettings):
         keys = tuple(EpisodeKey(u.id, c, str(e)) for u in units for c in conditions for e in range(self.n_episodes))
         row, condition, episode = np.unravel_index(np.arange(len(keys)), (len(units), len(conditions), self.n_episodes))
         loaded = np.array([c == "load" for c in conditions], float)[condition]
-        targets, loop = self._targets(), Loop(self.loop)
-        signals = simulate(parameters.take(row), loaded, episode, (targets[0], targets[1]), GAINS[loop])
+        samples, loop = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S), Loop(self.loop)
+        inputs = [np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)]
+        position, velocity = np.stack(inputs, axis=1)
+        signals = simulate(parameters.take(row), loaded, episode, (position, velocity), GAINS[loop])
         self._disturb(signals.states, keys)
-        inputs = [np.ascontiguousarray(targets[:, e]) for e in range(self.n_episodes)]
         parts = {key: (signals.states[i], inputs[episode[i]], signals.velocity[i]) for i, key in enumerate(keys)}
         about = {"plant": self.plant, "gear_ratio": GEAR_RATIO}
         raw = assemble(SimulatedEpisodes(parts), (*CHANNELS, *TRUTHS), units, SAMPLE_PERIOD_S, about)
@@ -137,11 +138,6 @@ class HarmonicDrivePopulation(BatchSettings):
             "ripple": RIPPLE * np.exp(self.spread * RIPPLE_DEVIATION * rng.standard_normal(len(RIPPLE)))
         }
         return ripple | {"phase_rad": rng.uniform(0.0, 2 * np.pi, len(RIPPLE))}
-
-    def _targets(self) -> Array:
-        """Target position and velocity of every episode, shape (2, n_episodes, n_samples)."""
-        samples = (round(self.seconds / SAMPLE_PERIOD_S) + 1, REST_SAMPLES, SAMPLE_PERIOD_S)
-        return np.stack([np.stack(episode_reference(self.seed, e, *samples)) for e in range(self.n_episodes)], axis=1)
 
     def _disturb(self, states: Array, keys: tuple[EpisodeKey, ...]) -> None:
         """Add what the recording adds: an offset of the position in each episode, noise on the current."""
